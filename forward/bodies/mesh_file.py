@@ -35,8 +35,8 @@ class MeshFile(Settings):
 
     Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
     the numbers that an array of the cells gives to triangles or quadrilaterals (boundaries) and to cells (regions).
-    A triangle may be in several groups, a cell in only one. In files of Abaqus, sets of elements are regions, and sets
-    of nodes boundaries: the faces of the surface all of whose nodes are in the set.
+    A triangle may be in several groups, a cell in only one. In files of Abaqus, sets of elements are regions, and
+    surfaces and sets of nodes boundaries: of these, the faces of the body all of whose nodes are in the set.
 
     Parameters
     ----------

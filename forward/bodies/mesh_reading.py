@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from contextlib import redirect_stderr, redirect_stdout
 from functools import lru_cache
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -15,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.mesh import CLOSE, CORNERS, FACES, IntArray, Loaded
+from forward.files import abaqus, meshes
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
 from forward.settings import nearest, one_line
@@ -31,14 +30,16 @@ _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays o
 
 
 def digest_of(file: str) -> str:
-    """Return the hash of a file, including the files in which an XDMF file stores its numbers."""
+    """Return the hash of a file, and of those in which XDMF stores its numbers, or that Abaqus would include."""
     try:
         whole = Path(file).read_bytes()
+        more = list[Path]()
         if file.endswith(".xdmf"):
             others = sorted(set(re.findall(rb"([^\s<>\"]+\.h5):", whole)))
-            whole += b"".join(
-                path.read_bytes() for path in (Path(file).parent / os.fsdecode(other) for other in others)
-            )
+            more = [Path(file).parent / os.fsdecode(other) for other in others]
+        if file.endswith(".inp"):
+            more = abaqus.included(Path(file))
+        whole += b"".join(path.read_bytes() for path in more)
         return hashlib.sha256(whole).hexdigest()
     except OSError as error:
         raise ModelError(one_line(f"file: {error.filename or file}: cannot be read: {error.strerror}")) from None
@@ -53,22 +54,13 @@ def load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...]
 
     if file.endswith(".npz"):
         return _of_ours(file, unit, refuse)
-    import meshio
-
-    printed = StringIO()
     try:
-        with redirect_stdout(printed), redirect_stderr(StringIO()):  # meshio prints empty lines, and what is wrong
-            mesh = _with_groups(meshio.read(file)) if file.endswith(".inp") else meshio.read(file)
-    except SystemExit:
-        said = (printed.getvalue().strip().splitlines() or [f"it is no {Path(file).suffix} file that meshio reads"])[0]
-        refuse(f"cannot be read as a mesh: {said}{', try .vtu' if file.endswith('.vtk') else ''}")
-    except Exception as error:  # readers fail in many ways
-        if out_of_memory(error):
-            raise
-        said = (str(error).splitlines() or [""])[0]
+        mesh = meshes.read(Path(file))
+    except (ValueError, ImportError) as error:
+        said = str(error)
         if "gmsh:physical" in said:
             refuse("has cells in no physical group, expected what belongs to one (gmsh: Mesh.SaveAll = 0)")
-        refuse(f"cannot be read as a mesh: {said or type(error).__name__}")
+        refuse(f"cannot be read as a mesh: {said}")
     kinds = [_MESHIO[block.type] for block in mesh.cells if block.type in _MESHIO]
     others = {block.type for block in mesh.cells if block.dim == 3 and block.type not in _MESHIO}
     if others or len(set(kinds)) != 1:
@@ -101,58 +93,6 @@ def load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...]
     present = np.unique(region_numbers)
     regions = tuple(words.get((3, int(n)), ALL if len(present) == 1 and not n else f"{n}") for n in present)
     return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers))
-
-
-def _with_groups(mesh: meshio.Mesh) -> meshio.Mesh:
-    """Return a mesh of Abaqus with its sets as groups: those of solid elements regions, those of nodes boundaries.
-
-    A boundary has the faces of the surface all of whose nodes are in a set. Sets of all elements, beside others, are
-    no regions, and elements in no set are the region "body".
-    """
-    import meshio
-
-    solid = [i for i, block in enumerate(mesh.cells) if block.type in _MESHIO]
-    kinds = {_MESHIO[mesh.cells[i].type] for i in solid}
-    if len(kinds) != 1:  # which is refused elsewhere
-        return mesh
-    (cell,) = kinds
-    cells = np.concatenate([mesh.cells[i].data for i in solid])
-    members = {}
-    for name, parts in mesh.cell_sets.items():
-        inside = [np.isin(np.arange(len(mesh.cells[i].data)), parts[i]) for i in solid if parts[i] is not None]
-        if len(inside) == len(solid) and np.concatenate(inside).any():
-            members[name] = np.concatenate(inside)
-    some = {name: member for name, member in members.items() if not member.all()}
-    members = some or dict(list(members.items())[:1])
-    faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = faces[first[count == 1]]
-    groups = {
-        f"{name}-nodes" if name in members else name: found
-        for name, nodes in mesh.point_sets.items()
-        if (found := np.isin(outer, nodes).all(axis=1)).any()
-    }
-    if groups:
-        outer = outer[np.any(list(groups.values()), axis=0)]
-    numbers = np.zeros(len(cells), dtype=np.int64)
-    for number, member in enumerate(members.values(), start=1):
-        numbers[member] = number
-    of_faces = np.zeros(len(outer), dtype=np.int64)
-    nothing = np.zeros(0, dtype=np.int64)
-    beside, titles = {}, {ALL: np.array([0, 3])} | {name: np.array([k, 3]) for k, name in enumerate(members, start=1)}
-    for number, (name, found) in enumerate(groups.items(), start=1):
-        member = found[np.any(list(groups.values()), axis=0)]
-        of_faces[member] = number
-        beside[name], titles[name] = [nothing, np.flatnonzero(member)], np.array([number, 2])
-    within = {name: [np.flatnonzero(member), nothing] for name, member in members.items()}
-    shape = mesh.cells[solid[0]].type
-    return meshio.Mesh(
-        mesh.points,
-        [(shape, cells), (_SURFACES[cell], outer)],
-        cell_data={_TAGS[0]: [numbers, of_faces]},
-        field_data=titles,
-        cell_sets=within | beside,
-    )
 
 
 def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:

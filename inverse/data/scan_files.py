@@ -6,19 +6,17 @@ whose numbers are in HDF5, as DOLFINx writes it, of which the last step counts.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import locale
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
 from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.files import meshes
+from forward.files.xdmf import geometry, numbers
 from forward.model import FloatArray
 from forward.settings import one_line
 from inverse.data.table import DataError
@@ -43,7 +41,6 @@ PLY_KINDS = {
     "float32": "f4",
     "float64": "f8",
 }
-POLYDATA = (".vtk", ".vtp")  # that VTK itself reads where meshio does not
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +72,9 @@ def points_of(path: Path) -> Points:
     """
     if not path.is_file():
         raise DataError(f"{path.name}: cannot be read: No such file or directory")
-    readers: dict[str, Callable[[Path], Points]] = {".stl": _stl, ".ply": _ply, ".xdmf": _xdmf, ".vtp": _polydata}
+    readers: dict[str, Callable[[Path], Points]] = {".stl": _stl, ".ply": _ply, ".xdmf": _xdmf}
     try:
-        found = readers.get(path.suffix, _meshio)(path)
+        found = readers.get(path.suffix, _mesh)(path)
     except DataError:
         raise
     except ImportError as error:
@@ -94,61 +91,10 @@ def points_of(path: Path) -> Points:
     return found
 
 
-def _meshio(path: Path) -> Points:
-    import meshio
-
-    said = io.StringIO()  # what meshio prints, also before it exits
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:
-        if path.suffix in POLYDATA:
-            return _polydata(path)
-        reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
-        raise ValueError(reason.strip() or type(error).__name__) from None
+def _mesh(path: Path) -> Points:
+    mesh = meshes.read(path)
     values = {name: np.asarray(one, dtype=float) for name, one in mesh.point_data.items()}
     return Points(np.asarray(mesh.points, float), values, tuple(np.asarray(block.data) for block in mesh.cells))
-
-
-def _polydata(path: Path) -> Points:
-    """Read polygons, which meshio does not, by VTK."""
-    from vtkmodules.util import numpy_support
-    from vtkmodules.vtkCommonCore import vtkLogger
-    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    whole = path.read_bytes()
-    if (b"PolyData" if path.suffix == ".vtp" else b"DATASET POLYDATA") not in whole:
-        raise ValueError("expected a data set of VTK")
-    reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkPolyDataReader()
-    shown = vtkLogger.GetCurrentVerbosityCutoff()
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    words = locale.setlocale(locale.LC_ALL)  # the legacy reader leaves "C", in which no later text could hold "±"
-    try:
-        if path.suffix != ".vtp":
-            reader.ReadAllScalarsOn()
-            reader.ReadAllVectorsOn()
-            reader.ReadAllFieldsOn()
-        reader.SetFileName(str(path))
-        reader.Update()
-    finally:
-        locale.setlocale(locale.LC_ALL, words)
-        vtkLogger.SetStderrVerbosity(shown)
-    mesh, as_numbers = reader.GetOutput(), cast("Any", numpy_support).vtk_to_numpy
-    if reader.GetErrorCode() or not mesh.GetNumberOfPoints():
-        raise ValueError("it is cut off, or has no points")
-    arrays = mesh.GetPointData()
-    names = [arrays.GetArrayName(k) for k in range(arrays.GetNumberOfArrays())]
-    values = {name: _copied(as_numbers(arrays.GetArray(name))) for name in names}
-    polygons = mesh.GetPolys()
-    parts = (polygons.GetOffsetsArray(), polygons.GetConnectivityArray())
-    cells = tuple(_copied(as_numbers(part)).astype(np.int64) for part in parts)
-    return Points(_copied(as_numbers(mesh.GetPoints().GetData())), values, cells)
-
-
-def _copied(numbers: Any) -> FloatArray:
-    """Return numbers of VTK's that stay when it is gone."""
-    return np.array(numbers, dtype=np.float64)
 
 
 def _stl(path: Path) -> Points:
@@ -231,43 +177,12 @@ def _ply_elements(words: list[list[str]]) -> list[tuple[str, int, list[list[str]
 def _xdmf(path: Path) -> Points:
     """Read the first geometry, and of each array the last that is there."""
     root = ET.parse(path).getroot()
-    geometry = root.find(".//Geometry")
-    item = None if geometry is None else geometry.find("DataItem")
-    if geometry is None or item is None:
-        raise ValueError("no Geometry with a DataItem")
-    if geometry.get("GeometryType", geometry.get("Type", "XYZ")).upper() != "XYZ":
-        raise ValueError("a Geometry in two dimensions, expected XYZ")
-    places = _numbers(item, path)
+    places = geometry(root, path)
     values = {}
     for one in root.iter("Attribute"):
         item = one.find("DataItem")
         if item is not None and one.get("Center", "Node") == "Node":
             values[one.get("Name", "")] = item
     topologies = [item for one in root.iter("Topology") if (item := one.find("DataItem")) is not None]
-    cells = tuple(_numbers(item, path).astype(np.int64) for item in topologies[:1])
-    return Points(places, {name: _numbers(item, path) for name, item in values.items()}, cells)
-
-
-def _numbers(item: ET.Element, path: Path) -> FloatArray:
-    """Return the numbers of an item of data, in its shape."""
-    shape = [int(n) for n in item.get("Dimensions", "").split()]
-    text, form = (item.text or "").strip(), item.get("Format", "XML").upper()
-    if form == "HDF":
-        from uq.evaluation.hdf5 import stored_array
-
-        name, _, place = text.partition(":")
-        file = path.parent / name
-        if not file.is_file():
-            raise ValueError(f"its numbers are in {name}, which is not there")
-        numbers = stored_array(file, place)
-    elif form == "XML":
-        numbers = np.array(text.split(), dtype=float)
-    elif form == "BINARY":
-        kind = {"INT": "i", "UINT": "u", "FLOAT": "f"}[item.get("NumberType", item.get("DataType", "Float")).upper()]
-        order = ">" if item.get("Endian", "").upper() == "BIG" else "<"
-        numbers = np.fromfile(path.parent / text, dtype=f"{order}{kind}{item.get('Precision', '4')}").astype(float)
-    else:
-        raise ValueError(f"numbers in the format {form}, expected XML, HDF or Binary")
-    if numbers.size != np.prod(shape):
-        raise ValueError(f"{numbers.size} numbers, expected {' × '.join(map(str, shape))}")
-    return numbers.reshape(shape)
+    cells = tuple(numbers(item, path).astype(np.int64) for item in topologies[:1])
+    return Points(places, {name: numbers(item, path) for name, item in values.items()}, cells)
