@@ -24,6 +24,7 @@ from benchmarks import (
     inversion,
     kernels,
     levels,
+    live,
     locking,
     mesh_error,
     meshes,
@@ -54,6 +55,7 @@ from benchmarks import (
 ALL = {
     "realisation": realisation.main,
     "reduced": reduced.main,
+    "live": live.main,
     "bookkeeping": bookkeeping.main,
     "kernels": kernels.main,
     "throughput": throughput.main,
@@ -105,6 +107,7 @@ WITH_OPTIONS = {
     "tails": tails.main,
     "coverage": coverage.main,
     "meshes": meshes.main,
+    "live": live.main,
     "pgd": pgd.main,
     "multifidelity": multifidelity.main,
     "gains": gains.main,

@@ -96,8 +96,8 @@ class Page:
         elif method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path, width: int = 1280, *, dark: bool = False, printed: bool = False) -> None:
-        """Open a file at a width (CSS pixels) and wait until it and its bodies are there."""
+    def open(self, path: Path | str, width: int = 1280, *, dark: bool = False, printed: bool = False) -> None:
+        """Open a file, or an address, at a width (CSS pixels) and wait until it and its bodies are there."""
         self.errors.clear()
         self.requests.clear()
         self.loaded = False
@@ -106,7 +106,7 @@ class Page:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", media="print" if printed else "", features=[scheme])
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         self.wait("document.readyState === 'complete'")
         self.wait("!document.querySelector('.viewer[data-state=loading]')")
 

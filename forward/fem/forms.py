@@ -208,6 +208,22 @@ class Forms:
         """Compile an expression for evaluation at points (q, 3) of the reference cell."""
         return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm, often=often)
 
+    def written_out(self, form: Any) -> Any:
+        """Return a form in state, constants, fields and places alone, with all derivatives carried out."""
+        expand = ufl.algorithms.expand_derivatives
+        return expand(expand(self._invariants.inserted(form)))
+
+    @property
+    def unknown(self) -> Any:
+        """The state as the function that forms are written in; in the mixed form, displacements and pressure."""
+        return self._state
+
+    def boundary_of(self, integral: Any) -> str:
+        """Return the name of the boundary that an integral of a form is over."""
+        number = integral.subdomain_id()
+        tag = number[0] if isinstance(number, tuple) else number
+        return next(name for name, one in self._tags.items() if one == tag)
+
     @property
     def size_of_value(self) -> int:
         """Number of values that a state has at a point: 3, in the mixed form 4."""

@@ -75,6 +75,11 @@ class VertexField:
         self.set(np.zeros(len(parameters)))
 
     @property
+    def function(self) -> Any:
+        """The logarithm of the factor, as the function that forms are written in."""
+        return self._function
+
+    @property
     def factor(self) -> Any:
         """The factor, as a UFL expression."""
         return ufl.exp(self.log)

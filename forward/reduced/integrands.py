@@ -49,7 +49,7 @@ class Integrand:
 
 def of_form(equations: Discretisation, form: Any, numbers: tuple[str, ...]) -> list[Integrand]:
     """Read a virtual work: for each of its measures, what works on the components of the virtual displacement."""
-    whole = _expanded(equations, form)
+    whole = equations.written_out(form)
     found: dict[tuple[str | None, int], list[Any]] = {}
     for integral in whole.integrals():
         found.setdefault(_measure(equations, integral), []).append(integral.integrand())
@@ -60,22 +60,15 @@ def of_form(equations: Discretisation, form: Any, numbers: tuple[str, ...]) -> l
 
 def of_density(equations: Discretisation, density: Any, measure: Any, numbers: tuple[str, ...]) -> Integrand:
     """Read a density over a measure."""
-    (integral,) = _expanded(equations, density * measure).integrals()
+    (integral,) = equations.written_out(density * measure).integrals()
     return _read(equations, integral.integrand(), *_measure(equations, integral), numbers, virtual=False)
-
-
-def _expanded(equations: Discretisation, form: Any) -> Any:
-    expand = ufl.algorithms.expand_derivatives
-    return expand(expand(equations._invariants.inserted(form)))
 
 
 def _measure(equations: Discretisation, integral: Any) -> tuple[str | None, int]:
     degree = int(integral.metadata()["quadrature_degree"])
     if integral.integral_type() == "cell":
         return None, degree
-    names = {tag: name for name, tag in equations._tags.items()}
-    number = integral.subdomain_id()
-    return names[number[0] if isinstance(number, tuple) else number], degree
+    return equations.boundary_of(integral), degree
 
 
 def _read(
@@ -93,15 +86,15 @@ def _read(
     graph = Graph(first["numbers"] + len(numbers))
     given: list[tuple[Any, tuple[int, ...]]] = []
     fields: list[int] = []
-    paths = {id(constant): path for path, constant in equations._constants.items()}
-    logs = {id(field._function): i for i, field in enumerate(equations.fields)}
+    paths = {id(constant): path for path, constant in equations.constants.items()}
+    logs = {id(field.function): i for i, field in enumerate(equations.fields)}
 
     def known(e: Any, component: tuple[int, ...]) -> Node:
         gradient = type(e).__name__ == "Grad"
         what = e.ufl_operands[0] if gradient else e
         kind = type(what).__name__
         own = values + 3 * component[0] + component[1] if gradient else (component or (0,))[0]
-        if what is equations._state:
+        if what is equations.unknown:
             return own
         if isinstance(what, ufl.Argument):
             return count + own
@@ -162,10 +155,10 @@ class Sampler:
 
     def __init__(self, equations: Discretisation, integrand: Integrand) -> None:
         self._equations, self.integrand = equations, integrand
-        shape = ufl.grad(equations._state)
+        shape = ufl.grad(equations.unknown)
         values = equations.size_of_value
         parts = [
-            _component(equations._state, (k,)) if k < values else shape[(k - values) // 3, (k - values) % 3]
+            _component(equations.unknown, (k,)) if k < values else shape[(k - values) // 3, (k - values) % 3]
             for k in integrand.components
         ]
         self._state = self._at(ufl.as_vector(parts)) if parts else None
@@ -223,7 +216,7 @@ class Sampler:
         equations, found = self._equations, []
         for number in self.integrand.fields:
             field = equations.fields[number]
-            at = self._at(ufl.as_vector([field._function]))
+            at = self._at(ufl.as_vector([field.function]))
             coefficients = np.zeros(len(equations.parameters))
             field.set(coefficients)
             base = at()[chosen, 0]

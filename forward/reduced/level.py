@@ -29,6 +29,8 @@ class Integrand:
         self._flat = points.fields.reshape(m * n, count)
         self.weighted = np.ascontiguousarray((points.weights[:, None] * points.fields).reshape(m * n, count))
         self._numbers = numbers
+        self._inputs = np.empty((self._varying, n))  # filled again and again: what is given never changes
+        self._inputs[m : m + len(points.given)] = points.given
 
     def _derived(self, along: Sequence[int]) -> Kernel:
         """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
@@ -58,11 +60,12 @@ class Integrand:
         return self._derived(range(first, first + len(self.points.logs) + self._numbers))
 
     def inputs(self, c: FloatArray, coefficients: Sequence[FloatArray]) -> FloatArray:
-        """Return what the integrand takes (varying, n) at coordinates, with the coefficients of all random fields."""
-        n = len(self.points.weights)
-        found = np.empty((self._varying, n))
-        found[: self.components] = (self._flat @ c).reshape(self.components, n)
-        found[self.components : self.components + len(self.points.given)] = self.points.given
+        """Return what the integrand takes (varying, n) at coordinates, with the coefficients of all random fields.
+
+        The array holds until this is called again.
+        """
+        found = self._inputs
+        np.dot(self._flat, c, out=found[: self.components].reshape(-1))
         for row, (number, log, slopes) in zip(
             found[self._varying - len(self.points.logs) :], self.points.logs, strict=True
         ):

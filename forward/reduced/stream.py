@@ -2,11 +2,14 @@
 
 Two rates, as in haptics: a `Local` model (factor, slopes, error estimate) is made now and then, wherever there is time
 for it, and every frame predicts with its slopes and corrects with its factor the nonlinear equations at the parameters
-of the frame. Where there is no time even for that, a frame is the local model alone.
+of the frame. A correction that would not end in time is not begun: the frame is the last one, moved along the slopes,
+and the corrections are made once it has been sent.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +21,7 @@ from forward.reduced.model import ReducedModel
 
 CLOSE = 1e-4  # forces left, relative to what they would be if they did not cancel, at which a frame is done
 MOST = 3  # corrections in a frame
+LONGER, SHORTER = 0.05, 0.5  # share of the newest time in the time that something takes
 LOST = 0.3  # forces left from which on the factor is too far away
 
 
@@ -84,7 +88,7 @@ class Frame(NamedTuple):
     residual
         Forces that were left before the last correction, relative to what they would be if they did not cancel.
     corrections
-        How many corrections were made: none in a frame of the local model alone.
+        How many corrections were made: none where there was no time, or where the local model is too far away.
     """
 
     outputs: FloatArray
@@ -101,6 +105,13 @@ class Stream:
         The model, of all its parameters.
     at
         Where it begins.
+
+    Attributes
+    ----------
+    behind
+        Whether the newest parameters were answered without corrections for want of time.
+    takes, besides
+        Times (s) that a correction takes, and that the outputs take after it.
     """
 
     def __init__(self, model: ReducedModel, at: Local) -> None:
@@ -108,41 +119,74 @@ class Stream:
         self.here = at
         self.modes = at.modes.copy()
         self.parameters = at.parameters.copy()
+        self.outputs = at.outputs.copy()  # at these parameters
         self.lost = False  # whether a new local model is needed
+        self.behind, self.takes, self.besides = False, 0.0, 0.0
         self._each_frame = [i for i, output in enumerate(model.data.outputs) if output.kind != "peak"]
 
     def moved(self, at: Local) -> None:
         """Use another local model from now on."""
+        if self.lost:
+            self.modes, self.parameters, self.outputs = at.modes.copy(), at.parameters.copy(), at.outputs.copy()
+        else:
+            own = self._from_here(at, self.parameters)
+            own[self._each_frame] = self.outputs[self._each_frame]
+            self.outputs = own
         self.here, self.lost = at, False
 
-    def linear(self, parameters: FloatArray) -> Frame:
-        """Return what the local model says at parameters (d,), without solving anything."""
-        return Frame(self.here.outputs + self.here.jacobian @ (parameters - self.here.parameters), np.nan, 0)
+    @staticmethod
+    def _from_here(at: Local, parameters: FloatArray) -> FloatArray:
+        return at.outputs + at.jacobian @ (parameters - at.parameters)
 
-    def frame(self, parameters: FloatArray) -> Frame:
-        """Correct the state for parameters (d,); the largest of values at many points comes from the local model."""
+    def linear(self, parameters: FloatArray) -> Frame:
+        """Return the last frame moved along the slopes to parameters (d,), without solving anything."""
+        if self.lost:
+            return Frame(self._from_here(self.here, parameters), np.nan, 0)
+        return Frame(self.outputs + self.here.jacobian @ (parameters - self.parameters), np.nan, 0)
+
+    def frame(self, parameters: FloatArray, within: float = math.inf) -> Frame:
+        """Correct the state for parameters (d,) within a time (s).
+
+        The largest of values at many points comes from the local model.
+        """
+        ends = time.perf_counter() + within - self.besides
+        self.behind = self.takes + self.besides > within
+        if self.behind:
+            return self.linear(parameters)
         level: Level = self.level
         modes = self.modes + self.here.slopes @ (parameters - self.parameters)
         if self.lost:
             modes = self.here.modes + self.here.slopes @ (parameters - self.here.parameters)
         c = level.coordinates(parameters, modes)
         residual, corrections = np.inf, 0
-        while corrections < MOST:
+        now = time.perf_counter()
+        while corrections < MOST and (corrections == 0 or now + self.takes <= ends):
             R, scale = level.forces(c, parameters)
             before, residual = residual, float(np.abs(R[level.free]).max()) / (scale or 1.0)
             if not residual < before:
                 break
             c[level.free] -= self.here.inverse @ R[level.free]
             corrections += 1
+            since, now = now, time.perf_counter()
+            self.takes = _learnt(self.takes, now - since)
             if residual <= CLOSE:
                 break
         if not residual < LOST:
             self.lost = True
             return self.linear(parameters)
-        self.modes, self.parameters = c[level.free].copy(), parameters.copy()
-        outputs = self.linear(parameters).outputs
+        outputs = self._from_here(self.here, parameters)
         outputs[self._each_frame] = level.some_outputs(self._each_frame, c, parameters)
-        return Frame(outputs, residual, corrections)
+        self.modes, self.parameters, self.outputs = c[level.free].copy(), parameters.copy(), outputs
+        self.besides = _learnt(self.besides, time.perf_counter() - now)
+        return Frame(outputs.copy(), residual, corrections)
+
+
+def _learnt(before: float, seconds: float) -> float:
+    """Return how long something takes, after it took so long; what was interrupted for long says little."""
+    if not before:
+        return seconds
+    share = SHORTER if seconds < before else LONGER
+    return before + share * (min(seconds, 3 * before) - before)
 
 
 def begin(model: ReducedModel, uncertain: FloatArray) -> Stream:

@@ -1,7 +1,8 @@
 """The fast loop of `tissuq live`: parameters in, outputs with errors and spread out, a line of JSON each.
 
-One process does nothing else. A second one makes local models of the newest frame, over and over; a third one serves
-the page. What they have to say is taken between frames, so a frame never waits for them.
+One process does nothing else, with the priority of real time where the system lets it, and collects no garbage while
+frames come. A second one makes local models of the newest frame, over and over; a third one serves the page. What they
+have to say is taken between frames in whole messages (`workflows.live.mail`), so a frame never waits for them.
 
 A client connects and is told in one line what there is: the `parameters` with their means, the names and units of
 the `outputs`, and which of them come from the `local` model alone. Then each line that it sends, a table of the
@@ -9,13 +10,16 @@ parameters that have changed, is answered by one line: `outputs`, estimated `err
 deviation due to the parameters that nobody has set), the `residual`, the number of `corrections`, whether the frame is
 `late`, the age of the local model (`local_ms`), and the `microseconds` that the answer took. `id` comes back as sent.
 
-When it is late, that is, when more than one line waits, only the last one is solved for; the others are answered at
-once by the local model, and say so. Where the model cannot follow (a jump), frames are those of the nearest local model
-until the next one is there.
+A frame is corrected as long as that is done within `WITHIN`. Where a correction takes longer, the answer is the last
+frame moved along the slopes of the local model (`corrections` is 0), and the correction follows once it has been sent.
+When it is late, that is, when more than one line waits, only the last one is solved for; the others are answered in
+that way, and say so. Where the model cannot follow (a jump), frames are those of the nearest local model until the next
+one is there.
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import multiprocessing
 import os
@@ -24,7 +28,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -34,24 +37,28 @@ from forward.model import FloatArray, SolveError
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel, outside_of
 from forward.reduced.stream import Local, Stream, local
+from workflows.live.mail import Mail, pair
 
+WITHIN = 0.5e-3  # s that the corrections of a frame may take
+REST = 5e-5  # s in which the system delivers an answer before its correction is made
 SHOWN = 1 / 60  # s between states that are sent to the page
 BEHIND = 5  # how much nicer the other processes are than the loop
 LONGEST = 2**16  # bytes of a line
+NOT_PROMPT = "the usual one: frames are late where others want the processors (`ulimit -r 1` would let it be real time)"
 
 
-def followed(path: str, pipe: Connection) -> None:
-    """Make a local model of each place that comes through a pipe, until it is closed; frames come first."""
+def followed(path: str, mail: Mail) -> None:
+    """Make a local model of each place that comes, until the line is closed; frames come first."""
     os.nice(BEHIND)
     data = load(Path(path))
     model = ReducedModel(data, data.parameters)
     try:
         while True:
-            parameters, modes, uncertain = pipe.recv()
+            parameters, modes, uncertain = mail.receive()
             try:
-                pipe.send(local(model, parameters, modes, uncertain))
+                mail.send(local(model, parameters, modes, uncertain))
             except SolveError as error:
-                pipe.send(str(error))
+                mail.send(str(error))
     except (EOFError, OSError, KeyboardInterrupt):
         return
 
@@ -69,16 +76,17 @@ class Loop:
         Sends what the page shows, and what its sliders say comes back; None without a page.
     """
 
-    def __init__(self, path: Path, host: str, port: int, view: Connection | None = None) -> None:
+    def __init__(self, path: Path, host: str, port: int, view: Mail | None = None) -> None:
         data = load(path)
         self._model = ReducedModel(data, data.parameters)
         self._data, self._view = data, view
         self._uncertain = data.spread.copy()
         self.stream = Stream(self._model, local(self._model, data.nominal, None, self._uncertain))
-        self.stream.frame(data.nominal)  # compiled before the first client comes
+        for _ in range(20):  # compiled, and known how long it takes, before the first client comes
+            self.stream.frame(data.nominal)
         self._now, self._made = data.nominal.copy(), time.monotonic()
         context = multiprocessing.get_context("spawn")
-        self._helper, theirs = context.Pipe()
+        self._helper, theirs = pair()
         self._process = context.Process(target=followed, args=(str(path), theirs), daemon=True)
         self._process.start()
         theirs.close()
@@ -95,11 +103,24 @@ class Loop:
 
     def run(self) -> None:
         """Answer until `ended` is set."""
-        while not self.ended:
-            for key, _ in self._selector.select(SHOWN):
-                handle: Callable[[Any], None] = key.data
-                handle(key.fileobj)
-            self._share()
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
+            while not self.ended:
+                ready = self._selector.select(SHOWN)
+                for key, _ in sorted(ready, key=lambda one: one[0].fileobj not in self._buffers):  # clients first
+                    handle: Callable[[Any], None] = key.data
+                    handle(key.fileobj)
+                if self.stream.behind:
+                    time.sleep(REST)
+                    self.stream.frame(self._now, self.stream.takes + self.stream.besides)  # one correction
+                self._share()
+                if not ready:
+                    gc.collect(0)
+        finally:
+            gc.enable()
+            gc.unfreeze()
 
     def close(self) -> None:
         """Let go of everything."""
@@ -170,7 +191,7 @@ class Loop:
                 str(error) if isinstance(error, _UnknownError) else "expected a table of numbers by parameter, in JSON"
             )
             return {"error": said}
-        frame = self.stream.linear(self._now) if late else self.stream.frame(self._now)
+        frame = self.stream.linear(self._now) if late else self.stream.frame(self._now, WITHIN)
         here = self.stream.here
         beyond = outside_of(self._data, self._now)
         return {
@@ -201,9 +222,9 @@ class Loop:
 
     # --- the other processes -----------------------------------------------------------------------------------------
 
-    def _local(self, helper: Connection) -> None:
+    def _local(self, helper: Mail) -> None:
         try:
-            found = helper.recv()
+            found = helper.receive()
         except (EOFError, OSError):
             self.ended = True
             return
@@ -212,9 +233,9 @@ class Loop:
             self.stream.moved(found)
             self._made = time.monotonic()
 
-    def _slid(self, view: Connection) -> None:
+    def _slid(self, view: Mail) -> None:
         try:
-            values: dict[str, float] = view.recv()
+            values: dict[str, float] = view.receive()
         except (EOFError, OSError):
             self._selector.unregister(view)
             self._view = None
@@ -225,14 +246,29 @@ class Loop:
         """Have the newest place linearised, and show it."""
         if not self._busy and (self.stream.lost or not np.array_equal(self._asked, self._now)):
             start = None if self.stream.lost else self.stream.modes
-            self._helper.send((self._now, start, self._uncertain))
-            self._busy, self._asked = True, self._now
+            try:
+                self._busy, self._asked = self._helper.send((self._now, start, self._uncertain)), self._now
+            except OSError:  # it has ended
+                self.ended = True
         now = time.monotonic()
         if self._view is not None and now - self._shown >= SHOWN:
             self._shown = now
             outputs: FloatArray = self.stream.linear(self._now).outputs
             here = self.stream.here
-            self._view.send((self._now, self.stream.modes, outputs, here.errors, here.spread))
+            try:
+                self._view.send((self._now, self.stream.modes, outputs, here.errors, here.spread))
+            except OSError:  # the page has ended; frames go on
+                self._selector.unregister(self._view)
+                self._view = None
+
+
+def real_time() -> bool:
+    """Ask the system to run this process before all usual ones; whether it does. Processes that it starts are usual."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except (OSError, AttributeError):  # not permitted, or not on this system
+        return False
+    return True
 
 
 class _UnknownError(ValueError):
@@ -258,15 +294,17 @@ def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = F
     context = multiprocessing.get_context("spawn")
     view = process = None
     if page is not None:
-        view, theirs = context.Pipe()
+        view, theirs = pair()
         process = context.Process(target=show, args=(str(path), page, theirs), daemon=True)
         process.start()
         theirs.close()
     loop = Loop(path, host, port, view)
+    prompt = real_time()
     if not quiet:
         sys.stdout.write(f"frames: {host}:{loop.port}, a line of JSON each\n")
         if page is not None:
             sys.stdout.write(f"page: http://127.0.0.1:{page}/\n")
+        sys.stdout.write(f"priority: {'that of real time' if prompt else NOT_PROMPT}\n")
         sys.stdout.flush()
     try:
         loop.run()

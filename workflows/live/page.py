@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.reduced.data import ReducedData, load
+from workflows.live.mail import Mail
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request
@@ -75,6 +76,7 @@ def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = True  # or a picture takes 40 ms
 
         def _own(self) -> bool:
             """Whether it was asked by this name: a page elsewhere can make its name point here."""
@@ -123,16 +125,22 @@ def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
         def log_message(self, format: str, *arguments: Any) -> None:
             return
 
-    return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, request: Any, client_address: Any) -> None:
+            """Say nothing of a page that was closed."""
+            if not isinstance(sys.exception(), ConnectionError):
+                super().handle_error(request, client_address)
+
+    return Server(("127.0.0.1", port), Handler)
 
 
-def show(path: str, port: int, pipe: Connection) -> None:
-    """Serve the page of a model whose newest frames come through a pipe, until that is closed."""
+def show(path: str, port: int, mail: Mail) -> None:
+    """Serve the page of a model whose newest frames come by mail, until that is closed."""
     scene = Scene(load(Path(path)))
-    found = server(scene, port, pipe.send)
+    found = server(scene, port, mail.send)
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:
-            scene.take(pipe.recv())
+            scene.take(mail.receive())
     except (EOFError, OSError, KeyboardInterrupt):
         found.shutdown()

@@ -63,6 +63,32 @@ def test_where_it_cannot_follow_it_says_so_and_catches_up(model):
     np.testing.assert_allclose(found.outputs, model.reduced(near).outputs, rtol=1e-6)
 
 
+def test_where_there_is_no_time_the_last_frame_moves_along_the_slopes(model, small):  # noqa: F811
+    """An answer on time, the correction after it; with time again, or a step later, it is exact as before."""
+    stream = begin(model, SPREAD)
+    smooth = [i for i, output in enumerate(small.outputs) if output.kind != "peak"]
+    spread = np.array(small.about["spread"])[smooth]
+    stream.frame(NOMINAL)
+    stream.takes = 1.0  # s: far more than there is
+    at = NOMINAL + 0.3 * SPREAD
+    frame = stream.frame(at, 1e-3)
+    assert frame.corrections == 0
+    assert stream.behind
+    exact = model.reduced(at).outputs[smooth]
+    first = np.abs(frame.outputs[smooth] - exact) / spread
+    corrected = stream.frame(at, stream.takes + stream.besides)
+    assert corrected.corrections > 0
+    assert not stream.behind
+    after = np.abs(corrected.outputs[smooth] - exact) / spread
+    assert (after < 0.3 * first + 1e-9).all()
+    further = stream.linear(at + 0.01 * SPREAD).outputs[smooth] - model.reduced(at + 0.01 * SPREAD).outputs[smooth]
+    assert (np.abs(further) / spread < 0.3 * first + 1e-4).all()
+    assert stream.takes < 1.0
+    for _ in range(60):
+        stream.frame(at)
+    assert stream.frame(at + 0.02 * SPREAD, 0.5).corrections > 0
+
+
 def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path):  # noqa: F811
     import json
 

@@ -12,6 +12,7 @@ import pytest
 
 from forward.reduced.data import save
 from forward.reduced.model import ReducedModel
+from tests.browser import browser, executable
 from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
     full,
     reduction,
@@ -19,6 +20,7 @@ from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
     snapshots,
 )
 from tests.launch import TISSUQ, environment
+from workflows.live.mail import pair
 from workflows.live.page import surface
 
 pytestmark = pytest.mark.fem
@@ -74,6 +76,59 @@ def test_frames_over_a_socket_and_the_body_on_a_page(small, tmp_path):  # noqa: 
     finally:
         served.terminate()
         served.wait(20)
+
+
+@pytest.mark.skipif(executable() is None, reason="no Chromium is installed (Debian: chromium)")
+def test_the_page_moves_in_a_browser(small, tmp_path):  # noqa: F811
+    """No fault on its console, nothing from elsewhere; a slider moves the body and its numbers."""
+    save(small, tmp_path / "model.npz")
+    port, page = free_port(), free_port()
+    command = [TISSUQ, "live", tmp_path / "model.npz", "--port", str(port), "--page", str(page), "--quiet"]
+    served = subprocess.Popen(list(map(str, command)), env=environment())
+    try:
+        _patiently(f"http://127.0.0.1:{page}/scene")
+        with browser() as tab:
+            tab.open(f"http://127.0.0.1:{page}/")
+            tab.wait("/[1-9]\\d* pictures a second/.test(document.getElementById('rate').textContent)")
+            number = "document.querySelector('#outputs td:nth-child(2)').textContent"
+            before = float(tab.run(number))
+            slider = small.parameters.index("loads.gravity.density")
+            high = float(small.upper[slider])
+            tab.run(
+                f"(() => {{ const s = document.querySelectorAll('#sliders input')[{slider}]; s.value = {high};"
+                " s.dispatchEvent(new Event('input')); })()"
+            )
+            whole = small.nominal.copy()
+            whole[slider] = high
+            exact = ReducedModel(small, small.parameters).reduced(whole).outputs[0]
+            assert abs(before - exact) > 1e-3 * abs(exact)
+            tab.wait(f"Math.abs({number} - {exact}) < 2e-3 * {abs(exact)}")
+            assert tab.errors == []
+            assert all(url.startswith((f"http://127.0.0.1:{page}/", "data:")) for url in tab.requests)
+            assert tab.run("document.getElementById('body').getContext('webgl') !== null")
+    finally:
+        served.terminate()
+        served.wait(20)
+
+
+def test_mail_is_whole_or_not_there():
+    """A line between processes: what has no room is left out, and nobody waits."""
+    one, other = pair()
+    assert one.send({"a": np.arange(3)})
+    np.testing.assert_array_equal(other.receive()["a"], np.arange(3))
+    large, sent = np.zeros(10_000), 0
+    while one.send(large):
+        sent += 1
+        assert sent < 1000
+    assert other.receive().shape == large.shape
+    assert one.send(large)
+    for _ in range(sent):
+        other.receive()
+    one.close()
+    with pytest.raises(EOFError):
+        other.receive()
+    with pytest.raises(OSError, match="pipe"):
+        other.send(1)
 
 
 def _patiently(address):

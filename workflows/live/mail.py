@@ -1,0 +1,69 @@
+"""Messages between two processes, whole or not at all: neither end ever waits for the other amid one.
+
+A loop that must be on time cannot use pipes: it would wait where the other end is slow to read, or has been stopped by
+the system halfway through what it writes. Packets of a Unix socket arrive whole; where there is no room for one, it is
+left out, which is right for whatever only the newest value matters of.
+"""
+
+from __future__ import annotations
+
+import pickle
+import socket
+from typing import Any
+
+LARGEST = 1 << 20  # bytes of a message, if the system has as much room
+
+
+class Mail:
+    """One end of a line between two processes of this program; what comes in is trusted.
+
+    Parameters
+    ----------
+    end
+        Of a pair of sockets.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        self._end = end
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)
+
+    def fileno(self) -> int:
+        """Return the number of the socket, for selectors."""
+        return self._end.fileno()
+
+    def send(self, message: Any) -> bool:
+        """Send a message if there is room for it; whether there was.
+
+        Raises
+        ------
+        OSError
+            If the other end is closed, or there would never be as much room.
+        """
+        try:
+            self._end.send(pickle.dumps(message, protocol=5), socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        return True
+
+    def receive(self) -> Any:
+        """Wait for a message.
+
+        Raises
+        ------
+        EOFError
+            If the other end is closed.
+        """
+        packet = self._end.recv(LARGEST)
+        if not packet:
+            raise EOFError
+        return pickle.loads(packet)
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._end.close()
+
+
+def pair() -> tuple[Mail, Mail]:
+    """Return both ends of a line."""
+    one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    return Mail(one), Mail(other)
