@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
 MOST_GROWTH = 4.0  # growth of the number of samples between checks
+FEW = 512  # samples, for fewer of which no better prediction is worth its making
 UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
@@ -181,13 +182,14 @@ def _sample(
     state = centre.state if slopes is None else centre.state_middle
     fields = _JointMoments(centre.coordinates, state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
+    growing = grown(inputs, evaluate, centre, method.limit) if fields is not None else evaluate
     limit = method.limit if goal is None else min(method.limit, goal.most - 1)
     tolerance = method.tolerance if goal is None else 1.0
     target = min(limit, FIRST_ROUND) if method.open_ended or goal is not None else limit
     count = 0
     while True:
         points = inputs.random(method.seed, count, target)
-        rounds.append(evaluate(Request(points, fields=fields, start=centre.prediction)))
+        rounds.append(growing(Request(points, fields=fields, start=centre.prediction)))
         count = target
         evaluations = merge(rounds)
         scalars = _scalar_moments(evaluations, inputs, centre, control)
@@ -202,6 +204,15 @@ def _sample(
     amount, error = f"{count} samples", f"relative error {float(scalars.relative_error.max()):.3g}"
     stopped = f"{amount}: {error}" if goal else method.why_stopped(reached, error, count, limit, amount)
     return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
+
+
+def grown(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, planned: int) -> Evaluate:
+    """Return an evaluation of `planned` samples whose predictions of the state grow; the same one if they are few."""
+    if planned < FEW:
+        return evaluate
+    from uq.surrogates.growing import Growing
+
+    return Growing(inputs, evaluate, centre, planned)
 
 
 def _scalar_moments(

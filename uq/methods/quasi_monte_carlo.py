@@ -36,7 +36,7 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Sta
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
-from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.surrogates.candidates import FULL, ROWS_PER_TERM
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
@@ -196,9 +196,10 @@ class QuasiMonteCarlo(MonteCarlo):
         if self.control == "chaos":
             fitted = expanded or self._expand(inputs, evaluate, centre)
             control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
-        samples = _Samples(
-            self, inputs, evaluate, centre, control, held, start, None if fitted is None else fitted.rest
-        )
+        growing: Evaluate = evaluate
+        if self.fields and fitted is None:
+            growing = grown(inputs, evaluate, centre, self.limit)
+        samples = _Samples(self, inputs, growing, centre, control, held, start, None if fitted is None else fitted.rest)
         most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
         last = power_of_two(most // self.scrambles)
         open_ended = self.open_ended or goal is not None
