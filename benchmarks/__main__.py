@@ -9,6 +9,7 @@ import sys
 
 from benchmarks import (
     adaptive,
+    blocks,
     bookkeeping,
     buckling,
     calibration,
@@ -86,6 +87,7 @@ ALL = {
     "pgd": pgd.main,
     "multifidelity": multifidelity.main,
     "gains": gains.main,
+    "blocks": blocks.main,
     "meshes_of_fields": meshes_of_fields.main,
     "oddities": oddities.main,
     "held_out": held_out.main,
@@ -111,6 +113,7 @@ WITH_OPTIONS = {
     "pgd": pgd.main,
     "multifidelity": multifidelity.main,
     "gains": gains.main,
+    "blocks": blocks.main,
     "meshes_of_fields": meshes_of_fields.main,
     "oddities": oddities.main,
     "tolerance": tolerance.main,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -19,6 +19,9 @@ from forward.fem.latest import Latest
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Work
 from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 FEWER = {"hexahedron": 2, "tetrahedron": 0}  # degrees of quadrature, for what only preconditions
 
@@ -333,6 +336,11 @@ class Linearisation(Forms):
         """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
         self.latest.factorised = None
         return self._matrix.assembled()
+
+    def sparse_stiffness(self) -> csr_matrix:
+        """The stiffness (U, U) at the state that is set, in one process; the factor of `factorise` is lost."""
+        self.latest.factorised = None
+        return self._matrix.sparse()
 
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; None if unknown."""

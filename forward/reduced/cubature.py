@@ -82,6 +82,17 @@ def chosen(values: FloatArray, integrals: FloatArray, tolerance: float, most: in
     return Rule(inside[order], (x / scale[inside])[order], missed)
 
 
+def beside(values: FloatArray, integrals: FloatArray, tolerance: float, kept: FloatArray) -> Rule:
+    """Choose points beside those that are kept with weights (n,), zero where they are not; else as `chosen`."""
+    there, others = np.flatnonzero(kept), np.flatnonzero(kept == 0)
+    left = integrals - values[:, there] @ kept[there]
+    share = float(np.linalg.norm(left)) / (float(np.linalg.norm(integrals)) or 1.0)
+    rule = chosen(values[:, others], left, tolerance / share if share > 0 else 1.0, len(others))
+    points = np.concatenate([there, others[rule.points]])
+    order = np.argsort(points)
+    return Rule(points[order], np.concatenate([kept[there], rule.weights])[order], rule.missed * share)
+
+
 def _solved(gram: FloatArray, right: FloatArray) -> FloatArray:
     for more in (1e-13, 1e-10, 1e-7):
         raised = gram.copy()

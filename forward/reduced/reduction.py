@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from forward.observables.functionals import Integral, Linear
 from forward.observables.max_displacement import MaxDisplacement
 from forward.observables.max_von_mises import MaxVonMises
 from forward.observables.reaction import Reaction
-from forward.reduced import basis, cubature
+from forward.reduced import basis, blocks, cubature
 from forward.reduced.data import LevelData, Output, Points, ReducedData
 from forward.reduced.integrands import Integrand, Sampler, of_density, of_form
 from forward.reduced.kernels import Kernel
@@ -46,12 +46,18 @@ class Sizes:
         What the points may miss of the forces of the snapshots, relative.
     more
         How many modes of states the nested larger model has besides, and as many of adjoints as the model has modes.
+    cut
+        Into how many blocks along each axis the body is cut, which have modes of their own; or its regions are blocks.
+    full
+        Places (f, 3) whose blocks are kept in full; their displacements are modes besides.
     """
 
     modes: int | None = None
     truncation: float = 3e-3
     cubature: float = 3e-3
     more: int = 120
+    cut: tuple[int, int, int] | Literal["regions"] | None = None
+    full: tuple[tuple[float, float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +131,11 @@ class Reduction:
         self._names = tuple(model.parameters[i] for i in numbers)
         self._at_rest()
         self._lifts = self._lifted()
+        self._kept: NDArray[np.bool_] | None = None  # which cells are kept in full
         self._densities: list[tuple[Sampler, Integral]] = []
         self._tests, self._outputs = self._of_outputs()
         self._dead_rows: list[tuple[int, float, FloatArray]] = []
+        equations.at_load(1.0)  # constants are read as they are now, and loads count in full
         potential = equations.virtual_work_of_energy
         self._integrands = of_form(equations, potential, self._names)
         for load, work in zip(spec.loads, equations.virtual_works, strict=True):
@@ -229,8 +237,10 @@ class Reduction:
         numbers = self._numbers
 
         def make(rows: FloatArray, parameters: FloatArray) -> Output:
-            """Keep the points that are near the largest stress in any snapshot."""
+            """Keep the points that are near the largest stress in any snapshot, and those in cells kept in full."""
             near = np.zeros(sampler.count, dtype=bool)
+            if self._kept is not None:
+                near |= np.repeat(self._kept, sampler.count // len(self._kept))
             everywhere = sampler.points(np.zeros((0, rows.shape[1])))
             kernel = Kernel(found.written.tape, len(found.components) + len(everywhere.given) + len(everywhere.logs))
             for state, point in zip(self._training, parameters, strict=True):
@@ -262,9 +272,15 @@ class Reduction:
         tangents = OF_TANGENTS * layout.scatter(snapshots.tangents)
         tangents[:, self.equations.fixed] = 0
         every = np.vstack([rest, tangents])
-        none = np.zeros((0, self.equations.size))
-        modes, squares = basis.orthonormal(every, self.inner, none, self._most(sizes))
-        n = sizes.modes or basis.enough(squares, sizes.truncation)
+        self._kept = None
+        if sizes.cut is None:
+            none = np.zeros((0, self.equations.size))
+            modes, squares = basis.orthonormal(every, self.inner, none, self._most(sizes))
+            n = sizes.modes or basis.enough(squares, sizes.truncation)
+            left = float(np.sqrt(max(1 - squares[:n].sum() / squares.sum(), 0.0)))
+        else:
+            modes, n, self._kept = self._of_blocks(every, sizes)
+            left = self._left(every, modes[:n])
         n = min(n, len(modes))
         modes = modes[: n + sizes.more]
         modes = np.vstack([modes, self._of_adjoints(adjoints, modes, n)])
@@ -305,12 +321,44 @@ class Reduction:
                 "snapshots": len(states),
                 "modes": n,
                 "modes of the larger model": len(modes),
-                "truncation": float(np.sqrt(max(1 - squares[:n].sum() / squares.sum(), 0.0))),
+                "truncation": left,
                 "unknowns": int(layout.size),
                 "spread": np.maximum(snapshots.outputs.std(axis=0), 1e-300).tolist(),
                 **told,
             },
         )
+
+    def _of_blocks(self, rows: FloatArray, sizes: Sizes) -> tuple[FloatArray, int, NDArray[np.bool_]]:
+        """Return modes (k, U_local) of the blocks, how many of them the model has, and which cells are kept in full."""
+        layout, equations = self.equations.layout, self.equations
+        cells, _ = layout.cells()
+        labels = self.model.space.regions() if sizes.cut == "regions" else None
+        if sizes.cut == "regions" and labels is None:
+            message = "the body has no regions, expected numbers of blocks along each axis"
+            raise ModelError(message)
+        if labels is None:
+            assert isinstance(sizes.cut, tuple)
+            labels = blocks.cut(cells, layout.coordinates, sizes.cut)
+        parts = blocks.partition(labels, cells, layout.coordinates, np.array(sizes.full).reshape(-1, 3))
+        self._at_rest()
+        canonical = np.round(layout.scatter(np.arange(float(equations.size))[None])[0]).astype(np.int64)
+        local = np.argsort(canonical)
+        stiffness = equations.sparse_stiffness()[local][:, local]
+        free = np.ones(equations.size, dtype=bool)
+        free[canonical[equations.fixed]] = False
+        whole = layout.gather(rows)
+        assert whole is not None
+        most = sizes.modes or len(rows)
+        found = blocks.modes(parts, stiffness, free, whole, most + sizes.more)
+        in_full = parts.full[parts.of_node]
+        kept = np.zeros(len(cells), dtype=bool)
+        kept[layout.by_cell(np.arange(len(cells)))] = in_full[cells].all(axis=1)
+        return layout.scatter(found), int((np.repeat(in_full, 3) & free).sum()) + most, kept
+
+    def _left(self, rows: FloatArray, modes: FloatArray) -> float:
+        """What orthonormal modes leave of rows: root mean square in the norm of the stiffness, relative."""
+        squares = ((rows @ self.inner(modes).T) ** 2).sum()
+        return float(np.sqrt(max(1 - squares / max((rows * self.inner(rows)).sum(), 1e-300), 0.0)))
 
     @staticmethod
     def _most(sizes: Sizes) -> float:
@@ -334,28 +382,36 @@ class Reduction:
         return logs[0], (logs[1:] - logs[0]).T.copy(), float(field.kept)
 
     def _levels(
-        self, rows: FloatArray, coordinates: FloatArray, parameters: FloatArray, counts: tuple[int, int], sizes: Sizes
+        self,
+        rows: FloatArray,
+        coordinates: FloatArray,
+        parameters: FloatArray,
+        counts: tuple[int, int],
+        sizes: Sizes,
     ) -> tuple[tuple[LevelData, ...], dict[str, Any]]:
-        """Choose the points of each level."""
+        """Choose the points of each level; all of those in cells that are kept in full."""
         before = len(self._lifts) + len(self._tests)
         levels: list[LevelData] = []
         told: dict[str, Any] = {}
-        candidates = [self._candidates(sampler) for sampler in self._samplers]
+        in_full = [np.zeros(sampler.count, dtype=bool) for sampler in self._samplers]
+        if self._kept is not None:
+            in_full[0] = np.repeat(self._kept, self._samplers[0].count // len(self._kept))
+        candidates = [self._candidates(sampler, some) for sampler, some in zip(self._samplers, in_full, strict=True)]
         known = [sampler.points(rows, some) for sampler, some in zip(self._samplers, candidates, strict=True)]
         of_densities = [sampler.points(rows, candidates[0]) for sampler, _ in self._densities]
         for level, n in enumerate(counts):
             works, integrals = [], []
             for number, (integrand, points) in enumerate(zip(self._integrands, known, strict=True)):
                 every = np.arange(len(points.weights))
-                if number > 0 and len(every) <= KEPT_WHOLE:
+                if number > 0 and (len(every) <= KEPT_WHOLE or in_full[0].any()):
                     works.append(points.some(every, points.weights, before + n))
                     continue
                 sizes_of = (counts[0],) if level == 0 else counts
                 training = _Training(rows, coordinates, parameters, before, n, sizes_of)
                 beside = of_densities if number == 0 else []
-                rule = self._rule(
-                    number, integrand, points, beside, training, sizes.cubature / (1 if level == 0 else FINER)
-                )
+                missed = sizes.cubature / (1 if level == 0 else FINER)
+                fixed = in_full[number][candidates[number]]
+                rule = self._rule(number, integrand, points, beside, training, missed, fixed)
                 works.append(points.some(rule.points, rule.weights, before + n))
                 if number == 0:
                     integrals = [one.some(rule.points, rule.weights, before + n) for one in of_densities]
@@ -365,11 +421,12 @@ class Reduction:
         return tuple(levels), told
 
     @staticmethod
-    def _candidates(sampler: Sampler) -> NDArray[np.int64]:
-        """Number the points among which a rule is chosen."""
+    def _candidates(sampler: Sampler, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Number the points among which a rule is chosen, and those (n,) that are kept."""
         if sampler.count <= CANDIDATES:
             return np.arange(sampler.count)
-        return np.sort(np.random.default_rng(SEED).choice(sampler.count, CANDIDATES, replace=False))
+        some = np.random.default_rng(SEED).choice(sampler.count, CANDIDATES, replace=False)
+        return np.union1d(some, np.flatnonzero(kept))
 
     def _rule(
         self,
@@ -379,6 +436,7 @@ class Reduction:
         densities: list[Points],
         training: _Training,
         missed: float,
+        fixed: NDArray[np.bool_],
     ) -> cubature.Rule:
         """Choose points and weights that integrate the works of projected snapshots, densities of outputs, and volume.
 
@@ -424,7 +482,7 @@ class Reduction:
         volume = np.ones((1, len(points.weights))) / self._samplers[number].weights.sum()
         every = np.vstack([mixture.values, *rows, volume])
         aims = np.concatenate([mixture.integrals, np.ones(len(rows) + 1)])
-        rule = cubature.chosen(every, aims, missed, len(points.weights))
+        rule = cubature.beside(every, aims, missed, np.where(fixed, points.weights, 0.0))
         if whole and rule.missed > missed:  # then all points are needed
             return cubature.Rule(np.arange(len(points.weights)), points.weights, 0.0)
         return rule

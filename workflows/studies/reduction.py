@@ -11,6 +11,7 @@ from pydantic import Field
 from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake
+from forward.settings import Settings
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import Method
 from workflows.config.priors import ranges
@@ -31,6 +32,24 @@ OF_DATA = ("data", "predict")  # blocks of an inversion that a reduced model doe
 OTHER_METHOD = "method={ kind = 'reduce' }"  # an assignment that makes such a study of one that samples
 
 
+class Blocks(Settings):
+    """Blocks of a body with modes of their own, joined at their interfaces.
+
+    Parameters
+    ----------
+    cut
+        Numbers of blocks along the axes; or "regions", which are the blocks then.
+    full
+        Places in blocks that are kept in full, where a tool may press that no snapshot has seen.
+    """
+
+    cut: (
+        tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+        | Literal["regions"]
+    )
+    full: tuple[tuple[float, float, float], ...] = ()
+
+
 class Reduce(Method):
     """Make a reduced model of a body.
 
@@ -43,6 +62,8 @@ class Reduce(Method):
         In how many rounds those are drawn.
     modes
         Number of modes; by default as many as `truncation` needs.
+    blocks
+        Into which blocks the body is cut, with modes of their own; by default modes are those of the whole body.
     truncation
         What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
     cubature
@@ -60,6 +81,7 @@ class Reduce(Method):
     snapshots: Annotated[int, Field(ge=4)] = 96
     rounds: Annotated[int, Field(ge=0)] = 3
     modes: Annotated[int, Field(ge=1)] | None = None
+    blocks: Blocks | None = None
     truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
     cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     derivatives: bool = True

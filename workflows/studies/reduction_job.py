@@ -113,6 +113,8 @@ class _Making:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
         self._start = linearise(inputs, evaluate).prediction
         self._sizes = Sizes(method.modes, method.truncation, method.cubature)
+        if method.blocks is not None:
+            self._sizes = replace(self._sizes, cut=method.blocks.cut, full=method.blocks.full)
         self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
 
     def run(self) -> tuple[ReducedData, xr.Dataset]:

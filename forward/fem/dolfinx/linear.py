@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dolfinx import fem
@@ -17,6 +17,9 @@ from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
 from forward.solvers.linear import TIGHT
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 ROOM = 60  # for what pivoting adds to the factor, in per cent of MUMPS's own estimate
 MOST_ROOM = 4000
@@ -86,6 +89,18 @@ class StiffnessMatrix:
         """Assemble; return a copy of PETSc's matrix, for `products`."""
         self.assemble()
         return self.matrix.copy()
+
+    def sparse(self) -> csr_matrix:
+        """Assemble; return SciPy's sparse matrix (n, n), of one process."""
+        from scipy.sparse import csr_matrix
+
+        matrix = self.assembled().convert("aij")
+        starts, columns, values = matrix.getValuesCSR()
+        matrix.destroy()
+        n = len(starts) - 1
+        ours = np.round(self.unknowns.reorder(np.arange(n, dtype=float))).astype(np.int64)
+        rows = ours[np.repeat(np.arange(n), np.diff(starts))]
+        return csr_matrix((values, (rows, ours[columns])), shape=(n, n))
 
     def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
         """Return the products (k, n) of such a copy with rows (k, n)."""

@@ -145,6 +145,17 @@ def test_without_derivatives_there_are_no_adjoints_and_nothing_is_factorised(fol
     assert max(told["errors"].values()) < 0.1
 
 
+def test_a_body_in_blocks(folder):
+    out, sizes = folder / "blocks", [*SIZES, "--set", "method.blocks={ cut = [2, 1, 1], full = [[0.1, 0.02, 0.01]] }"]
+    assert main(["reduce", str(folder / "body.toml"), *sizes, "--out", str(out), "--quiet", "--no-report"]) == 0
+    told = json.loads((out / "summary.json").read_text())["reduced"]
+    assert told["modes"] > 24  # eight free nodes of the block in full, and six modes
+    assert max(told["errors"].values()) < 0.05
+    (folder / "wrong.toml").write_text(BODY + '[method]\nkind = "reduce"\nblocks = { cut = [2, 0, 1] }\n')
+    with pytest.raises(StudyError, match="greater than or equal to 1"):
+        load(folder / "wrong.toml")
+
+
 def test_a_number_that_was_kept_is_no_parameter(folder):
     text = USED.format(upper=1200, more="").replace("loads.gravity.density", "material.D1")
     text = text.replace("900, upper = 1100", "1e3, upper = 2e3")
