@@ -75,7 +75,7 @@ class _Moving:
         self._work = work
         at_rest = np.zeros(level.count)
         self._numbers = [level.numbers(point) for point in parameters]
-        self._inputs = np.array([work.inputs(at_rest, level.coefficients(point)) for point in parameters])
+        self._inputs = np.array([work.inputs(at_rest, level.coefficients(point)).copy() for point in parameters])
 
     def forces(self, c: FloatArray, which: NDArray[np.int64]) -> FloatArray:
         """Return the forces (k, N) of the samples `which` (k,) at coordinates (k, N)."""
