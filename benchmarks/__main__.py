@@ -103,6 +103,7 @@ WITH_OPTIONS = {
     "designs": designs.main,
     "intervals": intervals.main,
     "size": size.main,
+    "startup": startup.main,
     "calibration": calibration.main,
     "indentation": indentation.main,
     "chaos": chaos.main,

@@ -1,4 +1,7 @@
-"""Processor time and memory of a body against its size, with factors and by multigrid."""
+"""Processor time and memory of a body against its size, with factors and by multigrid.
+
+Each row is kept in a file as soon as it is measured: the same command goes on where it was stopped.
+"""
 
 from __future__ import annotations
 
@@ -83,6 +86,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--ranks", type=int, default=1, help="ranks that share the body")
     parser.add_argument("--step", action="store_true", help="one step of Newton's method in place of a solve")
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--kept", type=Path, default=Path("sizes.jsonl"), help="file of the rows that were measured")
     parser.add_argument("--fields", action="store_true", help="random fields on cubes, in place of bodies")
     given = parser.parse_args(list(options))
     if given.fields:
@@ -94,17 +98,33 @@ def main(options: Sequence[str] = ()) -> None:
         for size in given.unknowns:
             if linear == "factor" and size > WITH_FACTORS:
                 continue
-            row = measured(CELLS[size], linear, given.ranks, step=given.step)
+            row = kept(given.kept, CELLS[size], linear, given.ranks, step=given.step)
             found.setdefault(linear, []).append(row)
             print(f"| {linear} | {row[0]:,.0f} | " + " | ".join(f"{value:.2f}" for value in row[1:]) + " |", flush=True)
-    for linear, rows in found.items():
-        if len(rows) > 1:
-            sizes, *columns = np.log(np.maximum(np.array(rows), 1e-3)).T
-            slopes = [np.polyfit(sizes, column, 1)[0] for column in columns]
-            words = ", ".join(f"{part} {slope:.2f}" for part, slope in zip(PARTS, slopes, strict=True))
-            print(f"\nslopes, {linear}: {words}")
+    slopes = {linear: slopes_of(rows) for linear, rows in found.items() if len(rows) > 1}
+    for linear, values in slopes.items():
+        words = ", ".join(f"{part} {slope:.2f}" for part, slope in zip(PARTS, values, strict=True))
+        print(f"\nslopes, {linear}: {words}")
     if given.picture is not None:
-        draw(found, given.picture)
+        draw(found, slopes, given.picture)
+
+
+def slopes_of(rows: list[list[float]]) -> list[float]:
+    """Return the power of the unknowns with which each of `PARTS` grows."""
+    sizes, *columns = np.log(np.maximum(np.array(rows), 1e-3)).T
+    return [float(np.polyfit(sizes, column, 1)[0]) for column in columns]
+
+
+def kept(file: Path, cells: tuple[int, int, int], linear: str, ranks: int, *, step: bool) -> list[float]:
+    """Return a row of the file; measure it and add it where it is missing."""
+    about = {"cells": list(cells), "linear": linear, "ranks": ranks, "step": step}
+    for one in map(json.loads, file.read_text().splitlines() if file.exists() else ()):
+        if about.items() <= one.items():
+            return [float(value) for value in one["row"]]
+    row = measured(cells, linear, ranks, step=step)
+    with file.open("a") as lines:
+        lines.write(json.dumps(about | {"row": row}) + "\n")
+    return row
 
 
 def measured(cells: tuple[int, int, int], linear: str, ranks: int, *, step: bool = False) -> list[float]:
@@ -140,19 +160,18 @@ def of_fields(cells: Sequence[int] = (24, 35)) -> None:
             print(f"| {(n + 1) ** 3:,} | {smoothness} | {times} |", flush=True)
 
 
-def draw(found: dict[str, list[list[float]]], file: Path) -> None:
-    """Draw first solves and memory against unknowns."""
+def draw(found: dict[str, list[list[float]]], slopes: dict[str, list[float]], file: Path) -> None:
+    """Draw first solves, derivatives and memory against unknowns, each with its slope."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    for axes, column, label in zip(
-        figure.subplots(1, 2), (2, 5), ("first solve (s of processor time)", "memory (GiB)"), strict=True
-    ):
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    columns = {"first solve (s)": 1, "two tangents (s)": 3, "memory (GiB)": 4}
+    for axes, (label, part) in zip(figure.subplots(1, 3), columns.items(), strict=True):
         for linear, rows in found.items():
-            table = np.array(rows)
-            axes.loglog(table[:, 0], table[:, column], "o-", label=linear)
-        axes.set_xlabel("unknowns")
-        axes.set_ylabel(label)
+            sizes, values = np.array(rows)[:, [0, part + 1]].T
+            slope = f", slope {slopes[linear][part]:.2f}" if linear in slopes else ""
+            axes.loglog(sizes, values, "o-", label=f"{'factors' if linear == 'factor' else linear}{slope}")
+        axes.set(xlabel="unknowns", ylabel=label)
         axes.grid(visible=True, alpha=0.3)
-    axes.legend()
-    figure.savefig(file, dpi=150)
+        axes.legend(frameon=False)
+    figure.savefig(file, dpi=110)

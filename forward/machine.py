@@ -262,7 +262,7 @@ def write_whole(path: Path, data: bytes) -> None:
     StopError
         If there is no space for it, or something else in its place; no partial file is left.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.with_name(f".{path.name}.{os.uname().nodename}.{os.getpid()}")
     try:
         with partial.open("wb") as file:
             file.write(data)

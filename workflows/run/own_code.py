@@ -57,7 +57,7 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
     if before is None or not modules(study):
         return
     if not (directory / "summary.json").exists() and not any(directory.glob("evaluations/*.h5")):
-        (directory / FILE).unlink()  # nothing was computed yet
+        (directory / FILE).unlink(missing_ok=True)  # nothing was computed yet
         return
     change = before.change(_sources(study))
     if change is not None:

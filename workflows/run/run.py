@@ -47,11 +47,19 @@ if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
 
 CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
+SECONDS_TO_BEGIN = 5.0  # in which another job that shares a study writes study.toml
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
 def run(
-    study: StudyKind, name: str, directory: Path, *, quiet: bool = False, silent: bool = False, report: bool = True
+    study: StudyKind,
+    name: str,
+    directory: Path,
+    *,
+    quiet: bool = False,
+    silent: bool = False,
+    report: bool = True,
+    shared: str = "",
 ) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
@@ -69,6 +77,8 @@ def run(
         Not even that line.
     report
         Whether report.html is written.
+    shared
+        Name of this job among several that work on the study in this directory; empty if it is alone.
 
     Returns
     -------
@@ -93,7 +103,7 @@ def run(
     was.
     """
     try:
-        return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report)
+        return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report, shared=shared)
     except Exception as error:
         if isinstance(error, StopError) or not out_of_memory(error):
             raise
@@ -101,7 +111,7 @@ def run(
         raise StopError(reason) from error
 
 
-def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: bool, report: bool) -> int:
+def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: bool, report: bool, shared: str) -> int:
     from mpi4py import MPI
 
     from uq.evaluation.turns import alone
@@ -109,7 +119,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     world = MPI.COMM_WORLD
     begin = time.monotonic()
     loaded = Loaded() if own_code.modules(study) else None
-    finished = _agreed(world, lambda: _prepare(study, directory, world.size))
+    finished = _agreed(world, lambda: _prepare(study, directory, world.size, shared=bool(shared)))
     if finished is not None:
         with alone(world):
             if world.rank == 0:
@@ -120,9 +130,11 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         return int(finished)
 
     from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.claims import Claims, FinishedElsewhere
     from uq.evaluation.ensemble import Ensemble
 
-    ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
+    claims = Claims.of(world, directory, shared) if shared else None
+    ensemble = Ensemble.split(world, study.parallel.ranks_per_model, claims)
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
     checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
@@ -135,25 +147,49 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
         dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
+        if claims is not None and dataset is not None:
+            claims.writes()
+    except FinishedElsewhere:
+        return _elsewhere(world, directory, quiet=quiet)
     except BaseException as error:
-        if world.rank == 0:
+        if world.rank == 0 and claims is None:
             _withdraw(directory, error, checkpoint)
         raise
     with alone(world):
         if dataset is None:
             return DONE
         progress.close()
-        dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
-        add(dataset, *study.findings)
-        dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
         evaluations = job.evaluations
+        dataset = _complete(study, name, dataset, job, evaluations)
         own_code.keep(directory, study, loaded)
-        add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
-        dataset = study.finished(dataset, evaluations)
         wall = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
         _leave(directory, dataset, evaluations, summary, checkpoint, job, study.units_of)
         _tell(directory, "" if quiet else closing_words(dataset, summary), report=report)
+        return exit_code(summary)
+
+
+def _complete(
+    study: StudyKind, name: str, dataset: xr.Dataset, job: Job, evaluations: dict[str, Evaluations]
+) -> xr.Dataset:
+    """Add to results what the study and all evaluations say."""
+    dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+    add(dataset, *study.findings)
+    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
+    add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
+    return study.finished(dataset, evaluations)
+
+
+def _elsewhere(world: Any, directory: Path, *, quiet: bool) -> int:
+    """End a job whose study another one has finished, and return the exit code of that; collective."""
+    from uq.evaluation.turns import alone
+
+    with alone(world):
+        summary = read_summary(directory) if world.rank == 0 else None
+        if summary is None:
+            return DONE
+        if not quiet:
+            sys.stdout.write(f"{directory}: finished by another job, which writes the report\n")
         return exit_code(summary)
 
 
@@ -227,7 +263,7 @@ def _report(directory: Path) -> None:
     write_report(directory)
 
 
-def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
+def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> int | None:
     """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
     share = study.parallel.ranks_per_model
     if ranks % share:
@@ -240,6 +276,8 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
             "of them will be idle; parallel.ranks_per_model makes groups larger"
         )
     kept = directory / "study.toml"
+    if shared:
+        _let_another_begin(directory, kept)
     try:
         if kept.exists():
             changes = differences(tomllib.loads(kept.read_text(encoding="utf-8")), document(study))
@@ -253,9 +291,7 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
         if not os.access(directory, os.W_OK | os.X_OK):
             message = f"{directory}: cannot be written: permission denied"
             raise StudyError(message)
-        for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")]:
-            leftover.unlink()
-        _keep_study(directory, study)
+        _keep_study(directory, study, tidy=not shared)
     except tomllib.TOMLDecodeError:
         message = f"{kept}: is not a study, expected a directory of this study"
         raise StudyError(message) from None
@@ -273,8 +309,20 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
         raise StudyError(message) from None
 
 
-def _keep_study(directory: Path, study: StudyKind) -> None:
-    """Write study.toml, also if only the block of the report differs; the report is then made again."""
+def _let_another_begin(directory: Path, kept: Path) -> None:
+    """Wait a while if another job has made the directory and not yet written study.toml into it."""
+    begin = time.monotonic()
+    while directory.exists() and not kept.exists() and time.monotonic() < begin + SECONDS_TO_BEGIN:
+        time.sleep(0.05)
+
+
+def _keep_study(directory: Path, study: StudyKind, *, tidy: bool) -> None:
+    """Write study.toml, also if only the block of the report differs; the report is then made again.
+
+    What a killed run was writing is removed where it is certain that no other job is writing it.
+    """
+    for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")] if tidy else ():
+        leftover.unlink()
     kept = directory / "study.toml"
     if not kept.exists():
         for name, content in study.beside.items():
@@ -299,6 +347,7 @@ def _finished(directory: Path) -> int | None:
         intact = False
     if not intact:
         sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
+        (directory / "summary.json").unlink(missing_ok=True)  # it says that the study is finished
         return None
     return exit_code(summary)
 

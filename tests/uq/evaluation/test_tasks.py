@@ -1,12 +1,15 @@
 """Tasks that give datasets: shared by groups of ranks, kept in files of their own, failures as data."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import xarray as xr
 from mpi4py import MPI
 
 from forward.model import FunctionModel, SolveError
-from tests.launch import run_script
+from tests.launch import ROOT, environment, run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Recorder, Request, SerialEvaluate
@@ -152,3 +155,50 @@ def test_a_mistake_on_one_rank_ends_all():
     done = run_script(3, SHARED, 1, "broken")
     assert done.returncode == 1
     assert "ZeroDivisionError: on one rank" in done.stderr
+
+
+OF_TWO_JOBS = """
+import sys
+import time
+from pathlib import Path
+import xarray as xr
+from mpi4py import MPI
+from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.claims import Claims
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.tasks import run_tasks
+
+directory, name = Path(sys.argv[1]), sys.argv[2]
+
+def work(number, solved):
+    with (directory / "calls").open("a") as calls:
+        calls.write(f"{name} {number}\\n")
+    begin = time.monotonic()
+    while number == 0 and not (directory / "calls").read_text().count("two") and time.monotonic() < begin + 60:
+        time.sleep(0.01)  # the second job finds the first at work
+    time.sleep(0.02)
+    return xr.Dataset({"square": number**2})
+
+ensemble = Ensemble.split(MPI.COMM_SELF, claims=Claims.of(MPI.COMM_SELF, directory, name))
+found = run_tasks(ensemble, "abcdefgh", work, checkpoint=Checkpoint(directory, "study"))
+print(*(one.dataset["square"].item() for one in found))
+"""
+
+
+def test_jobs_share_tasks(tmp_path):
+    """Each task is done once; both jobs have all outcomes."""
+    jobs = [
+        subprocess.Popen(
+            [sys.executable, "-c", OF_TWO_JOBS, tmp_path, name],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=environment(),
+        )
+        for name in ("one", "two")
+    ]
+    assert [job.communicate(timeout=120)[0] for job in jobs] == ["0 1 4 9 16 25 36 49\n"] * 2
+    done = [line.split() for line in (tmp_path / "calls").read_text().splitlines()]
+    assert sorted(number for _, number in done) == [str(number) for number in range(8)]
+    assert {name for name, _ in done} == {"one", "two"}
+    assert len(list((tmp_path / "evaluations").iterdir())) == 8
