@@ -24,7 +24,17 @@ from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
-from forward.fem.cost import Estimate, Linear, Times, held_together, linear_solver, sum_of, times
+from forward.fem.cost import (
+    SINGLE_FROM,
+    Estimate,
+    Linear,
+    Times,
+    factor,
+    held_together,
+    linear_solver,
+    sum_of,
+    times,
+)
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
@@ -239,6 +249,13 @@ class Hyperelastic(ModelSpec):
         if self.solver.kind == "newton" or self.touched or not self.symmetric:
             return Linear.FACTOR
         return linear_solver(self.body, symmetric=self.symmetric)
+
+    @property
+    def single(self) -> bool:
+        """Whether the factor of a reference is in single precision, where that is there and leaves enough digits."""
+        if self.solver.precision != "auto":
+            return self.solver.precision == "single"
+        return factor(self.body, mixed=self.mixed, symmetric=self.symmetric).bytes > SINGLE_FROM
 
     @property
     def frictional(self) -> bool:
@@ -507,9 +524,16 @@ class Hyperelastic(ModelSpec):
         first = "at first " if self.unrefined else ""
         yield "unknowns", f"{first}{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
-        yield "linear", IN_WORDS[self.over(ranges).linear]
+        yield "linear", self.over(ranges)._linear_in_words()
         if self.adapt is not None:
             yield "mesh", self.adapt.in_words(self)
+
+    def _linear_in_words(self) -> str:
+        """Say what linear systems are solved with."""
+        referred = self.linear != Linear.MULTIGRID and self.solver.kind != "newton" and not self.frictional
+        return IN_WORDS[self.linear] + (
+            "; that of the reference in single precision" if referred and self.single else ""
+        )
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""

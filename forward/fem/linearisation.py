@@ -12,7 +12,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import linear, multigrid, spaces, unknowns
+from forward.fem.dolfinx import linear, multigrid, single, spaces, unknowns
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
@@ -225,8 +225,10 @@ class Linearisation(Forms):
         return self._stiffness if self.symmetric else self._bilinear(self._symmetric_form)
 
     def new_factor(self) -> LinearSolver:
-        """Return a solver for the stiffness that makes a factor, with a matrix of its own."""
-        return linear.DirectSolver(self._new_matrix(self._stiffness, symmetric=self.symmetric))
+        """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own."""
+        matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
+        alone = self.comm.size == 1  # entries and right-hand sides are not distributed
+        return single.SingleSolver(matrix) if self.spec.single and alone else linear.DirectSolver(matrix)
 
     def new_symmetric_solver(self) -> LinearSolver:
         """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""

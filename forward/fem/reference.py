@@ -13,7 +13,7 @@ from forward.fem.equations import Discretisation
 from forward.model import FloatArray, ReferenceSolution, SolveError, Work
 from forward.solvers.anderson import Inverse
 from forward.solvers.lanczos import negative_eigenvalues
-from forward.solvers.linear import LinearSolver
+from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
 from forward.solvers.steps import Corrector, Steps, finished, through
@@ -202,7 +202,7 @@ class ReferenceFactor:
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
-        return Turned(R, self._equations.fixed).by(self._counted(self._solver, transpose=transpose))
+        return Turned(R, self._equations.fixed).by(self._counted(self._solver, transpose=transpose, tolerance=ROUGH))
 
     def corrector(self, R: FloatArray) -> Corrector:
         """Return the same, asking for what `solve` does."""
@@ -210,15 +210,15 @@ class ReferenceFactor:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve with the factor at the reference; (n,) or (k, n)."""
-        return self._counted(self._solver)(right)
+        return self._counted(self._solver, tolerance=ROUGH)(right)
 
     def solve_uncounted(self, right: FloatArray) -> FloatArray:
         """The same, where the caller knows to which solutions the work belongs."""
-        return self._solver.solve(right)
+        return self._solver.solve(right, tolerance=ROUGH)
 
-    def _counted(self, solver: LinearSolver, *, transpose: bool = False) -> Inverse:
+    def _counted(self, solver: LinearSolver, *, transpose: bool = False, tolerance: float = TIGHT) -> Inverse:
         def inverse(right: FloatArray) -> FloatArray:
             self._equations.work.back_substitutions += 1 if right.ndim == 1 else len(right)
-            return solver.solve(right, transpose=transpose)
+            return solver.solve(right, transpose=transpose, tolerance=tolerance)
 
         return inverse

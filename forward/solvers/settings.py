@@ -41,6 +41,11 @@ class SolverSettings(Settings):
         take steps of Newton's method from their predictions, with stiffnesses of their own. "both": these for Newton's
         method and derivatives, and a factor for the reference that corrects predictions. "auto" chooses by predicted
         time and memory; the textbook solver and the mixed form have factors.
+    precision
+        Of the factor of a reference, which corrects predictions. "single" takes half the memory and less time; what is
+        solved is the same within the tolerance, since residuals are in double precision, and so are derivatives and
+        the test for stability. "auto": single where the factor is large. It is in double precision where MUMPS is not
+        there in single, for several ranks that share a model, and where too few digits would be left.
     accept_unstable
         Whether an equilibrium counts even if the stiffness has negative eigenvalues (the body has buckled). These are
         then not looked for.
@@ -55,4 +60,5 @@ class SolverSettings(Settings):
     minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 8192
     solve_seconds: Annotated[float, Field(gt=0)] | None = None
     linear: Literal["auto", "factor", "multigrid", "both"] = "auto"
+    precision: Literal["auto", "single", "double"] = "auto"
     accept_unstable: bool = False

@@ -40,6 +40,24 @@ def _cache_directory() -> Path:
 _CACHE = _cache_directory()
 
 
+def cache_folder() -> Path:
+    """Return the folder of compiled code; make it if it does not exist.
+
+    Raises
+    ------
+    StopError
+        If it cannot be made.
+    """
+    try:
+        _CACHE.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        message = (
+            f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
+        )
+        raise StopError(message) from None
+    return _CACHE
+
+
 def options_for(folder: Path) -> dict[str, Any]:
     """Return DOLFINx's arguments with which it compiles in a folder."""
     options = {"cffi_extra_compile_args": FLAGS, "cffi_libraries": ["m"], "cache_dir": str(folder), "timeout": 600}
@@ -49,14 +67,7 @@ def options_for(folder: Path) -> dict[str, Any]:
 @contextmanager
 def _lock(name: str) -> Iterator[None]:
     """Let one process in at a time. The system releases the lock of a process that dies."""
-    try:
-        _CACHE.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        message = (
-            f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
-        )
-        raise StopError(message) from None
-    with (_CACHE / f"{name}.lock").open("w") as lock:
+    with (cache_folder() / f"{name}.lock").open("w") as lock:
         with suppress(OSError):  # some cluster file systems have no locks: then more than one process compiles
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield

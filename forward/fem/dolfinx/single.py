@@ -1,0 +1,244 @@
+"""The factor of a reference in single precision: half the memory, and faster to read.
+
+What corrects predictions needs a few digits only, since residuals are in double precision. Where all digits are wanted,
+solutions are refined with the stiffness itself (N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed.,
+chapter 12). PETSc has MUMPS in double precision only; its library in single precision stands beside it on Debian.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import re
+import shlex
+import subprocess
+import sysconfig
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from forward.fem.cost import SPARE
+from forward.fem.dolfinx.compile import cache_folder
+from forward.fem.dolfinx.linear import MOST_ROOM, ROOM, TOO_LITTLE_ROOM, DirectSolver, StiffnessMatrix
+from forward.machine import require
+from forward.model import FloatArray
+from forward.solvers.linear import ROUGH, TIGHT
+
+SINGLE = np.float32
+CONTRACTION = 0.1  # largest share of an error that a refinement may leave: then the factor has the stiffness' inertia
+TRIED, TRIALS = 4, 4  # random right-hand sides, and refinements, with which that is found out
+REFINEMENTS = 12  # most of a solution
+_SOURCE = Path(__file__).with_name("single.c")
+
+
+@cache
+def library() -> Any | None:
+    """Return MUMPS in single precision, of the same build as that which PETSc has loaded; None where there is none."""
+    doubles = re.findall(r"\S*/libdmumps\S*\.so\S*", Path("/proc/self/maps").read_text(encoding="utf-8"))
+    beside = [Path(one.replace("libdmumps", "libsmumps")) for one in doubles]
+    found = next((one for one in beside if one.exists()), None)
+    if found is None:
+        return None
+    text = _SOURCE.read_text(encoding="utf-8")
+    shim = cache_folder() / f"single-{hashlib.sha256(f'{text}{found}'.encode()).hexdigest()[:12]}.so"
+    if not shim.exists():
+        partial = shim.with_suffix(f".{os.uname().nodename}.{os.getpid()}")
+        compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")
+        include = f"-I{found.parents[1] / 'include'}"
+        command = [*compiler, "-O2", "-fPIC", "-shared", include, str(_SOURCE), "-o", str(partial), str(found)]
+        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        if done.returncode != 0:  # no header
+            return None
+        partial.replace(shim)
+    try:
+        loaded = ctypes.CDLL(str(shim))
+    except OSError:
+        return None
+    loaded.begin.restype = ctypes.c_void_p
+    loaded.factorise.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_int,
+        ctypes.c_int64,
+        *[ctypes.c_void_p] * 3,
+        *[ctypes.c_int] * 2,
+    ]
+    loaded.solve.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_int]
+    loaded.told.argtypes = [ctypes.c_void_p, ctypes.c_int]
+    loaded.end.argtypes = [ctypes.c_void_p]
+    return loaded
+
+
+class SingleSolver:
+    """A `LinearSolver` of one process whose factor is in single precision; where that will not do, it is in double.
+
+    A factor S is taken if refinements x ← x + S⁻¹(b − Kx) leave at most a tenth of every error, on random right-hand
+    sides. Then ρ(I − S⁻¹K) < 1, so that no S + t(K − S) with 0 ≤ t ≤ 1 is singular: S has as many negative eigenvalues
+    as K.
+
+    Attributes
+    ----------
+    contraction
+        That share, of the last factor in single precision.
+    """
+
+    def __init__(self, stiffness: StiffnessMatrix) -> None:
+        self._stiffness = stiffness
+        self._symmetric = stiffness.symmetric
+        self._factor: Any = None
+        self._analysed, self._room = False, ROOM
+        self.contraction = np.inf
+        self._double: DirectSolver | None = None
+        self._use_double = False
+        self._x, self._b = stiffness.matrix.createVecs()
+
+    @property
+    def in_single(self) -> bool:
+        """Whether the factor at hand is in single precision."""
+        return self._analysed and not self._use_double
+
+    def factorise(self) -> None:
+        """Assemble and factorise; errors as of `DirectSolver`."""
+        self._use_double = False
+        if self._made_single():
+            return
+        self._end()
+        self._double = self._double or DirectSolver(self._stiffness)
+        self._use_double = True
+        self._double.factorise()
+
+    def _made_single(self) -> bool:
+        """Assemble, and make a factor that is good enough; False if there is none."""
+        found = library()
+        if found is None:
+            return False
+        expected = self._stiffness.expected
+        require(
+            expected.bytes / 4 + SPARE,
+            f"the factor of the stiffness of {self._stiffness.matrix.getSize()[0]:,} unknowns",
+        )
+        if self._double is not None:
+            self._double.release()
+        self._factor = self._factor or found.begin(int(self._symmetric), MPI.COMM_SELF.py2f())
+        if not self._factor:
+            return False
+        self._stiffness.assemble()
+        rows, columns, values = _entries(self._stiffness.matrix, half=self._symmetric)
+        if not np.isfinite(values).all():
+            return False
+        n = self._stiffness.matrix.getSize()[0]
+        while True:
+            at = [array.ctypes.data for array in (rows, columns, values)]
+            status = found.factorise(self._factor, n, len(values), *at, self._room, not self._analysed)
+            self._analysed = status >= 0
+            if status not in TOO_LITTLE_ROOM or self._room >= MOST_ROOM:
+                break
+            self._room *= 4
+        self.contraction = self._contracted() if self._analysed else np.inf
+        return self.contraction <= CONTRACTION
+
+    def _contracted(self) -> float:
+        """Return the share of random errors that a refinement leaves, once only the largest are left."""
+        random = np.random.default_rng(0)
+        before = self._once(random.standard_normal((TRIED, self._stiffness.matrix.getSize()[0])).astype(SINGLE))
+        for _ in range(TRIALS):
+            after = before - self._once(self._products(before).astype(SINGLE))
+            share = float((np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1)).max())
+            before = after
+        return share if np.isfinite(share) else np.inf
+
+    def _once(self, rights: NDArray[np.float32], *, transpose: bool = False) -> FloatArray:
+        """Solve with the factor for rows (k, n) in PETSc's order, which are overwritten."""
+        found, rows = library(), np.ascontiguousarray(rights)
+        assert found is not None
+        status = found.solve(self._factor, rows.ctypes.data, len(rows), int(transpose and not self._symmetric))
+        assert status >= 0, status
+        return rows.astype(float)
+
+    def _products(self, rows: FloatArray, *, transpose: bool = False) -> FloatArray:
+        multiply = self._stiffness.matrix.multTranspose if transpose else self._stiffness.matrix.mult
+        found = np.empty_like(rows)
+        for row, product in zip(rows, found, strict=True):
+            self._x.array[:] = row
+            multiply(self._x, self._b)
+            product[:] = self._b.array_r
+        return found
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
+        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides; refine unless it may be rough."""
+        if self._use_double:
+            assert self._double is not None
+            return self._double.solve(right, transpose=transpose, tolerance=tolerance)
+        rights = self._stiffness.unknowns.reorder(np.atleast_2d(right))
+        # Numbers in single precision reach from 1e-38 to 1e38, and lose digits before.
+        sizes = np.abs(rights).max(axis=1, initial=0.0, keepdims=True)
+        sizes[sizes == 0] = 1.0
+        found = sizes * self._once((rights / sizes).astype(SINGLE), transpose=transpose)
+        if tolerance < ROUGH:
+            found = self._refined(found, rights, tolerance, transpose=transpose)
+        return self._stiffness.unknowns.take(found).reshape(right.shape)
+
+    def _refined(self, x: FloatArray, rights: FloatArray, tolerance: float, *, transpose: bool) -> FloatArray:
+        """Refine rows until steps are below the tolerance, or no longer fall: that is rounding in double precision."""
+        before = np.inf
+        for _ in range(REFINEMENTS):
+            residuals = rights - self._products(x, transpose=transpose)
+            sizes = np.abs(residuals).max(axis=1, initial=0.0, keepdims=True)
+            sizes[sizes == 0] = 1.0
+            step = sizes * self._once((residuals / sizes).astype(SINGLE), transpose=transpose)
+            lengths = np.linalg.norm(x, axis=1)
+            share = float((np.linalg.norm(step, axis=1) / np.where(lengths > 0, lengths, 1.0)).max())
+            if not share < before / 2:
+                break
+            x, before = x + step, share
+            if share <= tolerance * 1e-2:
+                break
+        return x
+
+    def release(self) -> None:
+        """Free the factor."""
+        self._end()
+        if self._double is not None:
+            self._double.release()
+
+    def _end(self) -> None:
+        found = library()
+        if found is not None and self._factor:
+            found.end(self._factor)
+        self._factor, self._analysed = None, False
+
+    def __del__(self) -> None:
+        if not MPI.Is_finalized():
+            self._end()
+
+    def negative_eigenvalues(self) -> int | None:
+        """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues of K; None for LU."""
+        if self._use_double:
+            assert self._double is not None
+            return self._double.negative_eigenvalues()
+        found = library()
+        return int(found.told(self._factor, 12)) if self._symmetric and found is not None else None
+
+    def memory(self) -> int:
+        """Return the bytes of the last factor with its working memory, in whole megabytes; 0 before."""
+        if self._use_double:
+            assert self._double is not None
+            return self._double.memory()
+        found = library()
+        return 10**6 * int(found.told(self._factor, 22)) if found is not None and self._analysed else 0
+
+
+def _entries(matrix: Any, *, half: bool) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Return rows and columns from one, and entries; of the lower half only."""
+    starts, columns, values = matrix.getValuesCSR()
+    rows = np.repeat(np.arange(1, len(starts), dtype=np.int32), np.diff(starts))
+    columns = columns.astype(np.int32) + np.int32(1)
+    if half:
+        lower = columns <= rows
+        rows, columns, values = rows[lower], columns[lower], values[lower]
+    with np.errstate(over="ignore"):
+        return rows, columns, values.astype(SINGLE)
