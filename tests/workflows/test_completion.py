@@ -31,7 +31,14 @@ def test_every_command_and_option_is_known():
     found = {one.name: one for one in commands(_parser())}
     expected = ["check", "run", "report", "serve", "reduce", "init", "live", "schema", "completion"]
     assert list(found) == expected
-    assert {option.name for option in found["run"].options} == {"--help", "--set", "--out", "--quiet", "--no-report"}
+    assert {option.name for option in found["run"].options} == {
+        "--help",
+        "--set",
+        "--out",
+        "--quiet",
+        "--no-report",
+        "--shared",
+    }
     for shell in SHELLS:
         script = completion(shell, _parser())
         for one in found.values():
