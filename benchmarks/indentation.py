@@ -140,9 +140,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--shapes", nargs="*", choices=TOOLS, default=list(TOOLS))
     parser.add_argument("--meshes", nargs="*", type=Mesh.read, default=MESHES)
     parser.add_argument("--random", type=int, default=1000)
+    parser.add_argument("--own", type=int, default=0, help="random ones on a mesh from a file")
     parser.add_argument("--kept", type=Path, default=Path("indentations.jsonl"))
     options = parser.parse_args(arguments or [])
     for name in options.tables:
         tables[name]()
-    if options.random:
-        random(options.random, options.kept)
+    if options.random or options.own:
+        random(options.random, options.kept, options.own)

@@ -12,13 +12,17 @@ import re
 import sys
 import time
 from collections import Counter
+from itertools import product
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from forward.bodies.hexahedra import CORNERS
+from forward.bodies.mesh import FACES, TETRAHEDRA
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError
 
@@ -45,9 +49,42 @@ KINDS = [  # shape, cell, material, formulation
     ("flat", "tetrahedron", "neo-hookean", "displacement"),
     ("cone", "tetrahedron", "mooney-rivlin", "mixed"),
 ]
+OWN = [  # of a mesh from a file
+    ("sphere", "mesh", "neo-hookean", "displacement"),
+    ("cylinder", "mesh", "mooney-rivlin", "mixed"),
+]
+EVERY = [*KINDS, *OWN]
+FIRST_OWN = 10**6  # of these
+CELLS, SHAKEN = 3, 0.2  # of the block, and how far vertices inside lie from those of a grid, over an edge
 BALANCED = 1e-5  # relative difference of forces and reactions that counts as none
 OTHER_WAY, ALIKE = 5, 0.01  # every so many are solved by another way, whose force may differ by so much
 REFUSED, VERIFIED = "refused", "verified"
+
+
+def box(cell: str) -> dict[str, Any]:
+    """Return the block as tissuq makes it."""
+    return {"kind": "box", "size": [SIDE] * 3, "cells": [CELLS] * 3, "degree": 2, "cell": cell}
+
+
+def own_mesh() -> dict[str, Any]:
+    """Return the block as a mesh of irregular tetrahedra in a file of VTK's."""
+    import meshio
+
+    grid = np.stack(np.meshgrid(*[np.arange(CELLS + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = ((grid > 0) & (grid < CELLS)).all(axis=1)
+    points = grid + SHAKEN * np.random.default_rng(0).uniform(-1, 1, grid.shape) * inside[:, None]
+    corner = {tuple(place): k for k, place in enumerate(grid.astype(int).tolist())}
+    cubes = [[corner[tuple(i)] for i in (np.array(at) + CORNERS).tolist()] for at in product(range(CELLS), repeat=3)]
+    cells = np.array(cubes)[:, TETRAHEDRA["hexahedron"]].reshape(-1, 4)
+    faces = cells[:, FACES["tetrahedron"]].reshape(-1, 3)
+    sides = [faces[(grid[faces][:, :, 2] == z).all(axis=1)] for z in (0, CELLS)]
+    numbers = [np.full(len(cells), 9), np.repeat([1, 2], [len(side) for side in sides])]
+    triangles = ("triangle", np.concatenate(sides))
+    path = Path(mkdtemp()) / "block.vtu"
+    mesh = meshio.Mesh(points, [("tetra", cells), triangles], cell_data={"part": numbers})
+    mesh.write(path)
+    names = {"z-min": 1, "z-max": 2}
+    return {"kind": "mesh", "file": str(path), "unit": SIDE / CELLS, "names": names, "degree": 2}
 
 
 def specification(shape: str, cell: str, material: str, formulation: str) -> Hyperelastic:
@@ -57,7 +94,7 @@ def specification(shape: str, cell: str, material: str, formulation: str) -> Hyp
     outputs += [{"name": f"below-{a}", "kind": "reaction", "on": "z-min", "component": a} for a in "xyz"]
     return Hyperelastic.model_validate(
         {
-            "body": {"kind": "box", "size": [SIDE] * 3, "cells": [3, 3, 3], "degree": 2, "cell": cell},
+            "body": own_mesh() if cell == "mesh" else box(cell),
             "material": {"kind": material, **MATERIALS[material]},
             "formulation": formulation,
             "clamp": ["z-min"],
@@ -71,8 +108,8 @@ class Kind:
     """A model whose numbers are drawn: place, depth and size of the tool, and the constants of the material."""
 
     def __init__(self, which: int) -> None:
-        self.shape, self.cell, self.material, self.form = KINDS[which]
-        spec = specification(*KINDS[which])
+        self.shape, self.cell, self.material, self.form = EVERY[which]
+        spec = specification(*EVERY[which])
         self.tool: Any = spec.loads[0]
         sizes = [name for name in TOOLS[self.shape] if name != "axis"]
         self.names = [f"loads.indenter.{name}" for name in ("x", "y", "depth", *sizes)]
@@ -148,12 +185,14 @@ class Kind:
         return []
 
 
-def random(count: int, kept: Path, seed: int = 1) -> None:
-    """Judge random indentations that are not kept yet, and print what became of all."""
+def random(count: int, kept: Path, own: int = 0, seed: int = 1) -> None:
+    """Judge random indentations that are not kept yet, `own` more on a mesh from a file; print what became of all."""
     lines = kept.read_text().splitlines() if kept.exists() else []
     records = {one["number"]: one for one in map(json.loads, lines)}
-    for which in range(len(KINDS)):
-        mine = [i for i in range(which, count, len(KINDS)) if i not in records]
+    asked = [range(which, count, len(KINDS)) for which in range(len(KINDS))]
+    asked += [range(FIRST_OWN + which, FIRST_OWN + own, len(OWN)) for which in range(len(OWN))]
+    for which, numbers in enumerate(asked):
+        mine = [i for i in numbers if i not in records]
         if not mine:
             continue
         kind = Kind(which)
@@ -163,7 +202,7 @@ def random(count: int, kept: Path, seed: int = 1) -> None:
             records[i] = one
             with kept.open("a") as file:
                 file.write(json.dumps(one) + "\n")
-    _print([records[i] for i in sorted(records) if i < count])
+    _print([records[i] for numbers in asked for i in numbers])
 
 
 def _print(records: list[dict[str, Any]]) -> None:
@@ -172,7 +211,7 @@ def _print(records: list[dict[str, Any]]) -> None:
         " forces and reactions,\npenetration over depth, p g over largest p times depth, penetration at nodes; with"
         " stiffer tools; by another way alike\n"
     )
-    for which, kind in enumerate(KINDS):
+    for which, kind in enumerate(EVERY):
         mine = [one for one in records if one["kind"] == which]
         answers = [one for one in mine if one["verdict"] != REFUSED]
         if not answers:

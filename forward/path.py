@@ -44,6 +44,8 @@ class AtStep:
         Number of the step from 1.
     estimable
         Whether an error of the mesh can be estimated.
+    negative
+        Whether it can be below 0.
     """
 
     name: str
@@ -51,6 +53,7 @@ class AtStep:
     of: str
     step: int
     estimable: bool
+    negative: bool
 
 
 class Path(Hyperelastic):
@@ -131,7 +134,7 @@ class Path(Hyperelastic):
     def returned(self) -> tuple[AtStep, ...]:
         """All outputs at the first step, then at the second, and so on."""
         return tuple(
-            AtStep(f"{output.name}.{step}", output.unit, output.name, step, output.estimable)
+            AtStep(f"{output.name}.{step}", output.unit, output.name, step, output.estimable, output.negative)
             for step in range(1, self.count + 1)
             for output in self.outputs
         )

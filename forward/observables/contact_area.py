@@ -19,6 +19,11 @@ class ContactArea(Observable):
     estimable: ClassVar[bool] = False
     tool: str = "indenter"
 
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0."""
+        return False
+
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         import ufl

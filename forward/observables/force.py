@@ -34,6 +34,11 @@ class Force(Observable):
     component: Literal["x", "y", "z", "along"] = "along"
     times: Annotated[float, Gt(0)] = 1.0
 
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0: a tool presses and never pulls."""
+        return self.component != "along"
+
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         import ufl

@@ -20,6 +20,11 @@ class MaxDisplacement(Observable):
     kind: Literal["max-displacement"] = "max-displacement"
     component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0."""
+        return False
+
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         return _Extreme(equations, None if self.component == "magnitude" else AXES.index(self.component))

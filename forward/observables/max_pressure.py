@@ -23,6 +23,11 @@ class MaxPressure(Observable):
     estimable: ClassVar[bool] = False
     tool: str = "indenter"
 
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0."""
+        return False
+
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         return _MaxPressure(equations, self.tool)

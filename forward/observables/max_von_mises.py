@@ -22,6 +22,11 @@ class MaxVonMises(Observable):
     unit: ClassVar[str] = "Pa"
     estimable: ClassVar[bool] = False  # at an edge that is held it grows without end as the mesh is refined
 
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0."""
+        return False
+
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         return _MaxVonMises(equations)

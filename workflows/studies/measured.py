@@ -17,9 +17,10 @@ from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.settings import Settings, one_line
+from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.observations import SCANS, Observations, Placed
-from inverse.data.readings import Units
+from inverse.data.readings import Readings, Units
 from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
@@ -28,7 +29,9 @@ from workflows.config.mistakes import lines
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
     from forward.model import FloatArray
+    from forward.spec import ModelSpec
     from forward.specimen import Specimen
+    from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import SharedMotion
 
 
@@ -198,6 +201,25 @@ def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
     return lambda points: surface.nearest(points)[0]
 
 
+def check_signs(found: OutputData, spec: ModelSpec) -> None:
+    """Refuse measured outputs of a model whose sign cannot be right, over all steps of each.
+
+    Raises
+    ------
+    DataError
+        With a line for each.
+    """
+    of = {one.name: (getattr(one, "of", one.name), getattr(one, "negative", True)) for one in spec.returned}
+    there = [of.get(name, (name, True)) for name in found.names]
+    signs.check([name for name, _ in there], found.values, found.labels, [negative for _, negative in there])
+
+
+def check_readings(found: Readings, model: Specimen) -> None:
+    """Refuse measured outputs of load cases whose sign cannot be right; raises as `check_signs`."""
+    outputs = [model.cases[case].outputs[which] for case, which in zip(found.case, found.which, strict=True)]
+    signs.check(found.names, found.values, found.labels, [output.negative for output in outputs])
+
+
 def read_on(
     path: Path, cases: Mapping[str, Units], body: Body, usual: Reading
 ) -> tuple[Placed, Registered | None, Scan]:
@@ -245,6 +267,7 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
         With every kind of mistake in the file.
     """
     placed, registered, scan = read_on(path, model.measurable, model.body, data)
+    check_readings(placed.observations.readings, model)
     found = placed.observations.with_sigma(None)
     found = replace(found, readings=found.readings.with_sigma({}))
     truth, places, stiffness = scan.truth | data.truth, np.zeros((0, 3)), np.zeros(0)

@@ -22,7 +22,7 @@ from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
-from workflows.studies.measured import DataSet
+from workflows.studies.measured import DataSet, check_signs
 from workflows.studies.predictions import never_estimable
 from workflows.studies.study import Sampled
 
@@ -197,6 +197,7 @@ class OutputInversion(InversionStudy):
         return self._with_errors(read_outputs(path, self.outputs, steps_of(self.model)))
 
     def _with_errors(self, found: OutputData) -> OutputData:
+        check_signs(found, self.model)
         noise = self.data.noise
         return found.with_sigma(self.data.sigma, noise.relative, noise.absolute).with_truth(self.data.truth)
 

@@ -23,6 +23,7 @@ from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.studies.material_tests import WHOLE
+from workflows.studies.measured import check_signs
 from workflows.studies.model_selection import ModelSelection, Positive
 from workflows.studies.output_inversion import derivable
 from workflows.studies.predictions import never_estimable
@@ -71,6 +72,7 @@ class OutputFile(Settings):
             found = (
                 stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs, steps_of(spec))
             )
+            check_signs(found, spec)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         given = np.array([self.sigma.get(name, np.nan) for name in found.names])

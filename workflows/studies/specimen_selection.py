@@ -23,7 +23,7 @@ from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE
-from workflows.studies.measured import onto, read_on
+from workflows.studies.measured import check_readings, onto, read_on
 from workflows.studies.model_selection import ModelSelection, Positive, changed
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ class DisplacementFile(Reading):
         cases = tuple(measurable)
         try:
             placed, registered, scan = read_on(folder / self.file, measurable, specimen.body, self)
+            check_readings(placed.observations.readings, specimen)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         motion = UncertainMotion.of(registered, scan.moved_between(placed.observations.unit))

@@ -9,10 +9,11 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.model import WORK
-from tests.launch import TISSUQ, assert_same_bits, run
+from tests.launch import ROOT, TISSUQ, assert_same_bits, run
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.surrogates.linearisation import linearise
-from workflows.config.study import parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load, parse
 from workflows.studies.contact import with_contact
 
 STUDY = """
@@ -88,3 +89,48 @@ def test_the_map_of_pressures_begins_where_the_mean_was_solved():
         np.testing.assert_allclose(maps[0][name], maps[1][name], rtol=1e-6)
     alone = {rows.shape for rows in model.solve(study.inputs.mean).touched().values()}
     assert alone == {(maps[0].sizes["contact_vertex"], 4)}
+
+
+@pytest.mark.parametrize("name", ["indentation", "palpation"])
+def test_forces_of_the_wrong_sign_are_refused(tmp_path, name):
+    """Many programs count forces that press as negative; a few below 0 may be so by their errors."""
+    text = (ROOT / "configs" / "data" / f"{name}.csv").read_text()
+    place = text.index("force,", text.index("\n4-4") if name == "palpation" else 0)
+
+    def turned(most):
+        rows, done = [], 0
+        for row in text.splitlines():
+            cells = row.split(",")
+            column = 2 if name == "palpation" else 1
+            if place and row[:1].isdecimal() and done < most:
+                cells[column], done = f"-{cells[column]}", done + 1
+            rows.append(",".join(cells))
+        (tmp_path / "turned.csv").write_text("\n".join(rows))
+        return load(ROOT / "configs" / f"{name}.toml", [f"data.files=['{tmp_path}/turned.csv']"])
+
+    assert len(turned(3).measurements) == 1
+    with pytest.raises(StudyError) as caught:
+        turned(100)
+    (line,) = caught.value.args
+    assert ": 'force' is -0." in line
+    assert "are below 0, which it cannot be: a force is positive where the tool presses" in line
+
+
+@pytest.mark.slow  # its forms are its own
+@pytest.mark.fem
+def test_the_shipped_map_of_stiffness_from_forces(tmp_path):
+    """On a coarse mesh: each force sees best what is in its corner, and the report maps what all of them tell."""
+    changes = ("model.body.cells=[3, 3, 1]", "model.body.degree=1", "method.mesh_error=false")
+    words = [word for change in changes for word in ("--set", change)]
+    study = ROOT / "configs" / "palpation-field.toml"
+    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "map", "--quiet", *words, timeout=1200)
+    assert done.returncode in {0, 3}, done.stderr
+    found = xr.load_dataset(tmp_path / "map" / "results.nc").isel(data_set=0)
+    prior = found["stiffness_prior_std"].to_numpy()
+    assert (found["stiffness_std"].to_numpy() < prior).all()
+    places = np.column_stack([found[axis] for axis in "xyz"])
+    for case in ("4-4", "16-4", "4-16", "16-16"):
+        seen = places[(found["alone_stiffness_std"].sel(case=case).to_numpy() / prior).argmin()]
+        at = np.array([float(number) for number in case.split("-")]) / 1e3
+        assert ((seen[:2] > 0.01) == (at > 0.01)).all()
+    assert "by each load case alone" in (tmp_path / "map" / "report.html").read_text()
