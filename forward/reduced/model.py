@@ -95,7 +95,7 @@ class ReducedModel(OneByOne):
         self.spec = Hyperelastic.model_validate(data.spec)
         self.space = ReducedSpace(data, self.places, self.base)
         self.differentiable = True
-        self.asked = 0  # how often the full model was asked
+        self.asked: list[FloatArray] = []  # all parameters (d,) at which the full model was asked
         self.tested = tested and not self.spec.solver.accept_unstable
         self._admission = Admission(self.spec, data.parameters)
         self._tolerance, self._full = tolerance, full
@@ -174,7 +174,7 @@ class ReducedModel(OneByOne):
         spread = np.array(self.data.about["spread"])[self.which]
         if (np.abs(found.estimate.outputs) <= self._tolerance * spread).all():
             return found
-        self.asked += 1
+        self.asked.append(self.whole(np.array(parameters, dtype=float)))
         return self.full.solve(np.array(parameters, dtype=float), None)
 
     def reduced(self, parameters: FloatArray, start: FloatArray | None = None) -> ReducedSolution:

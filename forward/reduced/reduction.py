@@ -260,18 +260,8 @@ class Reduction:
 
     def reduced(self, snapshots: Snapshots, sizes: Sizes) -> ReducedData:
         """Return the reduced model of snapshots."""
-        model, layout = self.model, self.equations.layout
-        states = layout.scatter(snapshots.states)
-        adjoints = layout.scatter(snapshots.adjoints)
-        self._training = states
-        lifts = np.array([row for _, _, row in self._lifts]).reshape(-1, self.equations.size)
-        moved = np.array([[v if n < 0 else p[n] for n, v, _ in self._lifts] for p in snapshots.parameters])
-        moved = moved.reshape(len(states), len(lifts))
-        rest = states - moved @ lifts
-        rest[:, self.equations.fixed] = 0
-        tangents = OF_TANGENTS * layout.scatter(snapshots.tangents)
-        tangents[:, self.equations.fixed] = 0
-        every = np.vstack([rest, tangents])
+        layout = self.equations.layout
+        rest, every = self._held(snapshots)
         self._kept = None
         if sizes.cut is None:
             none = np.zeros((0, self.equations.size))
@@ -283,12 +273,85 @@ class Reduction:
             left = self._left(every, modes[:n])
         n = min(n, len(modes))
         modes = modes[: n + sizes.more]
-        modes = np.vstack([modes, self._of_adjoints(adjoints, modes, n)])
+        modes = np.vstack([modes, self._of_adjoints(layout.scatter(snapshots.adjoints), modes, n)])
+        spread = np.maximum(snapshots.outputs.std(axis=0), 1e-300)
+        return self._of_modes(modes, n, rest, snapshots.parameters, sizes, spread, left)
+
+    def enriched(self, data: ReducedData, answers: Snapshots, sizes: Sizes) -> ReducedData:
+        """Return a reduced model of this body that holds further solutions too, with a mode more for each of them.
+
+        The modes that it had stay the first ones; the new ones hold what these leave of the solutions, and those of the
+        larger model what is left of changes along the parameters. Points are chosen again, for all snapshots as the
+        modes hold them.
+        """
+        layout, n = self.equations.layout, data.levels[0].modes
+        old = layout.scatter(data.fields)[data.before :]
+        rest, every = self._held(answers)
+        fresh = basis.orthonormal(rest, self.inner, old[:n], len(rest))[0]
+        first = np.vstack([old[:n], fresh])
+        beside = np.vstack([old[n:], self._normed(every[len(rest) :])])
+        modes = np.vstack([first, basis.orthonormal(beside, self.inner, first, len(beside))[0]])
+        modes = np.vstack([modes, self._of_adjoints(layout.scatter(answers.adjoints), modes, len(fresh))])
+        whole = np.vstack([data.coordinates[:, data.before :] @ old, rest])
+        parameters = np.vstack([data.snapshots, answers.parameters])
+        self._kept = None
+        truncation = self._left(rest, first)
+        spread = np.array(data.about["spread"])
+        return self._of_modes(
+            modes, len(first), whole, parameters, sizes, spread, max(truncation, data.about["truncation"])
+        )
+
+    def _moved(self, parameters: FloatArray) -> FloatArray:
+        """Return the coordinates (s, l) of what prescribed displacements move."""
+        moved = np.array([[v if n < 0 else p[n] for n, v, _ in self._lifts] for p in parameters])
+        return moved.reshape(len(parameters), len(self._lifts))
+
+    @property
+    def _lift_rows(self) -> FloatArray:
+        return np.array([row for _, _, row in self._lifts]).reshape(-1, self.equations.size)
+
+    def _held(self, snapshots: Snapshots) -> tuple[FloatArray, FloatArray]:
+        """Return states (s, U_local) less what prescribed displacements move, and all rows that modes are to hold."""
+        layout, fixed = self.equations.layout, self.equations.fixed
+        rest = layout.scatter(snapshots.states) - self._moved(snapshots.parameters) @ self._lift_rows
+        tangents = OF_TANGENTS * layout.scatter(snapshots.tangents)
+        rest[:, fixed] = 0
+        tangents[:, fixed] = 0
+        return rest, np.vstack([rest, tangents])
+
+    def _of_modes(
+        self,
+        modes: FloatArray,
+        n: int,
+        rest: FloatArray,
+        parameters: FloatArray,
+        sizes: Sizes,
+        spread: FloatArray,
+        truncation: float,
+    ) -> ReducedData:
+        """Return the reduced model of the first n of some modes, and the larger one of all of them.
+
+        Parameters
+        ----------
+        modes
+            Modes (N, U_local).
+        n
+            How many the model has.
+        rest, parameters
+            Snapshots (s, U_local) less what prescribed displacements move, and their parameters (s, d).
+        sizes
+            What the points may miss.
+        spread, truncation
+            Standard deviations (m,) of the outputs, and what the modes leave, for those who read it.
+        """
+        model, layout = self.model, self.equations.layout
+        lifts, moved = self._lift_rows, self._moved(parameters)
+        self._training = rest + moved @ lifts
         tests = np.array(self._tests).reshape(-1, self.equations.size)
         rows = np.vstack([lifts, tests, modes])
-        coordinates = np.hstack([moved, np.zeros((len(states), len(tests))), rest @ self.inner(modes).T])
-        outputs = tuple(make(rows, snapshots.parameters) for make in self._outputs)
-        levels, told = self._levels(rows, coordinates, snapshots.parameters, (n, len(modes)), sizes)
+        coordinates = np.hstack([moved, np.zeros((len(rest), len(tests))), rest @ self.inner(modes).T])
+        outputs = tuple(make(rows, parameters) for make in self._outputs)
+        levels, told = self._levels(rows, coordinates, parameters, (n, len(modes)), sizes)
         whole = layout.gather(rows)
         assert whole is not None
         cells, kind = layout.cells()
@@ -299,8 +362,8 @@ class Reduction:
             parameters=model.parameters,
             nominal=self.nominal,
             spread=self.spread,
-            lower=snapshots.parameters.min(axis=0),
-            upper=snapshots.parameters.max(axis=0),
+            lower=parameters.min(axis=0),
+            upper=parameters.max(axis=0),
             numbers=self._numbers,
             coefficients=tuple((field.field.label, field.positions) for field in fields),
             lifts=tuple((number, value) for number, value, _ in self._lifts),
@@ -315,15 +378,15 @@ class Reduction:
             cell_kind=kind,
             regions=model.space.regions(),
             factors=tuple(self._factor(i) for i in range(len(fields))),
-            snapshots=snapshots.parameters,
+            snapshots=parameters,
             coordinates=coordinates,
             about={
-                "snapshots": len(states),
+                "snapshots": len(rest),
                 "modes": n,
                 "modes of the larger model": len(modes),
-                "truncation": left,
+                "truncation": truncation,
                 "unknowns": int(layout.size),
-                "spread": np.maximum(snapshots.outputs.std(axis=0), 1e-300).tolist(),
+                "spread": spread.tolist(),
                 **told,
             },
         )
@@ -369,8 +432,11 @@ class Reduction:
         """Return modes of adjoints beside those of states; never the same ones, to which the residual is orthogonal."""
         if not len(adjoints):
             return np.zeros((0, self.equations.size))
-        sizes = np.sqrt(np.maximum((adjoints * self.inner(adjoints)).sum(axis=1), 1e-300))
-        return basis.orthonormal(adjoints / sizes[:, None], self.inner, modes, most)[0]
+        return basis.orthonormal(self._normed(adjoints), self.inner, modes, most)[0]
+
+    def _normed(self, rows: FloatArray) -> FloatArray:
+        """Return rows (k, U_local) of norm 1."""
+        return np.asarray(rows / np.sqrt(np.maximum((rows * self.inner(rows)).sum(axis=1), 1e-300))[:, None])
 
     def _factor(self, number: int) -> tuple[FloatArray, FloatArray, float]:
         """Return the logarithm of a random field at the nodes, its slopes, and the variance that is kept."""

@@ -181,13 +181,16 @@ class _Making:
             return found
         first = UNSEEN
         points = inputs.points(random_points((method.seed, 1), first, first + method.unseen, len(inputs.names)))
-        full = self._evaluate(Request(points, fields=KeptStates(None), start=self._start))
+        full = self._evaluate(Request(points, tangents=True, fields=KeptStates(None), start=self._start))
         ok = full.ok
         states = iter(np.zeros((0, 1)) if full.sketches is None else full.sketches[:, 0])
         model = ReducedModel(data, data.parameters)
         n, m = method.unseen, len(names)
         errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
         estimated_state = np.full(n, np.nan)
+        gradients = np.full(
+            (2, n, m, len(inputs.names)), np.nan
+        )  # times standard deviations: of the body, and what is off
         for i, point in enumerate(points):
             state = next(states) if ok[i] else None
             try:
@@ -198,13 +201,19 @@ class _Making:
                 errors[i], estimates[i] = full.outputs[i] - solution.outputs, solution.estimate.outputs
                 of_state[i] = np.linalg.norm(state - solution.state) / np.linalg.norm(state)
                 estimated_state[i] = solution.estimate.state
+                assert full.tangents is not None
+                own = solution.adjoint(np.eye(m))
+                gradients[:, i] = np.array([full.tangents[i], full.tangents[i] - own]) * inputs.std
         good = np.isfinite(errors).all(axis=1) & np.isfinite(estimates).all(axis=1)
         e, x, spread = errors[good], estimates[good], np.array(data.about["spread"])
         told: dict[str, Any] = {"unseen": int(good.sum())}
         if good.any():
             rms, left = np.sqrt((e**2).mean(axis=0)), np.sqrt(((e - x) ** 2).mean(axis=0))
             effectivity = (x * e).sum(axis=0) / np.maximum((e**2).sum(axis=0), 1e-300)
+            of_body, off = np.sqrt((gradients[:, good] ** 2).sum(axis=3).mean(axis=1))
+            of_gradients = off / np.maximum(of_body, 1e-300)
             told |= {
+                "errors of gradients": dict(zip(names, of_gradients.tolist(), strict=True)),
                 "errors": dict(zip(names, (rms / spread).tolist(), strict=True)),
                 "errors after correction": dict(zip(names, (left / spread).tolist(), strict=True)),
                 "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),

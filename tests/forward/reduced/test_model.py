@@ -13,6 +13,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS
 from forward.model import InadmissibleError, ModelError
 from forward.reduced.data import load, save
+from forward.reduced.enrichment import enriched
 from forward.reduced.integrands import of_density, of_form
 from forward.reduced.limits import mistakes
 from forward.reduced.model import ReducedModel, outside_of
@@ -189,10 +190,35 @@ def test_what_it_is_not_for_is_said(full, small):
 def test_the_full_model_is_asked_where_the_estimate_is_too_large(full, small):
     model = ReducedModel(small, full.parameters, tolerance=1e-9, full=lambda: full)
     np.testing.assert_allclose(model.solve(NOMINAL).outputs, full.solve(NOMINAL).outputs, rtol=1e-9)
-    assert model.asked == 1
+    assert len(model.asked) == 1
     generous = ReducedModel(small, full.parameters, tolerance=1e9, full=lambda: full)
     generous.solve(NOMINAL)
-    assert generous.asked == 0
+    assert generous.asked == []
+
+
+def test_what_the_full_model_was_asked_enriches_it(full, snapshots, small, tmp_path):
+    """Its answer is held then, with one mode more; what was known before is not lost."""
+    far = NOMINAL + SPREAD * np.array([-2, 1.5, 2, -1, 1, 1, -1])
+    asking = ReducedModel(small, full.parameters, tolerance=1e-9, full=lambda: full)
+    asking.solve(far)
+    save(enriched(small, np.array(asking.asked), cubature=1e-9), tmp_path / "more.npz")
+    more = load(tmp_path / "more.npz")
+    assert more.levels[0].modes == small.levels[0].modes + 1
+    assert len(more.snapshots) == len(small.snapshots) + 1
+    assert (more.lower <= far).all()
+    assert (more.upper >= far).all()
+    before, after = ReducedModel(small, full.parameters), ReducedModel(more, full.parameters)
+
+    def errors(point):
+        outputs, spread = full.solve(point).outputs, np.array(small.about["spread"])
+        return [float(np.abs((model.solve(point).outputs - outputs) / spread).max()) for model in (before, after)]
+
+    old, new = errors(far)
+    assert new < 1e-6 * old, (old, new)
+    for point in snapshots.parameters[:2]:
+        old, new = errors(point)
+        assert new < 1.5 * old, (old, new)
+    check_derivatives(after, NOMINAL, 0.2 * SPREAD).require()
 
 
 def test_it_is_loaded_and_solved_without_fenicsx(small, tmp_path):
