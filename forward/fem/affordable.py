@@ -11,6 +11,7 @@ from forward.fem.cost import MOST_BYTES, REPORT, START, Estimate, estimate
 MOST_UNKNOWNS = 40_000
 TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough
 SHARE = 0.2  # of what a study takes without its solves
+COARSEST = 0.35  # the same for the last of these meshes: without any, half of what is seen would be in doubt
 AROUND = 0.15  # processor time (s) of what estimates need besides: forms to be loaded, a longer report
 
 
@@ -37,8 +38,8 @@ def own_estimate(spec: Any) -> Estimate:
     return found
 
 
-def allowance(spec: Any, spare: float) -> float:
-    """Predict the processor time (s) that a calibration may take: so many solves, and a part of what comes once.
+def allowance(spec: Any, spare: float, share: float = SHARE) -> float:
+    """Predict the processor time (s) that a calibration may take: so many solves, and a share of what comes once.
 
     By counts only, and so the same on every machine.
     """
@@ -46,7 +47,7 @@ def allowance(spec: Any, spare: float) -> float:
         return math.inf
     cost = spec.cost()
     once = START + REPORT + cost.first + cost.reference_factor(2)
-    return float(SHARE * once + spare * cost.sample - AROUND - own_estimate(spec).once)
+    return float(share * once + spare * cost.sample - AROUND - own_estimate(spec).once)
 
 
 def richer(spec: Any) -> float:
@@ -59,8 +60,8 @@ def richer(spec: Any) -> float:
 def finer(spec: Any, spare: float = math.inf) -> Finer | None:
     """Return a body on the finest mesh that is affordable; None where any takes too much."""
     formulation, left = "mixed" if spec.mixed else "displacement", MOST_BYTES - own_estimate(spec).bytes
-    allowed = allowance(spec, spare)
     for times in TIMES:
+        allowed = allowance(spec, spare, COARSEST if times == TIMES[-1] else SHARE)
         body = _with_cells(spec, times)
         if body is None:
             continue

@@ -133,10 +133,10 @@ class FinerMesh:
         if np.delete(point, self._scalars).any() or self._finer is None:
             return None
         usual, bent = solution.mesh_error().outputs, THOROUGH[model.spec.mixed]
-        own = solution.estimated(model.enriched, bent)
+        own = solution.estimated(model.enriched, (solution.enriched_state, bent))
         seen = model.enriched.values(solution, own) - solution.outputs
         other, there = self._solved(point[self._scalars], own.state)
-        richer = there.estimated(other.enriched, bent)
+        richer = there.estimated(other.enriched, (there.enriched_state, bent))
         seen_there = other.enriched.values(there, richer) - there.outputs
         times, degree = self._finer.times, model.spec.body.degree
         found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
@@ -198,10 +198,9 @@ def _moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> Flo
         values = whole[:, start : start + components * len(nodes)].reshape(len(rows), -1, components)
         start += components * len(nodes)
         numbers = canonical[spaces.global_node_numbers(source)]
-        weights, _ = spaces.point_weights(source, points)
+        mine, of_points, weights, _ = spaces.point_rows(source, points)
         moved = np.zeros((len(rows), len(points), components))
-        for i, one in enumerate(weights):
-            if one is not None:
-                moved[:, i] = one[1] @ values[:, numbers[one[0]]]
+        some = values[:, numbers[of_points[mine]]]
+        moved[:, mine] = np.einsum("nk,rnkc->rnc", weights[mine], some, optimize=True)
         parts.append(moved.reshape(len(rows), -1))
     return np.asarray(here.comm.allreduce(np.concatenate(parts, axis=1)))

@@ -66,9 +66,9 @@ PER_NONZERO = 6e-8  # of the matrix and the analysis before the first factorisat
 PER_ENTRY_SOLVED = 2e-9  # of a back-substitution
 TOGETHER = 0.65  # of a back-substitution for one of many right-hand sides over one alone
 IN_LOCKSTEP = 0.25  # the same where samples are corrected together, with sides that are all there at once
-START = 3.0  # of the program, with all that it imports
+START = 1.4  # of the program, with all that it imports
 COMPILATION = 6.0  # of the forms of a body that are not compiled yet, one second each
-REPORT = 3.5  # of results and their report
+REPORT = 2.3  # of results and their report
 CALL = 2e-4  # of any of these on a vanishingly small body
 # Counts, in bodies that are slender (and turn as they bend) and in others.
 SLENDER = 3.0  # longest extent over the shortest
@@ -81,7 +81,7 @@ DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
 SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
 MOST_BYTES = 4e9  # of factors for estimates, where there is another way
-BLOCKS = {"hexahedron": 0.4, "tetrahedron": 1.0}  # of an assembly, for the blocks of the nodes
+BLOCKS = 9  # residuals, for the blocks of the nodes
 ACTION = 2  # a product with the stiffness, over a residual
 SMOOTHING, ROUGHLY = 12, 5  # steps in the enriched space, and solves with a factor of the body, of an estimate
 SADDLES = 3  # times as many steps and solves with pressures, of two solutions
@@ -412,7 +412,7 @@ def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) ->
     if not mixed:
         if body.degree == 1 and not alone:
             return referred
-        return Estimate(Way.SMOOTHING, smoothed, BLOCKS[enriched.cell] * fine.assembly, vectors)
+        return Estimate(Way.SMOOTHING, smoothed, BLOCKS * fine.residual, vectors)
     matrix = COPIES * BYTES_PER_NONZERO * factor(enriched, mixed=True).nonzeros
     stepped = Estimate(Way.SMOOTHING, smoothed, fine.setup + fine.assembly, vectors + matrix)
     return min((referred, stepped), key=lambda way: way.once + SEVERAL * way.seconds)

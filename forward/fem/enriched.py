@@ -247,8 +247,8 @@ class Enriched:
         solution
             A solution of the body.
         bent
-            Nonlinearity above which more steps are made; None for the usual one, and then one step with the stiffness
-            at the solution is enough.
+            Nonlinearity above which another step is made, one where the stiffness at the solution will do; None for
+            the usual one.
 
         Raises
         ------
@@ -256,9 +256,6 @@ class Enriched:
             If the stiffness is singular.
         """
         equations = self.equations
-        once = bent is None
-        if bent is None:
-            bent = BENT_MIXED if equations.spec.mixed else BENT
         equations.work = Work()
         forces = -self.imbalance(solution)
         (change,) = self._solve(solution, forces[None])
@@ -267,29 +264,52 @@ class Enriched:
         energy = 0.5 * equations.curvature(change, forces)
         equations.set_state(start)
         stored = float(self._stored())
-        before, step, linearised, moved = start, change, start, Moved(solution, start + change)
-        left = self.imbalance(moved)
+        left = self.imbalance(Moved(solution, start + change))
         far = nonlinearity(energy, stored, equations.curvature(change, left))
+        found = EnrichedState(start + change, change, energy, stored, far, Work(), start, change, start)
+        if bent is None:
+            bent = BENT_MIXED if equations.spec.mixed else BENT
+        return self._nearer(solution, found, left, bent, once=True)
+
+    def nearer(self, solution: Solved, found: EnrichedState, bent: float) -> EnrichedState:
+        """Go on from a state that was found until its nonlinearity is below `bent`; collective.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+        self.equations.work = Work()
+        return self._nearer(solution, found, self.imbalance(Moved(solution, found.state)), bent, once=False)
+
+    def _nearer(
+        self, solution: Solved, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
+    ) -> EnrichedState:
+        """Take steps of Newton's method, of which `left` is the imbalance at first; one if its stiffness is an old one.
+
+        Outputs of second order need u_h + e to be in equilibrium.
+        """
+        equations, start, far = self.equations, self.up(solution.state), found.nonlinearity
         for _ in range(MORE):
             if not bent < far < np.inf:
                 break
-            # Outputs of second order need u_h + e to be in equilibrium.
             # The stiffness at u_h will do; also where steps have left a part of the forces, and no factor is at hand.
             near = far < (BARELY if self.way == Way.SMOOTHING and equations.spec.mixed else NEAR)
             if not near and self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
-            (more,) = self._solve(solution, -left[None], close=CLOSER) if near else self._solve(moved, -left[None])
-            before, step, linearised = moved.enriched, more, start if near else moved.enriched
-            change = change + more
-            moved = Moved(solution, start + change)
-            left = self.imbalance(moved)
-            closer = nonlinearity(energy, stored, equations.curvature(change, left))
+            moved = Moved(solution, found.state)
+            (step,) = self._solve(solution, -left[None], close=CLOSER) if near else self._solve(moved, -left[None])
+            change = found.change + step
+            before, linearised = found.state, start if near else found.state
+            found = found._replace(state=start + change, change=change, before=before, step=step, linearised=linearised)
+            left = self.imbalance(Moved(solution, found.state))
+            closer = nonlinearity(found.energy, found.stored, equations.curvature(change, left))
             settled = closer < NEAR and near  # where pressures and displacements cancel, work says little
             far = closer if closer < far or settled else np.inf
             if near and once:
                 break
-        return EnrichedState(start + change, change, energy, stored, far, equations.work, before, step, linearised)
+        return found._replace(nonlinearity=far, work=equations.work)
 
     def _solve(
         self, solution: Solved, right: FloatArray, *, transpose: bool = False, close: float = CLOSE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +13,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import linear, multigrid, single, spaces, unknowns
+from forward.fem.dolfinx import assembly, linear, multigrid, nodal_blocks, single, spaces, unknowns
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
@@ -23,7 +24,7 @@ from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-FEWER = {"hexahedron": 2, "tetrahedron": 0}  # degrees of quadrature, for what only preconditions
+OF_MODULI = 2  # degree of quadrature of their means
 
 
 class Preconditioner(NamedTuple):
@@ -89,29 +90,61 @@ class Linearisation(Forms):
         return multigrid.MultigridSolver(matrix, linear.DirectSolver(coarse), transfer, self.fixed, fixed)
 
     @cached_property
-    def _nodal_blocks(self) -> linear.NodalBlocks:
-        few = {"quadrature_degree": max(self.spec.body.quadrature - FEWER[self.spec.body.cell], 1)}
-        rough = [one.reconstruct(metadata=one.metadata() | few) for one in self._of_stiffness.integrals()]
-        return linear.NodalBlocks(self._bilinear(ufl.Form(rough)), self._constraints, self.space, self.comm)
+    def _moduli(self) -> tuple[assembly.PointValues, FloatArray]:
+        """∂P along `_along` (n_cells, 9 q) at a few points of the cells, and the weights (q,) of these."""
+        changes = self._invariants.derivative(self.stress_of(self._potential), self._state, self._along)
+        points, weights = (of(self.space, OF_MODULI) for of in (spaces.quadrature_points, spaces.quadrature_weights))
+        return self.at(ufl.as_vector([changes[a, k] for a in range(3) for k in range(3)]), points, often=True), weights
+
+    def moduli(self) -> FloatArray:
+        """Means ∂P_ak/∂F_bl (n_cells, a, k, b, l) (Pa) over this rank's cells, at the state that is set."""
+        changes, weights = self._moduli
+        found = []
+        for b, place in itertools.product(range(3), spaces.node_coordinates(self.space).T):
+            along = np.zeros((self.nodes_owned, 3))
+            along[:, b] = place
+            self.unknowns.give(self._along, self.with_pressures(along.ravel()))
+            self.work.residuals += 1
+            found.append(np.einsum("q,cqi->ci", weights, changes().reshape(-1, len(weights), 9)) / weights.sum())
+        return np.asarray(np.stack(found, axis=-1).reshape(-1, 3, 3, 3, 3))
+
+    @cached_property
+    def _nodal_blocks(self) -> nodal_blocks.NodalBlocks:
+        return nodal_blocks.NodalBlocks(self.space)
+
+    @cached_property
+    def _blocks_of_boundaries(self) -> linear.BoundaryBlocks | None:
+        """What loads on boundaries that follow the body, and tools, add to these; None without any."""
+        rest = [one for one in self._of_stiffness.integrals() if one.integral_type() != "cell"]
+        return linear.BoundaryBlocks(self._bilinear(ufl.Form(rest)), self.space, self.comm) if rest else None
+
+    def _blocks(self) -> FloatArray | None:
+        """The 3×3 blocks (n_owned, 3, 3) of the nodes, roughly; None if one of this rank is not positive definite."""
+        blocks = self._nodal_blocks(self.moduli())
+        if self._blocks_of_boundaries is not None:
+            blocks += self._blocks_of_boundaries()
+        nodes, axes = np.divmod(self.fixed, 3)
+        blocks[nodes, axes] = blocks[nodes, :, axes] = 0
+        blocks[nodes, axes, axes] = 1
+        return blocks if linear.positive(blocks) else None
 
     def preconditioner(self) -> Preconditioner | None:
         """Return what a few steps at and near the state that is set are preconditioned by; collective.
 
-        The 3×3 blocks of the nodes, which cost an assembly, but no matrix; of hexahedra with fewer points of
-        quadrature, a third of the time. With pressures a matrix is made, which does not stay. None if a block on any
-        rank is not positive definite.
+        The 3×3 blocks of the nodes, from means of the moduli of the cells. With pressures a matrix is made, which does
+        not stay. None if a block on any rank is not positive definite.
         """
-        self.work.assemblies += 1
         if self.p is not None:
+            self.work.assemblies += 1
             saddle = linear.SaddleBlocks(
                 self._new_matrix(self._stiffness, symmetric=self.symmetric), self.nodes_owned, self.fixed
             )
             good = ranks.smallest(self.comm, float(saddle.good)) > 0
             return Preconditioner(saddle.inverse(), saddle.weights) if good else None
-        blocks, fixed = self._nodal_blocks.inverted(), self.fixed
+        blocks, fixed = self._blocks(), self.fixed
         if ranks.smallest(self.comm, -1.0 if blocks is None else 1.0) < 0 or blocks is None:
             return None
-        kept = blocks
+        kept = np.linalg.inv(blocks)
 
         def apply(r: FloatArray) -> FloatArray:
             z: FloatArray = np.einsum("nij,nj->ni", kept, r.reshape(-1, 3)).ravel()

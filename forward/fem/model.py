@@ -552,12 +552,15 @@ class FiniteElementSolution:
         self._model.visit(self)
         return self.estimated(self._model.enriched)
 
-    def estimated(self, enriched: Enriched, bent: float | None = None) -> EnrichedState:
-        """Find the state in an enriched space; solves with the stiffness of the body are charged to it too."""
+    def estimated(self, enriched: Enriched, nearer: tuple[EnrichedState, float] | None = None) -> EnrichedState:
+        """Find the state in an enriched space; solves with the stiffness of the body are charged to it too.
+
+        With `nearer`, go on from one until its nonlinearity is below a bound.
+        """
         self._model.visit(self)
         kept, self.work = self.work, Work()
         try:
-            found = enriched.state(self, bent)
+            found = enriched.state(self) if nearer is None else enriched.nearer(self, *nearer)
             work = found.work.as_array() + self.work.as_array()
         finally:
             self.work = kept

@@ -60,20 +60,21 @@ def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatAr
     else:
         scaled = slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
         ways = np.linalg.svd(np.nan_to_num(scaled), full_matrices=False)[2][: count - 1]
-    best, least = np.empty((0, d)), np.inf
-    for number in range(DESIGNS if count <= FEW else DESIGNS // 4):
-        drawn = (
-            latin_points((seed, STREAM + number), count - 1, d)
-            if count <= FEW
-            else sobol_points(seed, STREAM + number, 0, count - 1, d)
-        )
-        points = np.vstack([inputs.mean, inputs.points(drawn)])
-        along = np.column_stack([np.ones(count), inputs.coordinates.of(points) @ ways.T])
-        known = np.linalg.inv(along.T @ along + FALL * np.eye(along.shape[1]))
-        score = float(np.trace(known)) + count * float(np.maximum(np.abs(along) - FAR, 0.0).max())
-        if score < least:
-            best, least = points, score
-    return best
+    few = count <= FEW
+    numbers = range(STREAM, STREAM + (DESIGNS if few else DESIGNS // 4))
+    drawn = [
+        latin_points((seed, number), count - 1, d) if few else sobol_points(seed, number, 0, count - 1, d)
+        for number in numbers
+    ]
+    others = inputs.points(np.concatenate(drawn))  # all at once: inverse distributions take a while
+    along = inputs.coordinates.of(np.vstack([inputs.mean, others])) @ ways.T
+    of_mean = np.broadcast_to(along[0], (len(drawn), 1, along.shape[1]))
+    designs = np.concatenate([of_mean, along[1:].reshape(len(drawn), count - 1, -1)], axis=1)
+    designs = np.concatenate([np.ones((*designs.shape[:2], 1)), designs], axis=2)
+    known = np.linalg.inv(designs.swapaxes(1, 2) @ designs + FALL * np.eye(designs.shape[2]))
+    far = np.maximum(np.abs(designs) - FAR, 0.0).max(axis=(1, 2))
+    best = int(np.argmin(np.trace(known, axis1=1, axis2=2) + count * far))
+    return np.vstack([inputs.mean, others[best * (count - 1) : (best + 1) * (count - 1)]])
 
 
 @dataclass(frozen=True)

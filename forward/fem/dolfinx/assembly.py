@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from forward.bodies.geometry import Body
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
-from forward.fem.dolfinx.compile import compile_form, compiled, options_for
+from forward.fem.dolfinx.compile import compile_form, compiled, options_for, signature
 from forward.fem.dolfinx.lanes import Kernel, Numbers
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
 from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_ghosts
@@ -36,12 +36,14 @@ class VectorAssembler:
 
     def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any, *, often: bool = False) -> None:
         cells, rest = _parts(form) if often else (None, form)
-        self._forms = [compile_form(part, comm) for part in (cells, rest) if part is not None]
+        parts = [part for part in (cells, rest) if part is not None]
+        names = [signature(part) for part in parts]
+        self._forms = [compile_form(part, comm, name) for part, name in zip(parts, names, strict=True)]
         self._lanes: Kernel | None = None
         if cells is not None and all(one.subdomain_id() == "everywhere" for one in cells.integrals()):
             space = self._forms[0].function_spaces[0]
             nodes, size, values = version.numbers_of(space)
-            self._lanes = _kernel(cells, self._forms[0], space.mesh, Numbers(nodes, size, values), comm)
+            self._lanes = _kernel(names[0], self._forms[0], space.mesh, Numbers(nodes, size, values), comm)
         self._of_cells = self._forms[0]
         if self._lanes is not None:
             self._forms.pop(0)
@@ -74,15 +76,15 @@ def _parts(form: Any) -> tuple[Any | None, Any | None]:
     return (ufl.Form(cells) if cells else None), (ufl.Form(rest) if rest else None)
 
 
-def _kernel(what: Any, made: Any, msh: Any, to: Numbers | int, comm: Any) -> Kernel | None:
-    """A kernel for several cells of what DOLFINx has `made` of a form or an expression; None if there is none."""
+def _kernel(name: str, made: Any, msh: Any, to: Numbers | int, comm: Any) -> Kernel | None:
+    """A kernel for several cells of the form or expression of this name that DOLFINx has `made`; None without one."""
     own = owned_cells(msh)
     places = np.asarray(msh.geometry.x[version.corners_of_cells(msh)[:own]])
     coefficients = [Numbers(*numbers) for numbers in version.coefficients_of(made)]
     own_cells = [one._replace(nodes=one.nodes[:own]) for one in coefficients]
     if isinstance(to, Numbers):
         to = to._replace(nodes=to.nodes[:own])
-    kernel = Kernel(what, places, own_cells, len(version.constants_of(made)), to, comm)
+    kernel = Kernel(name, places, own_cells, len(version.constants_of(made)), to, comm)
     return kernel if kernel.available else None
 
 
@@ -105,15 +107,15 @@ class PointValues:
     """
 
     def __init__(self, expression: Any, points: FloatArray, space: Any, comm: Any, *, often: bool = False) -> None:
-        self._what = what = (expression, points)
+        self._name = signature((expression, points))
         self._comm = comm
         self._expression = compiled(
-            what, lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
+            self._name, lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
         )
         self._mesh = space.mesh
         self.cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
         self._size = len(points) * int(np.prod(expression.ufl_shape))
-        self._lanes = _kernel(what, self._expression, space.mesh, self._size, comm) if often else None
+        self._lanes = _kernel(self._name, self._expression, space.mesh, self._size, comm) if often else None
 
     def __call__(self) -> FloatArray:
         """Return the values (n_cells, q · size of the expression) at the current state."""
@@ -131,7 +133,7 @@ class PointValues:
         """
         nodes, _, values = version.numbers_of(space)
         to = Numbers(nodes, self._size // nodes.shape[1], values)
-        kernel = _kernel(self._what, self._expression, self._mesh, to, self._comm)
+        kernel = _kernel(self._name, self._expression, self._mesh, to, self._comm)
         return None if kernel is None else lambda sums: kernel(version.constants_of(self._expression), sums)
 
 

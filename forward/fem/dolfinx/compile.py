@@ -73,18 +73,23 @@ def _lock(name: str) -> Iterator[None]:
         yield
 
 
-def folder_of(what: Any, beside: str = "") -> Path:
-    """Where what is compiled of forms or expressions is kept, or what is made from that."""
-    return _CACHE / f"{ffcx.naming.compute_signature([what], '')}{beside}"
+def signature(what: Any) -> str:
+    """Name of a form, an element, or an expression with its points; it takes a while to find."""
+    return str(ffcx.naming.compute_signature([what], ""))
 
 
-def compiled(what: Any, make: Callable[[Path], T], comm: Any, beside: str = "") -> T:
-    """Return what `make` compiles, or loads, in a folder; collective over `comm`.
+def folder_of(name: str, beside: str = "") -> Path:
+    """Where what is compiled under a name is kept, or what is made from that."""
+    return _CACHE / f"{name}{beside}"
+
+
+def compiled(name: str, make: Callable[[Path], T], comm: Any, beside: str = "") -> T:
+    """Return what `make` compiles, or loads, in the folder of a name (its `signature`); collective over `comm`.
 
     However many processes ask for it at the same time, one compiles: in a folder that is renamed when it is complete,
     so that none ever finds half of it, or waits for a process that was killed. What exists is loaded without a lock.
     """
-    folder = folder_of(what, beside)
+    folder = folder_of(name, beside)
     if comm.bcast(folder.is_dir() if comm.rank == 0 else None):
         return make(folder)
     with _lock(folder.name) if comm.rank == 0 else nullcontext():
@@ -106,6 +111,6 @@ def _vacant(folder: Path) -> Path:
     return folder if folder.is_dir() else Path(tempfile.mkdtemp(dir=_CACHE))
 
 
-def compile_form(form: Any, comm: Any) -> Any:
-    """Compile a UFL form, once per machine; collective over `comm`."""
-    return compiled(form, lambda folder: fem.form(form, **options_for(folder)), comm)
+def compile_form(form: Any, comm: Any, name: str = "") -> Any:
+    """Compile a UFL form, once per machine, under its `signature`, which may be known; collective over `comm`."""
+    return compiled(name or signature(form), lambda folder: fem.form(form, **options_for(folder)), comm)

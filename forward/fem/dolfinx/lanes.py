@@ -120,8 +120,8 @@ class Kernel:
 
     Parameters
     ----------
-    what
-        The UFL form or expression that has been compiled.
+    name
+        Under which FFCx's code is kept (`compile.signature`).
     places
         Corners (n_cells, k, 3).
     coefficients
@@ -141,7 +141,7 @@ class Kernel:
 
     def __init__(
         self,
-        what: Any,
+        name: str,
         places: FloatArray,
         coefficients: Sequence[Numbers],
         constants: int,
@@ -152,7 +152,7 @@ class Kernel:
         loop = _loop(places.shape[1] * places.shape[2], coefficients, constants, to)
         text = hashlib.sha256(loop.encode()).hexdigest()[:4]  # an expression is stored, or added up
         beside = f"-lanes-{_VERSION}-{text}"
-        self._assemble = compiled(what, lambda folder: self._load(folder, what, loop, comm), comm, beside)
+        self._assemble = compiled(name, lambda folder: self._load(folder, name, loop, comm), comm, beside)
         self.available = self._assemble is not None
         self._cells = len(places)
         self._places = _grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
@@ -160,10 +160,10 @@ class Kernel:
         nodes, values = self._kept
         self._nodes, self._values = _addresses(nodes), _addresses(values)
 
-    def _load(self, folder: Path, what: Any, loop: str, comm: Any) -> Any:
+    def _load(self, folder: Path, name: str, loop: str, comm: Any) -> Any:
         library = folder / "lanes.so"
         if comm.rank == 0 and not (folder / "lanes.c").exists():
-            _compile(folder_of(what), loop, folder / "lanes.c", library)
+            _compile(folder_of(name), loop, folder / "lanes.c", library)
         exists = comm.bcast(library.exists() if comm.rank == 0 else None)
         return ctypes.CDLL(str(library)).assemble if exists else None
 

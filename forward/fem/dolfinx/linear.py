@@ -115,35 +115,34 @@ class StiffnessMatrix:
         return found
 
 
-class NodalBlocks:
-    """The 3×3 blocks on the diagonal of a stiffness of displacements, without the rest of it.
+class BoundaryBlocks:
+    """The 3×3 blocks on the diagonal of a stiffness of displacements on boundaries, without the rest of it.
 
     Parameters
     ----------
-    form, constraints, comm
+    form, comm
         As of `StiffnessMatrix`.
     space
         The space of displacements.
     """
 
-    def __init__(self, form: Any, constraints: list[Any], space: Any, comm: Any) -> None:
-        self._form, self._constraints = form, constraints
+    def __init__(self, form: Any, space: Any, comm: Any) -> None:
+        self._form = form
         self._matrix = version.block_diagonal_matrix(space, comm)
         nodes = np.arange(owned_nodes(space) + 1, dtype=np.int32)
         self._matrix.setValuesBlockedLocalCSR(nodes, nodes[:-1], np.zeros(9 * len(nodes[1:])))
         self._matrix.assemble()  # what is on the diagonal has its place now
         self._matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
 
-    def inverted(self) -> FloatArray | None:
-        """Assemble at the state that is set; return the inverses (n_owned, 3, 3), None where one is not positive."""
+    def __call__(self) -> FloatArray:
+        """Assemble at the state that is set; return them (n_owned, 3, 3)."""
         self._matrix.zeroEntries()
-        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
+        fem.petsc.assemble_matrix(self._matrix, self._form)
         self._matrix.assemble()
         rows, _, values = self._matrix.getValuesCSR()
         first, last = self._matrix.getOwnershipRange()
         assert len(values) == 3 * (last - first) == rows[-1]
-        blocks = np.asarray(values).reshape(-1, 3, 3)
-        return np.asarray(np.linalg.inv(blocks)) if _positive(blocks) else None
+        return np.array(values).reshape(-1, 3, 3)
 
 
 class SaddleBlocks:
@@ -189,7 +188,7 @@ class SaddleBlocks:
     @property
     def good(self) -> bool:
         """Whether the blocks of this rank are those of a stable body."""
-        return _positive(self._blocks) and bool((self._schur > 0).all())
+        return positive(self._blocks) and bool((self._schur > 0).all())
 
     def inverse(self) -> Callable[[FloatArray], FloatArray]:
         """Return r (U_local,) → what solves roughly for it; collective."""
@@ -222,7 +221,8 @@ def _nodal_blocks(matrix: Any) -> FloatArray:
     return blocks
 
 
-def _positive(blocks: FloatArray) -> bool:
+def positive(blocks: FloatArray) -> bool:
+    """Whether blocks (n, 3, 3) are all finite and positive definite."""
     finite = np.isfinite(blocks).all()
     return bool(finite and np.linalg.eigvalsh(blocks + blocks.swapaxes(1, 2)).min(initial=1.0) > 0)
 

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from forward.bodies.location import locate
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
-from forward.fem.dolfinx.compile import compiled, options_for
+from forward.fem.dolfinx.compile import compiled, options_for, signature
 from forward.fem.dolfinx.meshes import owned_cells, region_numbers
 from forward.model import FloatArray
 
@@ -22,7 +22,8 @@ def new_space(msh: Any, element: Any) -> Any:
     """Return the space of an element."""
     if not version.ELEMENTS_ARE_COMPILED:
         return version.new_space(msh, element, {})
-    return compiled(element, lambda folder: version.new_space(msh, element, options_for(folder)), msh.comm)
+    name = signature(element)
+    return compiled(name, lambda folder: version.new_space(msh, element, options_for(folder)), msh.comm)
 
 
 def vector_space(msh: Any, degree: int) -> Any:
@@ -94,25 +95,30 @@ def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
     return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
 
 
-def point_weights(
-    space: Any, points: FloatArray
-) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
-    """Return nodes and weights that interpolate at each point (n, 3), on one rank each; collective.
+def point_rows(space: Any, points: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int32], FloatArray, FloatArray]:
+    """Return which points (n, 3) are this rank's, nodes and weights (n, k) that interpolate there; collective.
 
-    A point in no cell gets the weights of the nearest place of the mesh; the other array (n,) holds, on every rank, its
+    A point in no cell gets the weights of the nearest place of the mesh; the last array (n,) holds, on every rank, its
     distance from there (m). The nearest rank, or the first of several, has the point.
     """
     msh, comm = space.mesh, space.mesh.comm
     found = locate(msh.geometry.x[version.corners_of_cells(msh)[: owned_cells(msh)]], points)
     every = np.array(comm.allgather(found.distances))
     # If an edge or a face has several nodes, DOLFINx permutes them: here they are as on the reference cell.
-    values = cell_element(space).tabulate(0, found.local)[0, :, :, 0]
-    mine = every.argmin(axis=0) == comm.rank
-    here = [
-        (np.asarray(space.dofmap.cell_dofs(cell)), np.array(row)) if own else None
-        for cell, row, own in zip(found.cells, values, mine, strict=True)
-    ]
-    return here, every.min(axis=0)
+    element = cell_element(space)
+    values = element.tabulate(0, found.local)[0, :, :, 0]
+    nodes = version.nodes_of_cells(space, len(element.points))
+    some = nodes[found.cells] if len(nodes) else np.zeros((len(points), nodes.shape[1]), dtype=np.int32)
+    return every.argmin(axis=0) == comm.rank, some, np.asarray(values), every.min(axis=0)
+
+
+def point_weights(
+    space: Any, points: FloatArray
+) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
+    """Return the same point by point: nodes and weights, None for those of other ranks; and the distances."""
+    mine, nodes, weights, distances = point_rows(space, points)
+    rows = zip(mine, nodes, weights, strict=True)
+    return [(its, np.array(row)) if own else None for own, its, row in rows], distances
 
 
 def quadrature_points(space: Any, degree: int) -> FloatArray:

@@ -29,15 +29,17 @@ class Transfer:
         from_nodes = version.nodes_of_cells(source, len(here.points))
         to_nodes = version.nodes_of_cells(target, len(there.points))
         owned = owned_nodes(target)
-        nodes, first = np.unique(to_nodes, return_index=True)
-        cells, places = np.divmod(first[nodes < owned], to_nodes.shape[1])
+        every = to_nodes.ravel()
+        first = np.empty(every.max(initial=-1) + 1, dtype=np.int64)
+        first[every[::-1]] = np.arange(len(every))[::-1]  # of several places the first is written last
+        cells, places = np.divmod(first[:owned], to_nodes.shape[1])
         index_map = source.dofmap.index_map
         columns = from_nodes[cells]
-        rows = np.broadcast_to(np.arange(owned)[:, None], columns.shape)
-        entries = (values[places].ravel(), (rows.ravel(), columns.ravel()))
+        ends = columns.shape[1] * np.arange(owned + 1)
         from scipy.sparse import csr_matrix
 
-        self._matrix = csr_matrix(entries, shape=(owned, index_map.size_local + index_map.num_ghosts))
+        shape = (owned, index_map.size_local + index_map.num_ghosts)
+        self._matrix = csr_matrix((values[places].ravel(), columns.ravel(), ends), shape=shape)
         self._matrix.eliminate_zeros()
         self._transposed = self._matrix.T.tocsr()
 
