@@ -109,7 +109,7 @@ class Linearisation(Forms):
         return np.asarray(np.stack(found, axis=-1).reshape(-1, 3, 3, 3, 3))
 
     @cached_property
-    def _nodal_blocks(self) -> nodal_blocks.NodalBlocks:
+    def _of_nodes(self) -> nodal_blocks.NodalBlocks:
         return nodal_blocks.NodalBlocks(self.space)
 
     @cached_property
@@ -118,9 +118,9 @@ class Linearisation(Forms):
         rest = [one for one in self._of_stiffness.integrals() if one.integral_type() != "cell"]
         return linear.BoundaryBlocks(self._bilinear(ufl.Form(rest)), self.space, self.comm) if rest else None
 
-    def _blocks(self) -> FloatArray | None:
+    def nodal_blocks(self) -> FloatArray | None:
         """The 3×3 blocks (n_owned, 3, 3) of the nodes, roughly; None if one of this rank is not positive definite."""
-        blocks = self._nodal_blocks(self.moduli())
+        blocks = self._of_nodes(self.moduli())
         if self._blocks_of_boundaries is not None:
             blocks += self._blocks_of_boundaries()
         nodes, axes = np.divmod(self.fixed, 3)
@@ -141,7 +141,7 @@ class Linearisation(Forms):
             )
             good = ranks.smallest(self.comm, float(saddle.good)) > 0
             return Preconditioner(saddle.inverse(), saddle.weights) if good else None
-        blocks, fixed = self._blocks(), self.fixed
+        blocks, fixed = self.nodal_blocks(), self.fixed
         if ranks.smallest(self.comm, -1.0 if blocks is None else 1.0) < 0 or blocks is None:
             return None
         kept = np.linalg.inv(blocks)

@@ -292,6 +292,23 @@ def test_steps_without_a_factor_come_close(cell, load):
     assert np.corrcoef(cells)[0, 1] > 0.98
 
 
+@pytest.mark.parametrize(("cell", "load"), [("hexahedron", "traction"), ("tetrahedron", "pressure")])
+def test_the_blocks_of_nodes_are_nearly_those_of_the_stiffness(cell, load):
+    direction = {"direction": (0, 0, -1)} if load == "traction" else {}
+    loads = ({"kind": load, "on": "x-max" if direction else "z-max", "size": 400.0, **direction},)
+    model = bent(cells=(4, 2, 2), cell=cell, degree=2, loads=loads).build(MPI.COMM_SELF, ())
+    solution = model.solve(np.zeros(0))
+    equations = model.enriched.visit(solution)
+    stiffness = equations.assembled_stiffness()
+    n, diagonal = equations.nodes_owned, equations.unknowns.take(stiffness.getDiagonal().array)
+    blocks = equations.nodal_blocks()
+    np.testing.assert_allclose(np.einsum("nii->ni", blocks).ravel(), diagonal, rtol=0.1)
+    rows = np.arange(3 * n, dtype=np.int32).reshape(-1, 3)[::7]
+    exact = np.array([stiffness.getValues(row, row) for row in rows])
+    sizes = np.abs(exact).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(blocks[::7] / sizes, exact / sizes, atol=0.1)
+
+
 @pytest.mark.parametrize("D1", [2e5, 5e7])
 def test_steps_without_a_factor_come_close_with_pressures(D1):
     spec = bent(
