@@ -121,6 +121,7 @@ WITH_OPTIONS = {
     "meshes_of_fields": meshes_of_fields.main,
     "oddities": oddities.main,
     "tolerance": tolerance.main,
+    "estimates": estimates.main,
 }
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -29,8 +31,11 @@ CASES: dict[str, tuple[str, int, tuple[str, ...]]] = {
 }
 
 
-def main(only: str = "") -> None:
+def main(arguments: Sequence[str] = ()) -> None:
     """Print a table, a row for each study with a word in its name."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks estimates")
+    parser.add_argument("--only", default="", help="part of the name of a study")
+    only = parser.parse_args(arguments).only
     print("| study | run without (s) | with (s) | more | solves (s) | estimates and their calibration (s) |")
     print("|---|---|---|---|---|---|")
     for name, (config, solves, changes) in CASES.items():

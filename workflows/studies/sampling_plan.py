@@ -11,7 +11,7 @@ from forward.machine import MIB, compiled_forms
 from uq.evaluation.evaluate import OWN, company_of
 from workflows.config.priors import ranges
 from workflows.studies import tolerance_asked
-from workflows.studies.predictions import duration, times_of
+from workflows.studies.predictions import duration, never_estimable, times_of
 
 if TYPE_CHECKING:
     from workflows.studies.sampling import Study
@@ -42,6 +42,9 @@ def plan(study: Study, rank_groups: int) -> list[str]:
     if study.estimates:
         estimates = f"{study.estimates} estimates in elements of one degree more"
         lines.append(f"mesh error  {up_to}{estimates}; none with accuracy.mesh_error = false")
+        never = never_estimable(spec, [output.name for output in spec.returned])
+        if never:
+            lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")
     needed = study.memory + BYTES_OF_PROGRAM
     return [
         *lines,

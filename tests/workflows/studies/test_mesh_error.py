@@ -254,6 +254,9 @@ def test_the_plan_says_what_it_takes():
     assert "estimates" not in "\n".join(plan(off))
     assert on.memory > off.memory
     assert on.solves == off.solves + 3
+    stress = """model.outputs=[{ name = "uy", kind = "max-displacement" }, { name = "vm", kind = "max-von-mises" }]"""
+    assert "none of vm, which need not converge" in "\n".join(plan(load(TINY, [stress])))
+    assert "none of" not in said
 
 
 @pytest.mark.fem
