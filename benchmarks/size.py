@@ -106,7 +106,7 @@ def main(options: Sequence[str] = ()) -> None:
         words = ", ".join(f"{part} {slope:.2f}" for part, slope in zip(PARTS, values, strict=True))
         print(f"\nslopes, {linear}: {words}")
     if given.picture is not None:
-        draw(found, slopes, given.picture)
+        draw(found, slopes, steps_in(given.kept), given.picture)
 
 
 def slopes_of(rows: list[list[float]]) -> list[float]:
@@ -125,6 +125,12 @@ def kept(file: Path, cells: tuple[int, int, int], linear: str, ranks: int, *, st
     with file.open("a") as lines:
         lines.write(json.dumps(about | {"row": row}) + "\n")
     return row
+
+
+def steps_in(file: Path) -> list[list[float]]:
+    """Return the rows of single steps of Newton's method by one rank, which cost too much to be taken to the end."""
+    found = [json.loads(line) for line in file.read_text().splitlines()]
+    return [one["row"] for one in found if one["step"] and one["linear"] == "multigrid" and one["ranks"] == 1]
 
 
 def measured(cells: tuple[int, int, int], linear: str, ranks: int, *, step: bool = False) -> list[float]:
@@ -160,7 +166,9 @@ def of_fields(cells: Sequence[int] = (24, 35)) -> None:
             print(f"| {(n + 1) ** 3:,} | {smoothness} | {times} |", flush=True)
 
 
-def draw(found: dict[str, list[list[float]]], slopes: dict[str, list[float]], file: Path) -> None:
+def draw(
+    found: dict[str, list[list[float]]], slopes: dict[str, list[float]], steps: list[list[float]], file: Path
+) -> None:
     """Draw first solves, derivatives and memory against unknowns, each with its slope."""
     from matplotlib.figure import Figure
 
@@ -171,6 +179,8 @@ def draw(found: dict[str, list[list[float]]], slopes: dict[str, list[float]], fi
             sizes, values = np.array(rows)[:, [0, part + 1]].T
             slope = f", slope {slopes[linear][part]:.2f}" if linear in slopes else ""
             axes.loglog(sizes, values, "o-", label=f"{'factors' if linear == 'factor' else linear}{slope}")
+        if part == len(PARTS) - 1 and steps:
+            axes.loglog(*np.array(steps)[:, [0, -1]].T, "o", mfc="none", color="C1", label="one Newton step")
         axes.set(xlabel="unknowns", ylabel=label)
         axes.grid(visible=True, alpha=0.3)
         axes.legend(frameon=False)
