@@ -108,6 +108,7 @@ WITH_OPTIONS = {
     "intervals": intervals.main,
     "size": size.main,
     "startup": startup.main,
+    "scaling": scaling.main,
     "precision": precision.main,
     "saddle": saddle.main,
     "calibration": calibration.main,

@@ -42,9 +42,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--bodies", nargs="+", choices=sorted(BODIES), default=list(BODIES))
     parser.add_argument("--ratios", type=float, nargs="+", default=[1e2, 1e4], help="κ/μ")
     given = parser.parse_args(list(options))
-    print(
-        "| body | κ/μ | unknowns | two levels: iterations | (s) | blocks: iterations | (s) | factor (s) | its solve (s) |"
-    )
+    print("| body | κ/μ | unknowns | two levels: steps | (s) | blocks: steps | (s) | factor (s) | its solve (s) |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for name in given.bodies:
         for ratio in given.ratios:

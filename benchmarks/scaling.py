@@ -8,6 +8,7 @@ all keys, claims its blocks by files, and reads and adds all blocks at the end.
 
 from __future__ import annotations
 
+import argparse
 import heapq
 import os
 import pickle
@@ -24,7 +25,7 @@ import numpy as np
 from benchmarks.beams import CONFIG, beam
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from forward.model import FloatArray, ForwardModel, Solution
     from uq.evaluation.evaluate import Evaluations
@@ -87,9 +88,16 @@ class Constants:
     read: float
 
 
-def main() -> None:
+def main(options: Sequence[str] = ()) -> None:
     """Print the constants, the check of the simulation by a real run, and the table; draw the picture."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks scaling")
+    parser.add_argument(
+        "--take", type=float, help="of the counter (s), as measured on a quiet machine or on another one"
+    )
+    parser.add_argument("--file", type=float, help="of a block (s), likewise")
+    given = parser.parse_args(list(options))
     constants, short, wide = measured()
+    constants = replace(constants, take=given.take or constants.take, file=given.file or constants.file)
     print(f"counter {constants.take * 1e6:.1f} µs; each block: key {constants.key * 1e3:.2f} ms, ", end="")
     print(f"file {constants.file * 1e3:.1f} ms, reception and sum {constants.merge * 1e3:.2f} ms; ", end="")
     print(f"reference {constants.reference:.1f} solves; ", end="")
