@@ -78,16 +78,18 @@ class Claims:
         path = self._path(key)
         if self._finished():
             return False
-        try:
-            self._create(path)
-        except FileNotFoundError:  # the folder is gone: the study is finished
-            return False
-        except FileExistsError:
-            if not self._stale(path, key):
-                return False
+        if self._stale(path, key):
             with suppress(OSError):
                 path.unlink()
-                self._create(path)
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(self._name)
+        except FileExistsError:
+            return False
+        except FileNotFoundError:  # the folder is gone: the study is finished, or somebody has removed it
+            if not self._finished():
+                self._folder.mkdir(parents=True, exist_ok=True)
+            return False
         self._held[key] = self._beaten = time.monotonic()
         return True
 
@@ -105,8 +107,10 @@ class Claims:
         begun = self._held.pop(key, None)
         if begun is not None:
             self._patience = max(self._patience, LONG * (time.monotonic() - begun))
+            path = self._path(key)
             with suppress(OSError):
-                self._path(key).unlink()
+                if path.read_text(encoding="utf-8") == self._name:  # or else it was taken over
+                    path.unlink()
 
     def turned(self, pieces: Sequence[T]) -> tuple[T, ...]:
         """Return pieces of work from another one on for each job, so that they rarely meet."""
@@ -143,10 +147,6 @@ class Claims:
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.claim"
-
-    def _create(self, path: Path) -> None:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(self._name)
 
     def _stale(self, path: Path, key: str) -> bool:
         """Whether a claim has not changed for long."""

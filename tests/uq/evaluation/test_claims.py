@@ -51,6 +51,8 @@ def test_a_claim_that_nobody_changes_is_taken_over_and_one_that_is_beaten_is_not
     assert heir.take("left")
     assert not heir.take("kept")
     assert (tmp_path / "claims" / "left.claim").read_text() == "heir"
+    dead.drop("left")  # slow, not dead: it leaves the claim to who has it now
+    assert not jobs("another").take("left")
 
 
 def test_patience_grows_with_the_longest_piece_of_work(jobs):
@@ -77,9 +79,14 @@ def test_nothing_is_claimed_nor_awaited_once_the_study_is_finished(jobs, tmp_pat
     assert sorted(path.name for path in (tmp_path / "claims").iterdir()) == ["block.claim", "results.claim"]
 
 
-def test_without_the_folder_nothing_is_claimed(jobs, tmp_path):
+def test_a_folder_that_is_gone_is_made_again_unless_the_study_is_finished(jobs, tmp_path):
     one = jobs("1")
     (tmp_path / "claims").rmdir()
+    assert not one.take("block")
+    assert one.take("block")
+    one.drop("block")
+    (tmp_path / "claims").rmdir()
+    (tmp_path / "summary.json").write_text("{}")
     assert not one.take("block")
     assert not (tmp_path / "claims").exists()
 
