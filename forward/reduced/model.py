@@ -374,15 +374,10 @@ class ReducedSolution:
     @cached_property
     def slopes(self) -> FloatArray:
         """Derivatives (N, d) of the coordinates by the parameters of the model."""
-        level, places = self._model.level, self._model.places
-        slopes = np.zeros((level.count, len(self._whole)))
-        for k, (number, _) in enumerate(self._model.data.lifts):
-            if number >= 0:
-                slopes[k, number] = 1.0
-        slopes[level.free] = -np.linalg.solve(self.stiffness[level.free, level.free], self._F[level.free])
+        slopes = _slopes(self._model.level, self.stiffness, self._F)
         self.work.factorisations += 1
         self.work.back_substitutions += slopes.shape[1]
-        return slopes[:, places]
+        return slopes[:, self._model.places]
 
     @cached_property
     def jacobian(self) -> FloatArray:
@@ -413,9 +408,19 @@ class ReducedSolution:
         holds a basis of adjoints; the output is evaluated whole, so that curved ones are corrected too (R. Becker,
         R. Rannacher, Acta Numerica 10 (2001) 1–102).
         """
+        if self._larger is None:
+            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
+        larger, (c, change) = self._model.larger, self._larger
+        errors = larger.outputs(c, self._whole) - self.outputs
+        size = float(np.linalg.norm(c[larger.free])) or 1.0
+        return Estimate(errors, float(np.linalg.norm(change)) / size, Work(0, 1, 1, 1, 0))
+
+    @cached_property
+    def _larger(self) -> tuple[FloatArray, FloatArray] | None:
+        """Coordinates in the larger model after a step of Newton's method, and the step; None where there is none."""
         model, larger = self._model, self._model.larger
         if model.alone:
-            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
+            return None
         modes = np.zeros(larger.modes)
         modes[: model.level.modes] = self.c[model.level.free]
         c = larger.coordinates(self._whole, modes)
@@ -423,11 +428,21 @@ class ReducedSolution:
         try:
             change = -np.linalg.solve(K[larger.free, larger.free], R[larger.free])
         except np.linalg.LinAlgError:
-            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
+            return None
         c[larger.free] += change
-        errors = larger.outputs(c, self._whole) - self.outputs
-        size = float(np.linalg.norm(c[larger.free])) or 1.0
-        return Estimate(errors, float(np.linalg.norm(change)) / size, Work(0, 1, 1, 1, 0))
+        return c, change
+
+    @cached_property
+    def corrected_jacobian(self) -> FloatArray:
+        """Derivatives (m, d) of the corrected outputs: of the larger model where its step ends; NaN without one."""
+        model, larger = self._model, self._model.larger
+        if self._larger is None:
+            return np.full((len(self.outputs), len(self.parameters)), np.nan)
+        c, free = self._larger[0], larger.free
+        _, K, _ = larger.stiffness(c, self._whole)
+        F = larger.by_parameters(c, self._whole, K)
+        by_state, directly = larger.output_slopes(c, self._whole, K, F)
+        return np.asarray((by_state[:, free] @ _slopes(larger, K, F)[free] + directly)[:, model.places])
 
     def mesh_error(self) -> None:
         """No mesh that could be refined."""
@@ -436,3 +451,13 @@ class ReducedSolution:
     def saturation(self, spare: float = math.inf) -> None:
         """No mesh that could be refined."""
         return
+
+
+def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:
+    """Return derivatives (N, d) of the coordinates of equilibria by all parameters, from those of the forces."""
+    slopes = np.zeros(F.shape)
+    for k, (number, _) in enumerate(level.data.lifts):
+        if number >= 0:
+            slopes[k, number] = 1.0
+    slopes[level.free] = -np.linalg.solve(K[level.free, level.free], F[level.free])
+    return slopes

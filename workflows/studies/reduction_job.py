@@ -188,9 +188,7 @@ class _Making:
         n, m = method.unseen, len(names)
         errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
         estimated_state = np.full(n, np.nan)
-        gradients = np.full(
-            (2, n, m, len(inputs.names)), np.nan
-        )  # times standard deviations: of the body, and what is off
+        gradients = np.full((3, n, m, len(inputs.names)), np.nan)  # of the body, and what is off before and after
         for i, point in enumerate(points):
             state = next(states) if ok[i] else None
             try:
@@ -203,17 +201,19 @@ class _Making:
                 estimated_state[i] = solution.estimate.state
                 assert full.tangents is not None
                 own = solution.adjoint(np.eye(m))
-                gradients[:, i] = np.array([full.tangents[i], full.tangents[i] - own]) * inputs.std
+                exact = full.tangents[i]
+                gradients[:, i] = np.array([exact, exact - own, exact - solution.corrected_jacobian]) * inputs.std
         good = np.isfinite(errors).all(axis=1) & np.isfinite(estimates).all(axis=1)
         e, x, spread = errors[good], estimates[good], np.array(data.about["spread"])
         told: dict[str, Any] = {"unseen": int(good.sum())}
         if good.any():
             rms, left = np.sqrt((e**2).mean(axis=0)), np.sqrt(((e - x) ** 2).mean(axis=0))
             effectivity = (x * e).sum(axis=0) / np.maximum((e**2).sum(axis=0), 1e-300)
-            of_body, off = np.sqrt((gradients[:, good] ** 2).sum(axis=3).mean(axis=1))
-            of_gradients = off / np.maximum(of_body, 1e-300)
+            of_body, *off = np.sqrt((gradients[:, good] ** 2).sum(axis=3).mean(axis=1))
+            before, after = (one / np.maximum(of_body, 1e-300) for one in off)
             told |= {
-                "errors of gradients": dict(zip(names, of_gradients.tolist(), strict=True)),
+                "errors of gradients": dict(zip(names, before.tolist(), strict=True)),
+                "errors of gradients after correction": dict(zip(names, after.tolist(), strict=True)),
                 "errors": dict(zip(names, (rms / spread).tolist(), strict=True)),
                 "errors after correction": dict(zip(names, (left / spread).tolist(), strict=True)),
                 "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),

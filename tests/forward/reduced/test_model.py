@@ -167,6 +167,20 @@ def test_estimates_see_the_errors_where_the_larger_model_holds_the_state(full, s
     assert (np.linalg.norm(e - x, axis=0) < np.linalg.norm(e, axis=0))[[0, 1, 3, 4, 6]].all()
 
 
+def test_gradients_are_corrected_too(full, snapshots, small):
+    """Those of the larger model are far closer to those of the body, where it holds the state."""
+    model = ReducedModel(small, full.parameters)
+    own, corrected = [], []
+    for point in snapshots.parameters[:3]:
+        solution, exact = model.solve(point), full.solve(point).adjoint(np.eye(7)) * SPREAD
+        size = np.linalg.norm(exact, axis=1)
+        own.append(np.linalg.norm(solution.jacobian * SPREAD - exact, axis=1) / size)
+        corrected.append(np.linalg.norm(solution.corrected_jacobian * SPREAD - exact, axis=1) / size)
+    smooth = [0, 1, 3, 4, 6]
+    assert (np.mean(corrected, axis=0) < 0.3 * np.mean(own, axis=0))[smooth].all(), (own, corrected)
+    assert np.max(corrected, axis=0)[smooth].max() < 0.02
+
+
 def test_nodes_cells_and_fields_are_those_of_the_body(full, small):
     model = ReducedModel(small, full.parameters)
     np.testing.assert_array_equal(model.space.coordinates, full.space.coordinates)
