@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.mesh import CLOSE, CORNERS, FACES, IntArray, Loaded
-from forward.files import abaqus, meshes
+from forward.files import meshes
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
 from forward.settings import nearest, one_line
@@ -33,13 +32,7 @@ def digest_of(file: str) -> str:
     """Return the hash of a file, and of those in which XDMF stores its numbers, or that Abaqus would include."""
     try:
         whole = Path(file).read_bytes()
-        more = list[Path]()
-        if file.endswith(".xdmf"):
-            others = sorted(set(re.findall(rb"([^\s<>\"]+\.h5):", whole)))
-            more = [Path(file).parent / os.fsdecode(other) for other in others]
-        if file.endswith(".inp"):
-            more = abaqus.included(Path(file))
-        whole += b"".join(path.read_bytes() for path in more)
+        whole += b"".join(path.read_bytes() for path in meshes.beside(Path(file)))
         return hashlib.sha256(whole).hexdigest()
     except OSError as error:
         raise ModelError(one_line(f"file: {error.filename or file}: cannot be read: {error.strerror}")) from None

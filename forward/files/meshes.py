@@ -7,7 +7,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forward.files import abaqus_mesh, vtk, xdmf
+from forward.files import abaqus, abaqus_mesh, vtk, xdmf
 from forward.machine import out_of_memory
 
 if TYPE_CHECKING:
@@ -15,6 +15,21 @@ if TYPE_CHECKING:
 
 OWN = {".inp": abaqus_mesh.read, ".xdmf": xdmf.read, ".vtp": vtk.read}
 OF_VTK = (".vtk", ".vtu")  # of which meshio reads the usual ones, faster and without VTK
+
+
+def beside(path: Path) -> list[Path]:
+    """Return the files that hold what a file refers to: the numbers of XDMF, what Abaqus would include.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+    if path.suffix == ".inp":
+        return abaqus.included(path)
+    if path.suffix == ".xdmf":
+        return xdmf.stored(path)
+    return []
 
 
 def read(path: Path) -> meshio.Mesh:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +25,15 @@ SOLIDS = {
     "hexahedron_27": "hexahedron27",
 }
 FACETS = {"triangle": "triangle", "quadrilateral": "quad"}
+STORED = re.compile(rb"([^\s<>\"]+\.h5):|Format=\"Binary\"[^>]*>\s*([^\s<>]+)")
 TAGS = "cell_tags"  # the array of all tags, where there is one set for cells and one for facets at most
+
+
+def stored(path: Path) -> list[Path]:
+    """Return the files in which a file stores its numbers; raises OSError."""
+    whole = path.read_bytes()
+    names = {name for name, _ in STORED.findall(whole)} | {name for _, name in STORED.findall(whole)}
+    return [path.parent / os.fsdecode(name) for name in sorted(names - {b""})]
 
 
 def numbers(item: ET.Element, path: Path) -> FloatArray:

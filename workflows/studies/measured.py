@@ -16,6 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError, field_validator
 from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
+from forward.files import meshes
 from forward.settings import Settings, one_line
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
@@ -120,15 +121,22 @@ def scan_of(path: Path, usual: Reading) -> Scan:
 
 
 def digest_of(path: Path) -> str:
-    """Return the hash of a file and, if it describes a scan, of the files of that; empty if one cannot be read."""
+    """Return the hash of a file and of those that belong to it, of a scan or of its numbers; empty if one is lost."""
     try:
         whole = path.read_bytes()
         if path.suffix in SCANS:
             for name in scan_of(path, Reading()).files:
-                whole += sha256((path.parent / name).read_bytes()).digest()
+                whole += _hashes(path.parent / name)
+        else:
+            whole += b"".join(map(_hashes, meshes.beside(path)))
         return sha256(whole).hexdigest()[:16]
     except (OSError, DataError):  # then it is refused
         return ""
+
+
+def _hashes(path: Path) -> bytes:
+    """Return the hashes of a file and of those that hold what it refers to."""
+    return b"".join(sha256(one.read_bytes()).digest() for one in (path, *meshes.beside(path)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -182,6 +182,23 @@ def test_pairs_of_surfaces(tmp_path, form):
     assert digest_of(tmp_path / "scan.toml") != before
 
 
+@pytest.mark.parametrize("form", ["HDF", "Binary"])
+def test_numbers_that_are_stored_elsewhere_belong_to_a_scan(tmp_path, form):
+    """A file whose numbers have changed is another one, also where its text is the same."""
+    (tmp_path / "scan.toml").write_text('file = "scan.xdmf"\n')
+    files, found = [tmp_path / "scan.xdmf", tmp_path / "scan.toml"], []
+    for motion in (HOLES, HOLES, 2 * HOLES):
+        mesh = meshio.Mesh(POINTS, [("triangle", TRIANGLES)], point_data={"displacement": motion})
+        mesh.write(files[0], data_format=form)
+        found.append([digest_of(path) for path in files])
+    assert found[0] == found[1]
+    assert all(found[0])
+    assert all(a != b for a, b in zip(found[1], found[2], strict=True))
+    for path in tmp_path.glob("scan*.[hb]*"):
+        path.unlink()
+    assert [digest_of(path) for path in files] == ["", ""]
+
+
 def write_stl(path, points, *, binary):
     """Write the facets one after another, each with its corners, as scanners do."""
     if binary:
