@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from forward.words import NONE, duration, number, with_unit
+from forward.readable import size
+from forward.words import NONE, duration
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results
@@ -59,7 +60,7 @@ def estimates(studies: Mapping[str, Results], output: str) -> Table:
         if output not in results.outputs:
             rows.append((name, NONE, NONE, NONE))
             continue
-        central = number(float(results.dataset["nominal"].sel(output=output)), 6)
+        central = size(float(results.dataset["nominal"].sel(output=output)), results.unit(output), 6)
         shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
-        rows.append((name, *shown, with_unit(central, results.unit(output))))
+        rows.append((name, *shown, central))
     return Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)

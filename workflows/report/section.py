@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible
+from forward.readable import precise
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
-from forward.words import NONE, with_error, with_unit
+from forward.words import NONE
 from workflows.config.mistakes import StudyError
 from workflows.report.words import solves
 
@@ -76,15 +77,14 @@ class Results:
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
-        text = with_error(float(of_output[name]), float(of_output[f"{name}_error"]))
-        return with_unit(text, self.unit(output))
+        return precise(float(of_output[name]), float(of_output[f"{name}_error"]), self.unit(output))
 
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""
         if f"{name}_corrected" not in self.dataset:
             return []
         value, error = (float(self.dataset[f"{name}_corrected{end}"].sel(at)) for end in ("", "_error"))
-        return [with_unit(NONE if np.isnan(value) else with_error(value, error), unit)]
+        return [NONE if np.isnan(value) else precise(value, error, unit)]
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""

@@ -11,7 +11,7 @@ from scipy import integrate, stats
 from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
 from workflows.report import bodies, plots
 from workflows.report.page import write_report
-from workflows.report.readable import interval, percent, quantity, rounded, scale, size, spoken
+from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
 from workflows.report.sections import answer
 
 

@@ -15,7 +15,7 @@
       (h) => !h.closest(".answer") && h.compareDocumentPosition(element) & Node.DOCUMENT_POSITION_FOLLOWING);
     return heads.length ? heads[heads.length - 1].textContent : "table";
   };
-  // The number at the beginning of a cell: "(1.2 ± 0.1) × 10⁻⁴ m" is 1.2e-4.
+  // The number at the beginning of a cell, in SI units: "(1.2 ± 0.1) × 10⁻⁴ m" is 1.2e-4, "28.9 ± 0.1 mm" 0.0289.
   const digits = "⁰¹²³⁴⁵⁶⁷⁸⁹";
   const numeric = (text) => {
     const plain = text.replace(/−/g, "-").replace(/,/g, "");
@@ -23,7 +23,10 @@
     if (!found) return null;
     const power = plain.match(/× 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)/);
     const exponent = power ? Number([...power[1]].map((c) => (c === "⁻" ? "-" : digits.indexOf(c))).join("")) : 0;
-    return Number(found[1]) * 10 ** exponent;
+    const unit = plain.match(/\s(GPa|MPa|kPa|mPa|[cmµn]m[²³]?|[kmµ]N|[kmµn]J)$/);
+    const one = unit ? { G: 1e9, M: 1e6, k: 1e3, c: 1e-2, m: 1e-3, µ: 1e-6, n: 1e-9 }[unit[1][0]] : 1;
+    const axes = unit && /[²³]$/.test(unit[1]) ? (unit[1].endsWith("²") ? 2 : 3) : 1;
+    return Number(found[1]) * 10 ** exponent * one ** axes;
   };
   const sort = (table, column, head) => {
     const ascending = head.getAttribute("aria-sort") !== "ascending";

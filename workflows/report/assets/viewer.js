@@ -27,7 +27,7 @@ function unpack(told, bytes) {
   });
 }
 
-// --- numbers in words, as workflows/report/readable.py writes them ----------------------------------------------------
+// --- numbers in words, as forward/readable.py writes them ----------------------------------------------------
 const SIZES = {
   m: [[1, "m"], [1e-2, "cm"], [1e-3, "mm"], [1e-6, "µm"], [1e-9, "nm"]],
   Pa: [[1e9, "GPa"], [1e6, "MPa"], [1e3, "kPa"], [1, "Pa"], [1e-3, "mPa"]],

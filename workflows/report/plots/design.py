@@ -24,6 +24,7 @@ def against_number(found: xr.Dataset, quantity: str, ax: Axes | None = None) -> 
     chosen, n = found["worth"].to_numpy(), np.arange(1, found.sizes["choice"] + 1)
     ax.plot(n, chosen, "o-", ms=3, color=CONTROLLED, label="chosen")
     ax.hlines(chosen[-1], n[-1], x[-1], color=CONTROLLED, linestyle=":", linewidth=1)
+    ax.locator_params(axis="x", integer=True)
     ax.set_xlabel("number of observations")
     ax.set_ylabel(quantity)
     ax.set_ylim(bottom=0)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from forward.readable import SIZES, is_path, scale, spoken
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,6 +26,7 @@ def png(ax: Axes) -> bytes:
     file = io.BytesIO()
     whole = ax.get_figure(root=True)
     assert whole is not None
+    in_fitting_units(whole)
     whole.savefig(file, format="png", dpi=130)
     return file.getvalue()
 
@@ -33,6 +37,7 @@ def svg(ax: Axes) -> bytes:
 
     whole = ax.get_figure(root=True)
     assert whole is not None
+    in_fitting_units(whole)
     for each in whole.axes:
         for artist in (*each.collections, *each.lines):
             artist.set_rasterized(_points(artist) > MANY_POINTS)
@@ -41,6 +46,43 @@ def svg(ax: Axes) -> bytes:
     with mpl.rc_context({"svg.hashsalt": "tissuq", "svg.fonttype": "path"}):
         whole.savefig(file, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     return file.getvalue()
+
+
+def in_fitting_units(figure: Any) -> None:
+    """Write the numbers of all axes whose labels end with an SI unit in one of a fitting size: mm, kPa.
+
+    Axes stay in SI units, so that lines can be added; only what is written beside them changes.
+    """
+    from matplotlib.ticker import FixedLocator
+
+    for axis in (
+        one for ax in figure.axes for one in (ax.xaxis, ax.yaxis, *([ax.zaxis] if hasattr(ax, "zaxis") else []))
+    ):
+        found = re.search(r"\(([^()]+)\)$", axis.get_label_text())
+        if found is None or found[1] not in SIZES or axis.get_scale() != "linear":
+            continue
+        one, name = scale(float(np.abs(axis.get_view_interval()).max()), found[1])
+        if isinstance(axis.get_major_locator(), FixedLocator):
+            continue
+        axis.set_label_text(axis.get_label_text()[: found.start()] + f"({name})")
+        axis.set_major_formatter(_ticks(one))
+
+
+def _ticks(one: float) -> Any:
+    """Return a formatter of ticks in a unit: with the decimals that tell them apart."""
+    from matplotlib.ticker import Formatter
+
+    class Ticks(Formatter):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            places = np.sort(np.asarray(self.locs, dtype=float) / one)
+            step = float(np.diff(places).min(initial=np.inf)) if len(places) > 1 else abs(float(places[0]))
+            for decimals in range(12):
+                if np.abs(np.round(places, decimals) - places).max() < 1e-3 * step:
+                    break
+            text = f"{round(x / one, decimals) + 0.0:,.{decimals}f}"
+            return text.replace("-", "\N{MINUS SIGN}")
+
+    return Ticks()
 
 
 def _points(artist: Any) -> int:
@@ -85,8 +127,8 @@ def quantity(dataset: xr.Dataset, output: str) -> str:
 
 
 def text_of(name: str) -> str:
-    """Keep matplotlib from reading a name as a formula."""
-    return name.replace("$", r"\$")
+    """Keep matplotlib from reading a name as a formula; numbers of a model are named by the ends of their paths."""
+    return (spoken(name) if is_path(name) else name).replace("$", r"\$")
 
 
 def count_axis(ax: Axes, first: int, n: int) -> None:

@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from forward.readable import size
 from forward.words import named
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span, text_of
+from workflows.report.plots.pairs import pairs
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-NARROW = 0.3  # part of a prior below which the whole of it is drawn beside its posterior
+DECADES = 30.0  # ratio of the ends of a prior above which its axis is logarithmic
+CURVE, PRIOR = 160, 200  # points of curves
+PAIRED = 6  # parameters that are drawn in pairs
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
 SEEN = 1.0  # λ above which the data say more about a direction than the prior
@@ -72,7 +76,7 @@ class Cut:
     @property
     def words(self) -> str:
         """The plane in words."""
-        return f"the plane {'xyz'[self.axis]} = {self.level:.4g} m"
+        return f"the plane {'xyz'[self.axis]} = {size(self.level, 'm', 3)}"
 
     def values(self, field: FloatArray) -> FloatArray:
         """Return a field (N,) at the points of the plane."""
@@ -139,12 +143,24 @@ def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
     return found[0]
 
 
-def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends: tuple[float, float]) -> None:
+def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, limits: tuple[float, float]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    low, high = ends if ends[1] > ends[0] else (ends[0] - 1e-3, ends[1] + 1e-3)
-    drawn = ax.pcolormesh(*cut.lines, cut.values(values), cmap=colours, vmin=low, vmax=high, shading="gouraud")
-    ax.set_aspect("equal")
+    low, high = limits if limits[1] > limits[0] else (limits[0] - 1e-3, limits[1] + 1e-3)
+    # A picture of the points, which is small and drawn at once; browsers and printers smooth it.
+    half = [(line[-1] - line[0]) / (len(line) - 1) / 2 for line in cut.lines]
+    ends = [end for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)]
+    drawn = ax.imshow(
+        cut.values(values),
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+        origin="lower",
+        extent=(ends[0], ends[1], ends[2], ends[3]),
+        interpolation="none",
+    )
+    ax.set_xlim(cut.lines[0][[0, -1]].tolist())
+    ax.set_ylim(cut.lines[1][[0, -1]].tolist())
     ax.set_title(title, fontsize="medium")
     ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
     ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
@@ -181,44 +197,63 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
 def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:
     """Draw prior and posterior densities of the parameters; if there are many, those that the data narrow most.
 
-    Units of the parameters (``study.units_of("/")``) are shown if given.
+    Of each parameter, the posterior as wide as it is, and beside it the whole prior with the posterior in it. Units of
+    the parameters (``study.units_of("/")``) are shown if given.
     """
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
     names = [str(one.parameter.values[i]) for i in chosen]
-    found = grid(len(names), columns=min(len(names), 2), height=2.2)
-    for ax, name in zip(found, names, strict=True):
+    found = grid(2 * len(names), columns=4 if len(names) > 1 else 2, height=2.0, width=2.1)
+    for close, whole, name in zip(found[::2], found[1::2], names, strict=True):
         of = one.sel(parameter=name)
         draws = of["draw"].to_numpy()
         draws = draws[np.isfinite(draws)]
         mean, std = float(of["mode"]), float(of["laplace_std"])
         low, high = _span(draws, mean, min(std, 3 * float(of["std"])), float(of["true"]))
-        values, density = before[name]
-        x = np.linspace(*_cut(low, high, np.append(draws, mean), values[[0, -1]]), 300)
-        ax.fill_between(x, _smooth(draws, float(of["std"]), _worth(one), x), **_FILLED)
-        ax.plot(x, _bell(x, mean, std), color=DARK, linewidth=1, label="Laplace")
-        ax.plot(x, np.interp(x, values, density, left=0.0, right=0.0), color=PLAIN, linestyle="--", label="prior")
+        every = slice(None, None, max(1, len(before[name][0]) // PRIOR))
+        values, density = (one_[every] for one_ in before[name])
+        x = np.linspace(*_cut(low, high, np.append(draws, mean), values[[0, -1]]), CURVE)
+        posterior = _smooth(draws, float(of["std"]), _worth(one), x)
+        close.fill_between(x, posterior, **_FILLED)
+        close.plot(x, _bell(x, mean, std), color=DARK, linewidth=1, label="Laplace")
+        close.plot(x, np.interp(x, values, density, left=0.0, right=0.0), color=PLAIN, linestyle="--", label="prior")
         if np.isfinite(of["true"]):
-            ax.axvline(float(of["true"]), color=HIGH, label="truth")
-        _finish(ax, named(name, (units or {}).get(name, "1")), x)
-        if x[-1] - x[0] < NARROW * (values[-1] - values[0]):
-            _both(ax, values, density, x, _smooth(draws, float(of["std"]), _worth(one), x))
+            close.axvline(float(of["true"]), color=HIGH, label="truth")
+        label = named(text_of(name), (units or {}).get(name, "1"))
+        _finish(close, label, x)
+        _beside(whole, values, density, x, posterior)
+        _finish(whole, label, np.array(whole.get_xlim()))
+    found[1].set_title("the whole prior", fontsize="small")
     _legend(found)
     return found[0]
 
 
-def _both(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
-    """Draw the whole prior in a corner, with the posterior in it, each to its own height."""
-    corner = ax.inset_axes((0.7, 0.68, 0.29, 0.3))
-    every = slice(None, None, max(1, len(values) // 120))
-    corner.fill_between(
-        values[every], density[every] / max(float(density.max()), 1e-300), color=PLAIN, alpha=0.35, linewidth=0
-    )
-    corner.fill_between(x, posterior / max(float(posterior.max()), 1e-300), **_FILLED)
-    corner.plot([x.mean()] * 2, [0, 1], color=_FILLED["color"], linewidth=1)  # seen also where it is very narrow
-    corner.set(yticks=[], xticks=values[[0, -1]], xlim=values[[0, -1]], ylim=(0, 1.1))
-    corner.set_xticklabels([f"{end:.3g}" for end in values[[0, -1]]], fontsize=6)
-    corner.set_title("whole prior", fontsize=6, pad=2)
+def _beside(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
+    """Draw the middle 99 % of a prior, with the posterior in it, each to its own height."""
+    reached = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(values))])
+    low, high = (float(v) for v in np.interp((0.005, 0.995), reached / reached[-1], values))
+    low, high = min(low, float(x[0])), max(high, float(x[-1]))
+    if low > 0 and high > DECADES * low:  # as wide as this, equal lengths are equal factors
+        ax.set_xscale("log")
+        density, posterior = density * values, posterior * x
+    ax.fill_between(values, density / max(float(density.max()), 1e-300), color=PLAIN, alpha=0.35, linewidth=0)
+    ax.fill_between(x, posterior / max(float(posterior.max()), 1e-300), **_FILLED)
+    middle = float(x[int(posterior.argmax())])
+    ax.plot([middle] * 2, [0, 1], color=_FILLED["color"], linewidth=1)  # seen also where it is very narrow
+    ax.set_xlim(low, high)
+
+
+def correlations(one: xr.Dataset, units: Mapping[str, str]) -> Axes:
+    """Draw the posterior of the parameters in pairs; of many, those that the data narrow most."""
+    narrowed = (one["std"] / one["prior_std"]).to_numpy()
+    chosen = np.sort(np.argsort(narrowed, kind="stable")[:PAIRED])
+    names = [str(one.parameter.values[i]) for i in chosen]
+    here = one.sel(parameter=names)
+    draws = here["draw"].transpose("parameter", "sample").to_numpy()
+    kept = np.isfinite(draws).all(axis=0)
+    columns = {named(text_of(name), units.get(name, "1")): row[kept] for name, row in zip(names, draws, strict=True)}
+    modes, truths = (here[which].to_numpy().tolist() for which in ("mode", "true"))
+    return pairs(columns, np.ones(kept.sum()), CONTROLLED, worth=_worth(one), modes=modes, truths=truths)
 
 
 def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[float, float]:
@@ -258,7 +293,8 @@ def _finish(ax: Axes, label: str, x: FloatArray) -> None:
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(bottom=0)
     ax.set_yticks([])
-    ax.xaxis.set_major_locator(MaxNLocator(4))
+    if ax.get_xscale() == "linear":
+        ax.xaxis.set_major_locator(MaxNLocator(3))
     ax.set_xlabel(label, fontsize="small")
     ax.tick_params(labelsize="small")
     ax.spines[["top", "right", "left"]].set_visible(False)
@@ -306,7 +342,7 @@ def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.axvspan(-1.96, 1.96, color=DARK, alpha=0.08, linewidth=0)
     ax.errorbar(z, places, xerr=1, fmt="o", color=CONTROLLED, capsize=4)
     ax.axvline(0, color=HIGH, linewidth=1)
-    ax.set_yticks(places, names)
+    ax.set_yticks(places, [text_of(name) for name in names])
     ax.set_ylim(-0.6, len(names) - 0.4)
     farthest = max(3.0, 1.05 * float(np.abs(z).max()) + 1.3)
     ax.set_xlim(-farthest, farthest)

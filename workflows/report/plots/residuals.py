@@ -24,11 +24,10 @@ def residuals(one: xr.Dataset) -> Axes:
     """Draw the residuals of each load case: as arrows, and over their errors as a map."""
     parts = [part for part in measured_points(one) if len(part.places)]
     panels = _panels(len(parts), 2)
-    largest = max(float(np.linalg.norm(part.residuals, axis=1).max()) for part in parts)
     most = max(3.0, *(float(part.over.max()) for part in parts))
     extent = float(np.ptp(one["node_position"].to_numpy(), axis=0).max())
-    factor = LONGEST * extent / max(largest, 1e-300)
     for part, (arrows, coloured) in zip(parts, panels, strict=True):
+        factor = LONGEST * extent / max(float(np.linalg.norm(part.residuals, axis=1).max()), 1e-300)
         _box(arrows, one)
         tips = np.hstack([part.places, factor * part.residuals]).T * MM
         arrows.quiver(*tips, color="#d1622b", linewidth=0.8, arrow_length_ratio=0.3)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.model import FloatArray
+from forward.readable import percent
 from forward.words import named, with_error
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, span
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, text_of
+from workflows.report.plots.pairs import pairs
 from workflows.studies.findings_selection import by_probability, ranking
 
 if TYPE_CHECKING:
@@ -42,18 +45,9 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax = ax or axes(height=1.6 + 0.36 * len(names))
     places = np.arange(len(names))[::-1]
     left = np.zeros(len(names))
-    best = by_probability(dataset, dataset["log_evidence"])[0]
-    muted = [colour for colour in COLOURS if colour != HIGH]
-    for k, model in enumerate(dataset.model.values):
+    for model, colour in colours(dataset).items():
         share = dataset["variant_probability"].sel(model=model).values
-        ax.barh(
-            places,
-            share,
-            left=left,
-            color=HIGH if model == best else muted[k % len(muted)],
-            label=str(model),
-            height=0.6,
-        )
+        ax.barh(places, share, left=left, color=colour, label=model, height=0.6)
         left = left + share
     ax.set_yticks(places, names)
     ax.set_xlim(0, 1)
@@ -63,55 +57,26 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
 
 
 def corner(dataset: xr.Dataset, model: str, group: str, units: Mapping[str, str] | None = None) -> Axes:
-    """Draw the posterior of the constants of a model, each alone and in pairs; large points have large weights.
+    """Draw the posterior of the constants of a model, each alone and in pairs: contours hold 50 and 90 %.
 
     Units of the constants (``study.units_of(model)``) are shown where they are given.
     """
-    labels = {name: named(str(name), (units or {}).get(str(name), "1")) for name in dataset.parameter.values}
     one = dataset.sel(model=model, group=group)
-    names = [
-        str(name) for name in dataset.parameter.values if np.isfinite(float(one["constant_mode"].sel(parameter=name)))
-    ]
-    n = len(names)
-    first = axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
-    figure = first.get_figure(root=True)
-    assert figure is not None
-    first.remove()
-    grid = figure.subplots(n, n, squeeze=False, sharex="col")
-    weights = one["point_weight"].values
-    used = weights > 1e-6 * weights.max()
-    weights = weights[used]
-    columns = [one["point"].sel(parameter=name).values[used] for name in names]
-    modes = [float(one["constant_mode"].sel(parameter=name)) for name in names]
-    ends = [span(x, weights) for x in columns]
-    colour = COLOURS[list(dataset.model.values).index(model) % len(COLOURS)]
-    for i, j in np.ndindex(n, n):
-        ax = grid[i, j]
-        if j > i:
-            ax.remove()
-            continue
-        if i == j:
-            ax.hist(columns[i], bins=24, range=ends[i], weights=weights, color=colour, alpha=0.6)
-            ax.axvline(modes[i], color=DARK, linewidth=1)
-            ax.set_yticks([])
-        else:
-            ax.scatter(columns[j], columns[i], s=300 * weights / weights.max() / np.sqrt(len(weights)), color=colour)
-            ax.plot(modes[j], modes[i], "+", color=DARK)
-            ax.set_ylim(ends[i])
-        ax.set_xlim(ends[j])
-        ax.ticklabel_format(style="sci", scilimits=(-2, 3), useMathText=True)
-        ax.tick_params(labelsize="x-small")
-        ax.xaxis.get_offset_text().set_fontsize("x-small")
-        ax.yaxis.get_offset_text().set_fontsize("x-small")
-        ax.spines[["top", "right"]].set_visible(False)
-        if i == n - 1:
-            ax.set_xlabel(labels[names[j]], fontsize="small")
-        if j == 0 and i > 0:
-            ax.set_ylabel(labels[names[i]], fontsize="small")
-        elif j > 0:
-            ax.tick_params(labelleft=False)
-    corner_axes: Axes = grid[0, 0]
-    return corner_axes
+    modes = {str(name): float(one["constant_mode"].sel(parameter=name)) for name in dataset.parameter.values}
+    modes = {name: mode for name, mode in modes.items() if np.isfinite(mode)}
+    columns = {
+        named(text_of(name), (units or {}).get(name, "1")): one["point"].sel(parameter=name).to_numpy()
+        for name in modes
+    }
+    return pairs(columns, one["point_weight"].to_numpy(), colours(dataset)[model], modes=list(modes.values()))
+
+
+def colours(dataset: xr.Dataset) -> dict[str, str]:
+    """Return the colour of each model: a strong one for the most probable."""
+    best = by_probability(dataset, dataset["log_evidence"])[0]
+    muted = [colour for colour in COLOURS if colour != HIGH]
+    names = [str(model) for model in dataset.model.values]
+    return {model: HIGH if model == best else muted[k % len(muted)] for k, model in enumerate(names)}
 
 
 def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = "displacement (m)") -> Axes:
@@ -124,11 +89,9 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = 
     ax = ax or axes(height=3.4)
     one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
     measured = one["measured"].values
-    for k, model in enumerate(dataset.model.values):
+    for model, style, label in _styles(dataset):
         left = (measured - one["prediction_mean"].sel(model=model).values) / one["sigma"].values
-        P = float(dataset["probability"].sel(model=model))
-        colour = COLOURS[k % len(COLOURS)]
-        ax.plot(measured, left, ".", markersize=4, color=colour, label=f"{model} ({P:.2g})")
+        ax.plot(measured, left, ".", markersize=4, color=style["color"], zorder=style["zorder"], label=label)
     ax.axhspan(-2, 2, color=DARK, alpha=0.08, linewidth=0)
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_xlabel(f"measured {of}")
@@ -138,24 +101,58 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = 
 
 
 def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -> Axes:
-    """Draw the posterior curves of all models over the data of a test."""
-    ax = ax or axes(height=3.4)
+    """Draw the posterior curves of all models over the data of a test, the most probable one in front."""
     chosen = (dataset["output_group"].values == group) & (dataset["output_test"].values == test)
     one = dataset.isel(output=np.flatnonzero(chosen))
-    one = one.isel(output=np.argsort(one["output_at"].values, kind="stable"))
-    at = one["output_at"].values
-    for k, model in enumerate(dataset.model.values):
+    return _over(dataset, one, one["output_at"].to_numpy(), f"{test}: stretch or amount of shear", "stress (Pa)", ax)
+
+
+def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, ax: Axes | None = None) -> Axes:
+    """Draw the posterior curves of all models over measured outputs of the steps of a path.
+
+    Parameters
+    ----------
+    dataset
+        Results of a comparison.
+    places
+        Where on the path each output is, by its name.
+    over, of
+        What is drawn at the two axes, with its unit.
+    ax
+        Where to draw.
+    """
+    here = [k for k, test in enumerate(dataset["output_test"].values) if str(test) in places]
+    one = dataset.isel(output=here)
+    return _over(dataset, one, np.array([places[str(test)] for test in one["output_test"].values]), over, of, ax)
+
+
+def _over(dataset: xr.Dataset, one: xr.Dataset, at: FloatArray, over: str, of: str, ax: Axes | None) -> Axes:
+    ax = ax or axes(height=3.4)
+    order = np.argsort(at, kind="stable")
+    one, at = one.isel(output=order), at[order]
+    for model, style, label in _styles(dataset):
         low, high = one["prediction_quantiles"].sel(model=model).values
-        ax.fill_between(at, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.25, linewidth=0)
-        P = float(dataset["probability"].sel(model=model))
-        ax.plot(
-            at,
-            one["prediction_mean"].sel(model=model).values,
-            color=COLOURS[k % len(COLOURS)],
-            label=f"{model} ({P:.2g})",
-        )
-    ax.errorbar(at, one["measured"].values, yerr=one["sigma"].values, fmt=".", color=DARK, label="measured")
-    ax.set_xlabel(f"{test}: stretch or amount of shear")
-    ax.set_ylabel("stress (Pa)")
+        faint = 0.3 if style["zorder"] > 2 else 0.1
+        ax.fill_between(at, low, high, color=style["color"], alpha=faint, linewidth=0, zorder=style["zorder"])
+        ax.plot(at, one["prediction_mean"].sel(model=model).values, label=label, **style)
+    error = one["sigma"].values
+    ax.errorbar(at, one["measured"].values, yerr=error, fmt=".", color=DARK, label="measured", zorder=4)
+    ax.locator_params(axis="x", nbins=6)
+    ax.set_xlabel(over)
+    ax.set_ylabel(of)
     ax.legend(fontsize="small", frameon=False)
     return ax
+
+
+def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
+    """Return names of models from the most probable, how they are drawn, and what is written beside them."""
+    of = colours(dataset)
+    order = by_probability(dataset, dataset["log_evidence"])
+    return [
+        (
+            model,
+            {"color": of[model], "linewidth": 1.0 if rank else 2.4, "zorder": 2.0 if rank else 3.0},
+            f"{model} ({percent(float(dataset['probability'].sel(model=model)))})",
+        )
+        for rank, model in enumerate(order)
+    ]

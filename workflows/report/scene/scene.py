@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from forward.bodies.inclusions import INDICATORS, OPS
 from forward.model import FloatArray
-from workflows.report.readable import spoken
+from forward.readable import spoken
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 DERIVATIVES_SHOWN = 6  # parameters whose effect on the body is shown
 MAPS_SHOWN = 6  # parameters whose indices are
+CASES_SHOWN = 6  # load cases that have quantities of their own
+FEWEST = 6  # measured points that make a map
+NEAREST = 4  # of them that tell what is between
+REACH = 1.5  # of the largest distance between neighbours: farther points have no value
 SMALL = 20_000  # nodes of bodies that are sent whole, so that they can be cut
 DRAWS_SHOWN = 6  # posterior draws of an inclusion
 FINE, COARSE = 1e-6, 2e-5  # of an array's largest number: rounding, of small and large bodies
@@ -145,7 +149,7 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
         kind,
         up_of(one),
         np.zeros_like(points),
-        list(_stiffness(one)),
+        [*_stiffness(one), *_by_case(one, points, cells, kind)],
         [*_regions(one, points, cells, kind), *insides],
         dict(_arrows(one)),
         cut="" if inclusions or "stiffness_mean" not in one else "v",
@@ -234,6 +238,52 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
         yield Quantity(
             "Mean minus truth over the posterior standard deviation", off, colours="coolwarm", low=-3.0, high=3.0
         )
+
+
+def _by_case(one: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> Iterator[Quantity]:
+    """What each load case says of a field, what was measured on the surface, and what the model misses of it."""
+    cases = [str(case) for case in one.case.values][:CASES_SHOWN]
+    if "alone_stiffness_std" in one:
+        widest = float(one["alone_stiffness_std"].max())
+        for case in cases:
+            alone = one["alone_stiffness_std"].sel(case=case).to_numpy()
+            yield Quantity(f"± of ln stiffness by {case} alone", alone, colours="plasma", low=0.0, high=widest)
+    if "place" not in one or not has_points(one):
+        return
+    outer = np.unique(skin(points, cells, kind).nodes)
+    for of_case in measured_points(one):
+        if of_case.case in cases and len(of_case.places) >= FEWEST:
+            between = spread_over(of_case.places, points[outer])
+
+            def values(of: FloatArray, between: Any = between) -> FloatArray:
+                all_ = np.full(len(points), np.nan)
+                all_[outer] = between(of)
+                return all_
+
+            yield Quantity(f"Measured displacement, {of_case.case}", values(_size(of_case.measured)), "m")
+            high = max(3.0, float(of_case.over.max()))
+            label = f"Residuals over their errors, {of_case.case}"
+            yield Quantity(label, values(of_case.over), colours="plasma", low=0.0, high=high)
+
+
+def spread_over(places: FloatArray, at: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what values (p,) at places (p, 3) are at others (n, 3): the means of the nearest, by their distances.
+
+    NaN farther from all places than these are from each other.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(places)
+    apart = tree.query(places, k=2)[0][:, 1].max()
+    distances, nearest = tree.query(at, k=min(NEAREST, len(places)))
+    weights = 1 / np.maximum(distances, 1e-9 * max(apart, 1e-300)) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    far = distances[:, 0] > REACH * apart
+
+    def spread(values: FloatArray) -> FloatArray:
+        return np.where(far, np.nan, (weights * values[nearest]).sum(axis=1))
+
+    return spread
 
 
 def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> Iterator[Inside]:

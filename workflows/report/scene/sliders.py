@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
+from forward.readable import spoken
 from forward.words import named
 from uq.surrogates.expansion import Expansion
-from workflows.report.readable import spoken
 from workflows.report.scene.pack import Packer
 from workflows.results.level import IntArray
 

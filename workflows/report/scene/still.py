@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray
-from workflows.report.readable import scale
+from forward.readable import scale
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
 from workflows.results.level import IntArray
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forward.words import NONE, duration, number, with_unit
+from forward.readable import size
+from forward.words import NONE, duration
 from workflows.report import bodies, plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -54,8 +55,10 @@ def cycles(results: Results) -> Table:
         for output in results.outputs:
             here = dataset.isel(cycle=k).sel(output=output)
             value, error = float(here["cycle_value"]), float(here["cycle_mesh_error"])
-            estimated = NONE if np.isnan(error) else f"{error:+.2g}"
-            found += [with_unit(number(value), results.unit(output)), estimated]
+            unit = results.unit(output)
+            sign = "+" if error > 0 else ""
+            estimated = NONE if np.isnan(error) else sign + size(error, unit, like=value)
+            found += [size(value, unit, 4), estimated]
         rows.append((f"{told['cells']:,}", f"{told['unknowns']:,}", duration(told["cpu_seconds"]), *found))
     head = ["cells", "unknowns", "processor time"]
     for output in results.outputs:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.readable import and_error, interval, percent, quantity, size, spoken
 from forward.words import duration, number
 from workflows.report.blocks import Answer, Block, Card, Text
-from workflows.report.readable import and_error, interval, percent, quantity, size, spoken
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
 from workflows.report.sections.error_budget import counting, parts_of

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.words import number, with_unit
+from forward.readable import size
+from forward.words import number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots.averaged import within_and_between
 from workflows.report.section import Results, Section
@@ -15,7 +16,7 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     import xarray as xr
 
-UNITS = {"stress": "Pa", "displacement": "m", "output": "1"}  # outputs have their own units
+UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
 
 
 class Averages(Section):
@@ -31,7 +32,7 @@ class Averages(Section):
         yield Text(
             "At the end of each test, or where the largest displacement was measured, without measurement errors."
         )
-        yield averages(results.dataset)
+        yield averages(results)
         caption = "Parts of the variance: within the models, and between them: what it matters which of them is right."
         yield Pictures([Picture.drawn(within_and_between(last_of_tests(results.dataset)), caption)])
 
@@ -50,20 +51,23 @@ def last_of_tests(dataset: xr.Dataset) -> dict[str, xr.Dataset]:
     return found
 
 
-def averages(dataset: xr.Dataset) -> Table:
+def averages(results: Results) -> Table:
     """Predictions averaged over the models at the end of each test, with both parts of their variance."""
-    rows = []
+    rows, dataset = [], results.dataset
     quantity = str(dataset.attrs["quantity"])
+    specs = getattr(results.study, "of_candidates", {})
+    units = {output.name: output.unit for spec in [*specs.values()][:1] for output in spec.returned}
     for one in last_of_tests(dataset).values():
+        unit = UNITS.get(quantity) or units.get(str(one["output_test"].item()), "1")
         stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))
         rows.append(
             (
                 str(one["output_group"].item()),
                 str(one["output_test"].item()),
                 number(float(one["output_at"])),
-                with_unit(number(float(one["measured"])), UNITS[quantity]),
-                with_unit(number(float(one["average_mean"])), UNITS[quantity]),
-                *(with_unit(number(std, 3), UNITS[quantity]) for std in stds),
+                size(float(one["measured"]), unit, 4),
+                size(float(one["average_mean"]), unit, 4),
+                *(size(std, unit, 3) for std in stds),
             )
         )
     place = "at" if quantity == "stress" else "datum"

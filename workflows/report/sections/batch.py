@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from forward.readable import scale, spoken
 from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
@@ -34,6 +35,10 @@ def batch(results: Results) -> Table:
     """A row for each data set."""
     dataset = results.dataset
     names = [str(name) for name in dataset.parameter.values]
+    sizes = {
+        name: scale(float(abs(dataset["mean"].sel(parameter=name)).median()), results.parameter_unit(name))
+        for name in names
+    }
     rows = []
     for label in dataset.data_set.values:
         one = dataset.sel(data_set=label)
@@ -41,7 +46,8 @@ def batch(results: Results) -> Table:
             rows.append((str(label), "", "failed", *[""] * (len(names) + 3)))
             continue
         values = [
-            with_error(float(one["mean"].sel(parameter=name)), float(one["std"].sel(parameter=name))) for name in names
+            with_error(*(float(one[which].sel(parameter=name)) / sizes[name][0] for which in ("mean", "std")))
+            for name in names
         ]
         rows.append(
             (
@@ -54,6 +60,6 @@ def batch(results: Results) -> Table:
                 number(float(one["log_evidence"]), 6),
             )
         )
-    units = [named(name, results.parameter_unit(name)) for name in names]
+    units = [named(spoken(name), sizes[name][1]) for name in names]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     return Table(head, rows, text=frozenset({0, 2}))

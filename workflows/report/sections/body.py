@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.readable import size
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Text, Viewer
-from workflows.report.readable import size
 from workflows.report.section import Results, Section
 
 if TYPE_CHECKING:

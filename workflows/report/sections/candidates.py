@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.words import with_error, with_unit
+from forward.readable import precise
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -32,8 +32,10 @@ class AveragedCandidates(Section):
             for name in map(str, of["candidate"].values):
                 one = of.sel(candidate=name, output=output)
                 share = f"{100 * float(one['candidate_probability']):.3g} %"
-                cells = (with_error(float(one[f"candidate_{m}"]), float(one[f"candidate_{m}_error"])) for m in MOMENTS)
-                rows.append((name, share, *(with_unit(cell, unit) for cell in cells)))
+                cells = [
+                    precise(float(one[f"candidate_{m}"]), float(one[f"candidate_{m}_error"]), unit) for m in MOMENTS
+                ]
+                rows.append((name, share, *cells))
             rows.append(("all", "100 %", *(results.estimate(output, m) for m in MOMENTS)))
             yield Heading(output, level=3)
             yield Table(("candidate", "weight" if stacked else "probability", "mean", "standard deviation"), rows)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.words import number, settings, with_unit
+from forward.readable import size
+from forward.words import settings
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.section import Results, Section
@@ -63,7 +64,14 @@ def constants(results: Results) -> Table:
                 unit = results.parameter_unit(str(name), str(model))
                 low, high = of_name["constant_quantiles"].values
                 values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
-                rows.append((str(model), str(group), str(name), *(with_unit(number(float(v)), unit) for v in values)))
+                rows.append(
+                    (
+                        str(model),
+                        str(group),
+                        str(name),
+                        *(size(float(v), unit, 4, like=float(of_name["constant_mean"])) for v in values),
+                    )
+                )
     head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
     return Table(head, rows, text=frozenset({0, 1, 2}))
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from forward.words import number, with_error
-from workflows.report.blocks import Block, Heading, Table, Text
+from forward.readable import percent
+from forward.words import with_error
+from workflows.report.blocks import Block, Folded, Heading, Table, Text
 from workflows.report.section import Results, Section
 
 if TYPE_CHECKING:
@@ -24,25 +25,25 @@ class Dependence(Section):
         """One table."""
         yield Heading("What the evidences depend on")
         yield Text(
-            "ln Z and probability of each model with other errors, other data, and priors of half and twice the width "
-            "(in standard normal coordinates)."
+            "Probability of each model with other errors, other data, and priors of half and twice the width (in "
+            "standard normal coordinates)."
         )
-        yield variants(results.dataset)
+        dataset = results.dataset
+        models = [str(model) for model in dataset.model.values]
+        chances = dataset["variant_probability"].transpose("variant", "model").to_numpy()
+        names = [str(variant) for variant in dataset.variant.values]
+        yield Table(
+            ("", *models), [(n, *(percent(float(p)) for p in row)) for n, row in zip(names, chances, strict=True)]
+        )
+        yield Folded("Their evidences, ln Z", [variants(dataset)])
 
 
 def variants(dataset: xr.Dataset) -> Table:
-    """Evidence and probability with other errors, data and priors."""
+    """Evidence of each model, a column for each variant: models have longer names than there are of them."""
+    names = [str(variant) for variant in dataset.variant.values]
     rows = []
-    for variant in dataset.variant.values:
-        one = dataset.sel(variant=variant)
-        cells = [
-            f"{with_error(float(z), float(e))} ({number(100 * float(p), 3)} %)"
-            for z, e, p in zip(
-                one["variant_log_evidence"].values,
-                one["variant_log_evidence_error"].values,
-                one["variant_probability"].values,
-                strict=True,
-            )
-        ]
-        rows.append((str(variant), *cells))
-    return Table(("", *map(str, dataset.model.values)), rows)
+    for model in dataset.model.values:
+        one = dataset.sel(model=model)
+        ends = (one[f"variant_log_evidence{end}"].to_numpy() for end in ("", "_error"))
+        rows.append((str(model), *(with_error(float(z), float(e)) for z, e in zip(*ends, strict=True))))
+    return Table(("ln Z", *names), rows)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from forward.readable import scale, size
 from forward.words import NONE, number, with_unit
 from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import design as plots
-from workflows.report.readable import size
 from workflows.report.section import Results, Section
 from workflows.results.summary import against_random
 
+ROUNDING = 1e-9  # of the largest coordinate of a place
 WORTH = {
     "information": "What they tell (nat)",
     "parameters": "Share of the parameters' variances that they take away",
@@ -61,7 +62,7 @@ class ChosenObservations(Section):
             yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
         if "posterior_std" in found:
             rows = [
-                (name, *(with_unit(number(float(one[f"{which}_std"])), unit) for which in ("prior", "posterior")))
+                (name, *(size(float(one[f"{which}_std"]), unit, 4) for which in ("prior", "posterior")))
                 for name in results.leading(found["posterior_std"] / found["prior_std"])
                 for one, unit in [(found.sel(parameter=name), results.parameter_unit(name))]
             ]
@@ -75,17 +76,24 @@ def card(results: Results) -> Card:
     together = f"{number(float(found['information'][-1]), 3)} nat"
     answers = [Answer(f"{found.sizes['choice']} observations", together, (against_random(design),))]
     for k, one in enumerate(design["chosen"], start=1):
-        where = [] if None in one["place"] else [f"at ({', '.join(size(x, 'm', 3) for x in one['place'])})"]
+        where = [] if None in one["place"] else [f"at ({place(one['place'])})"]
         case = [f"load case {one['case']}"] if one["case"] else []
         answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 3)} nat", [*case, *where]))
     return Card("Which observations tell most of what is not known?", answers)
 
 
+def place(x: Sequence[float], digits: int = 3) -> str:
+    """Write a place (m) in one unit; a coordinate that is rounding beside the others is zero."""
+    largest = max(map(abs, x))
+    one, unit = scale(largest, "m")
+    return with_unit(", ".join(number(c / one if abs(c) > ROUNDING * largest else 0.0, digits) for c in x), unit)
+
+
 def _table(results: Results) -> Table:
     rows = []
     for k, one in enumerate(results.summary["design"]["chosen"], start=1):
-        place = NONE if None in one["place"] else ", ".join(f"{x:.4g}" for x in one["place"])
-        cells = (str(k), one["name"], one["case"] or NONE, place, one["measured"])
+        where = NONE if None in one["place"] else place(one["place"])
+        cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
         rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
-    head = ("", "observation", "load case", "place (m)", "measured", "adds (nat)", "together (nat)", "cost")
+    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost")
     return Table(head, rows, text=frozenset({1, 2, 3, 4}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from forward.readable import size
 from forward.words import NONE, duration, number, with_error, with_unit
 from uq.methods.compare import gains, plain_samples
 from workflows.report import plots
@@ -58,7 +59,7 @@ def references(results: Results) -> Table:
     rows = []
     for output in results.outputs:
         of_output, unit = results.dataset.sel(output=output), results.unit(output)
-        floors = (with_unit(number(abs(float(of_output[f"{name}_error"])), 2), unit) for name in ("solver", "mesh"))
+        floors = (size(abs(float(of_output[f"{name}_error"])), unit) for name in ("solver", "mesh"))
         rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
     return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.words import NONE, number, with_error, with_unit
+from forward.readable import precise, size
+from forward.words import NONE
 from uq.estimators.rounding import only_rounding
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
@@ -129,7 +130,7 @@ def table(results: Results, names: list[str]) -> Table:
             return float(of_output[name]) if name in of_output else np.nan
 
         for name in names:
-            first = FIRST.get(name, "")
+            value, first = known(name), FIRST.get(name, "")
             error, doubt = (known(f"{first}mesh_error{end}") for end in ("", "_doubt"))
             corrected, its_error = known(f"{name}_corrected"), known(f"{name}_corrected_error")
             total = known(f"{first}total_error")
@@ -138,11 +139,11 @@ def table(results: Results, names: list[str]) -> Table:
             rows.append(
                 (
                     f"{ESTIMATES[name]} of {output}",
-                    with_unit(number(known(name), 6), unit),
-                    with_unit(number(known(f"{name}_error"), 2), unit),
-                    NONE if np.isnan(error) else with_unit(with_error(error, doubt), unit),
-                    with_unit(number(total, 2), unit),
-                    NONE if np.isnan(error) else with_unit(with_error(corrected, its_error), unit),
+                    size(value, unit, 6),
+                    size(known(f"{name}_error"), unit, like=value),
+                    NONE if np.isnan(error) else precise(error, doubt, unit),
+                    size(total, unit, like=value),
+                    NONE if np.isnan(error) else precise(corrected, its_error, unit),
                 )
             )
     head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from forward.words import number, with_unit
+from forward.readable import size
+from forward.words import NONE
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
 from workflows.report.words import counted
@@ -42,7 +43,7 @@ def failures(results: Results) -> Table:
 
     def row(failure: Mapping[str, Any]) -> tuple[str, ...]:
         model, at = str(failure.get("model", "/")), failure["parameters"]
-        shown = (with_unit(number(at.get(name), 6), results.parameter_unit(name, model)) for name in names)
+        shown = (NONE if name not in at else size(at[name], results.parameter_unit(name, model), 6) for name in names)
         return (*([model] if models else []), *shown, failure["reason"])
 
     head = (*(["model"] if models else []), *names, "reason")

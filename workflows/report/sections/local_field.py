@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from forward.readable import size
 from forward.words import number, per, with_unit
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
@@ -32,9 +33,9 @@ def field_norms(results: Results) -> Table:
     rows = []
     for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
         of_parameter = dataset.sel(parameter=name)
-        size, std, wide = (
+        rms, std, wide = (
             float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
         )
-        slope = with_unit(number(size, 5), per("m", results.parameter_unit(name)))
-        rows.append((name, slope, with_unit(number(size * std), "m"), with_unit(number(size * wide), "m")))
+        slope = with_unit(number(rms, 5), per("m", results.parameter_unit(name)))
+        rows.append((name, slope, size(rms * std, "m", 4), size(rms * wide, "m", 4)))
     return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from forward.readable import size
 from forward.words import number, per, with_unit
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
@@ -43,7 +44,7 @@ def sensitivities(results: Results, output: str) -> Table:
         slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
         corrected = results.corrected("derivative", {"output": output, "parameter": name}, by)
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
-        rows.append((name, slope, *corrected, *(with_unit(number(value), unit) for value in scaled)))
+        rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
     known = ("corrected for the mesh",) if "derivative_corrected" in results.dataset else ()
     return Table(("parameter", "derivative", *known, "× standard deviation", "× range"), rows)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.words import duration, number, with_error, with_unit
+from forward.readable import precise
+from forward.words import duration, number
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -74,7 +75,8 @@ def differences(results: Results, output: str) -> Table:
     rows = []
     for level in results.dataset["level"].to_numpy():
         here = results.dataset.sel(output=output, level=level)
-        text = with_error(float(here["difference_mean"]), float(here["difference_mean_error"]))
+        unit = results.unit(output)
+        text = precise(float(here["difference_mean"]), float(here["difference_mean_error"]), unit)
         rest = (
             "mesh_variance",
             "difference_variance",
@@ -82,7 +84,7 @@ def differences(results: Results, output: str) -> Table:
             "difference_kurtosis",
             "consistency",
         )
-        rows.append((f"{level}", with_unit(text, results.unit(output)), *(number(float(here[n]), 3) for n in rest)))
+        rows.append((f"{level}", text, *(number(float(here[n]), 3) for n in rest)))
     head = (
         "level",
         "mean of the difference",

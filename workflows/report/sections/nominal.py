@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.words import number, with_unit
+from forward.readable import size
 from workflows.report.blocks import Block, Heading, Table
 from workflows.report.section import Results, Section
 
@@ -25,5 +25,5 @@ class Nominal(Section):
 def nominal(results: Results) -> Table:
     """Outputs at the mean parameters."""
     values = results.dataset["nominal"].to_numpy()
-    rows = [(o, with_unit(number(v, 6), results.unit(o))) for o, v in zip(results.outputs, values, strict=True)]
+    rows = [(o, size(float(v), results.unit(o), 6)) for o, v in zip(results.outputs, values, strict=True)]
     return Table(("output", "value"), rows)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.bodies.geometry import AXES
+from forward.readable import precise
 from forward.specimen import Specimen
-from forward.words import named, number, with_error
+from forward.words import named, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import places as plots
 from workflows.report.section import Results, Section
@@ -84,8 +85,8 @@ def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Ta
     for k, case, name, unit in _outputs(one, model):
         of = one.isel(datum=k)
         pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        shown = [with_error(float(of[value]), float(of[error])) for value, error in pairs]
+        shown = [precise(float(of[value]), float(of[error]), unit) for value, error in pairs]
         told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
-        rows.append((case, named(name, unit), *shown, number(float(of["residual"]), 3), *told))
+        rows.append((case, name, *shown, number(float(of["residual"]), 3), *told))
     head = ["load case", "output", "measured", "predicted", "residual over its error"]
     return Table([*head, *(["information alone (nat)"] if alone else [])], rows, text=frozenset({0, 1}))

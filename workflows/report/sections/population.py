@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from forward.words import named, number, with_error
-from workflows.report.blocks import Block, Heading, Table, Text
+from forward.readable import scale, spoken
+from forward.words import named, number, with_error, with_unit
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.plots import population as plots
 from workflows.report.section import Results, Section
 
 if TYPE_CHECKING:
@@ -34,8 +36,14 @@ class PopulationOfSpecimens(Section):
         )
         rows = [
             (
-                named(name, results.parameter_unit(name)),
-                *(_interval(of[f"{which}_quantiles"].sel(parameter=name)) for which in ("typical", "scale", "new")),
+                name,
+                *(
+                    _interval(
+                        of[f"{which}_quantiles"].sel(parameter=name),
+                        "1" if logarithmic and which == "scale" else results.parameter_unit(name),
+                    )
+                    for which in ("typical", "scale", "new")
+                ),
             )
             for name in results.parameters
         ]
@@ -55,32 +63,43 @@ class PopulationOfSpecimens(Section):
             ]
             yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
         yield Heading("Its specimens")
+        caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
+        units = {name: results.parameter_unit(name) for name in results.parameters}
+        yield Pictures([Picture.drawn(plots.specimens(of, name, units[name]), caption) for name in results.parameters])
         yield Text(
             "By its own data alone, and with what the others say on what specimens are like. The last column is how "
             "many of its draws lie where the population is."
         )
-        lines = []
-        for specimen in map(str, of["specimen"].values):
-            one = of.sel(specimen=specimen)
-            for name in results.parameters:
-                here = one.sel(parameter=name)
-                alone, shrunken = (
-                    with_error(float(here[f"{who}_mean"]), float(here[f"{who}_std"])) for who in ("own", "specimen")
-                )
-                lines.append(
-                    (
-                        specimen,
-                        named(name, results.parameter_unit(name)),
-                        alone,
-                        shrunken,
-                        number(float(one["specimen_effective"]), 3),
-                    )
-                )
-        head = ("specimen", "parameter", "by itself", "of the population", "effective")
-        yield Table(head, lines, text=frozenset({0, 1}))
+        yield specimens(results)
 
 
-def _interval(quantiles: xr.DataArray) -> str:
+def specimens(results: Results) -> Table:
+    """A line for each specimen."""
+    of = results.dataset
+    sizes = {
+        name: scale(float(of["typical_quantiles"].sel(parameter=name)[1]), results.parameter_unit(name))
+        for name in results.parameters
+    }
+    lines = []
+    for specimen in map(str, of["specimen"].values):
+        one = of.sel(specimen=specimen)
+        cells = [
+            with_error(*(float(one[f"{who}_{which}"].sel(parameter=name)) / size for which in ("mean", "std")))
+            for name, (size, _) in sizes.items()
+            for who in ("own", "specimen")
+        ]
+        lines.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
+    heads = [
+        f"{named(spoken(name), unit)}, {who}"
+        for name, (_, unit) in sizes.items()
+        for who in ("by itself", "of the population")
+    ]
+    return Table(("specimen", *heads, "effective"), lines)
+
+
+def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
     """Write a median with the ends of an interval."""
-    lower, middle, upper = (number(float(x)) for x in quantiles.to_numpy())
-    return f"{middle} ({lower} to {upper})"
+    values = [float(x) for x in quantiles.to_numpy()]
+    one, name = scale(values[1], unit)
+    lower, middle, upper = (number(x / one) for x in values)
+    return f"{with_unit(middle, name)} ({lower} to {upper})"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from forward.readable import precise, scale, size, spoken
 from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
+PAIRABLE = 20  # draws from which on densities are drawn
 DRAWN = 8  # data sets that have more than a row in the table
 
 
@@ -60,13 +62,11 @@ class Posterior(Section):
             yield Pairs([*amounts(one, one.sizes["direction"])])
             yield posterior(one, units)
             if _words(one) is OUTPUTS:
-                yield measurements(one)
+                yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
                 yield from _curves(one, results.study.model)
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before, units)])
             names = [str(name) for name in one.parameter.values if name != "noise"]
-            alone = [[_shown(of["alone_std"].sel(parameter=name), 2) for name in names] for of in each_case(one)]
-            together = [_shown(one["together_std"].sel(parameter=name), 2) for name in names]
-            yield from cases(one, [f"± {named(name, units.get(name, '1'))}" for name in names], [*alone, together])
+            yield from cases(one, *_widths(one, names, units))
             yield Heading("Directions", level=3)
             yield Text(
                 "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
@@ -74,6 +74,15 @@ class Posterior(Section):
             )
             yield directions(one)
             yield iterations(one)
+
+
+def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tuple[list[str], list[list[str]]]:
+    """Return heads and rows of posterior widths: by each load case alone, then by all; a column in one unit."""
+    sizes = {name: scale(float(one["together_std"].sel(parameter=name)), units.get(name, "1")) for name in names}
+    rows = [[of["alone_std"].sel(parameter=name) for name in names] for of in each_case(one)]
+    rows.append([one["together_std"].sel(parameter=name) for name in names])
+    heads = [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()]
+    return heads, [[_shown(x / sizes[n][0], 2) for n, x in zip(names, row, strict=True)] for row in rows]
 
 
 def first(results: Results) -> Iterator[xr.Dataset]:
@@ -107,7 +116,7 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
     if "points_moved" in one and (moved := int(one["points_moved"])):
         yield (
             "outside the body",
-            f"{moved} points, up to {number(float(one['largest_move']), 2)} m, moved to its surface",
+            f"{moved} points, up to {size(float(one['largest_move']), 'm')}, moved to its surface",
         )
     seen = int((one["eigenvalue"] > plots.SEEN).sum())
     yield "directions about which the data say more than the prior", f"{seen} of {directions:,}"
@@ -159,14 +168,20 @@ def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
 
 
 def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[str]:
-    """Name, prior, mode, posterior, interval; width by Laplace if there is one, truth if known."""
-    row = [named(name, unit), with_error(float(of["prior_mean"]), float(of["prior_std"]))]
-    row += [_shown(of["mode"]), _estimate(of), f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
+    """Name, prior, mode, posterior, interval; width by Laplace if there is one, truth if known; in one unit."""
+    one, unit = scale(float(of["mean"]), unit)
+
+    def said(which: str, digits: int = 4) -> str:
+        return number(float(of[which]) / one, digits)
+
+    row = [named(name, unit), with_error(float(of["prior_mean"]) / one, float(of["prior_std"]) / one)]
+    row += [said("mode"), with_error(float(of["mean"]) / one, float(of["std"]) / one)]
+    row.append(f"{said('lower')} to {said('upper')}")
     if laplace:
-        row.append(_shown(of["laplace_std"], 2) if "laplace_std" in of else "")
+        row.append(said("laplace_std", 2) if "laplace_std" in of else "")
     if known:
         inside = float(of["lower"]) <= float(of["true"]) <= float(of["upper"])
-        row += [_shown(of["true"]), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
+        row += [said("true"), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
     return row
 
 
@@ -199,8 +214,15 @@ def directions(one: xr.Dataset) -> Table:
     rows = []
     for i, value in enumerate(one["eigenvalue"].to_numpy()):
         vector = one["direction_parameter"].isel(direction=i).to_numpy()[: len(names)]
-        rows.append((f"{i + 1}", number(value, 3), number((1 + value) ** -0.5, 2), *(f"{x:+.2f}" for x in vector)))
-    return Table(("direction", "λ", "posterior over prior width", *names), rows)
+        rows.append(
+            (
+                f"{i + 1}",
+                number(value, 3),
+                number((1 + value) ** -0.5, 2),
+                *(f"{x:+.2f}".replace("-", "−") for x in vector),
+            )
+        )
+    return Table(("direction", "λ", "posterior over prior width", *map(spoken, names)), rows)
 
 
 def iterations(one: xr.Dataset) -> Block:
@@ -221,10 +243,6 @@ def _shown(value: Any, digits: int = 4) -> str:
     return number(float(value), digits)
 
 
-def _estimate(of: Any) -> str:
-    return with_error(float(of["mean"]), float(of["std"]))
-
-
 def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
     """Curves (values, density) of the priors by the name of the parameter."""
     known = dict(study.inputs.marginals)
@@ -240,14 +258,15 @@ def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
     return curves
 
 
-def measurements(one: xr.Dataset) -> Table:
+def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Measurements of each output, and predictions with the most probable parameters."""
     rows = []
     for k in np.flatnonzero(np.isfinite(one["measured"].to_numpy())):
         of = one.isel(datum=k)
         pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        shown = [with_error(float(of[value]), float(of[error])) for value, error in pairs]
-        rows.append((str(one.case.values[int(of["datum_case"])]), *shown, _shown(of["residual"], 3)))
+        output = str(one.case.values[int(of["datum_case"])])
+        shown = [precise(float(of[value]), float(of[error]), units.get(output, "1")) for value, error in pairs]
+        rows.append((output, *shown, _shown(of["residual"], 3)))
     return Table(("output", "measured", "predicted", "residual over its error"), rows)
 
 
@@ -300,8 +319,12 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
         yield from on_a_plane(one, plots.Cut.of(one))
     yield (
         plots.marginals(one, before, units),
-        "Prior and posterior of each parameter; Laplace's Gaussian, and the truth if known.",
+        "Prior and posterior of each parameter, beside it the whole prior; Laplace's Gaussian, and the truth if known.",
     )
+    if one.sizes["parameter"] > 1 and np.isfinite(one["draw"].to_numpy()).all(axis=1).sum() >= PAIRABLE:
+        words = "Posterior of the parameters in pairs: contours hold 50 and 90 %; lines are at the most probable values"
+        known = " and the truth" if np.isfinite(one["true"]).any() else ""
+        yield plots.correlations(one, units), f"{words}{known}."
     yield of_misfits(one)
     if np.isfinite(one["true"]).any():
         yield plots.errors(one), "Mean minus truth over the posterior standard deviation; 95 % lie in the grey band."

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.words import NONE, number, with_error, with_unit
+from forward.readable import between, precise, size
+from forward.words import NONE, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
 
@@ -59,11 +60,11 @@ def table(one: xr.Dataset) -> Table:
         rows.append(
             (
                 str(goal),
-                with_unit(with_error(float(at["prediction_mean"]), float(at["prediction_std"])), unit),
-                f"{number(lower)} to {number(upper)}",
-                with_error(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"])),
+                precise(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
+                between(lower, upper, unit),
+                precise(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
                 f"{number(100 * share, 3)} %" if np.isfinite(share) else NONE,
-                number(mesh, 2) if np.isfinite(mesh) else "not estimated",
+                size(mesh, unit) if np.isfinite(mesh) else "not estimated",
             )
         )
     head = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")

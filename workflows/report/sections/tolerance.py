@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.words import number, with_error, with_unit
+from forward.readable import precise
+from forward.words import number
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -40,7 +41,7 @@ class Tolerance(Section):
             [
                 (
                     f"{WORDS[estimate]} of {name}",
-                    with_unit(with_error(of["value"], of["error"]), results.unit(name)),
+                    precise(of["value"], of["error"], results.unit(name)),
                     *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
                 )
                 for name, estimates in told["outputs"].items()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from forward.words import NONE, number
+from forward.words import NONE, number, with_error
 
 # From large to small: what one of it is in the SI unit, and its name. The first that a value reaches is taken.
 SIZES: dict[str, tuple[tuple[float, str], ...]] = {
@@ -12,6 +12,7 @@ SIZES: dict[str, tuple[tuple[float, str], ...]] = {
     "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa"), (1e-3, "mPa")),
     "N": ((1e3, "kN"), (1.0, "N"), (1e-3, "mN"), (1e-6, "µN")),
     "J": ((1e3, "kJ"), (1.0, "J"), (1e-3, "mJ"), (1e-6, "µJ"), (1e-9, "nJ")),
+    "N m": ((1.0, "N m"), (1e-3, "mN m"), (1e-6, "µN m")),
     "m²": ((1.0, "m²"), (1e-4, "cm²"), (1e-6, "mm²")),
     "m³": ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³")),
     "N/m": ((1e3, "kN/m"), (1.0, "N/m"), (1e-3, "mN/m")),
@@ -72,6 +73,18 @@ def and_error(value: float, error: float, unit: str) -> str:
     return _with(f"{rounded(value / one, error / one)} ± {rounded(error / one, error / one)}", name)
 
 
+def precise(value: float, error: float, unit: str) -> str:
+    """Write a value and its error, which has two digits, in a fitting unit: 12.311 ± 0.0088 cm."""
+    one, name = scale(max(abs(value), error) if math.isfinite(error) else value, unit)
+    return _with(with_error(value / one, error / one), name)
+
+
+def between(lower: float, upper: float, unit: str, digits: int = 4) -> str:
+    """Write two ends in one fitting unit: 28.78 to 29.06 mm."""
+    one, name = scale(max(abs(lower), abs(upper)), unit)
+    return _with(f"{number(lower / one, digits)} to {number(upper / one, digits)}", name)
+
+
 def interval(lower: float, upper: float, unit: str, at: float) -> str:
     """Write an interval, to three digits of its width, in the unit of `at`: 11.0–13.7 cm."""
     if not (math.isfinite(lower) and math.isfinite(upper)):
@@ -85,7 +98,12 @@ def interval(lower: float, upper: float, unit: str, at: float) -> str:
 def spoken(path: str) -> str:
     """Name a number of a model by the end of its path: `loads.gravity.density` is the gravity density."""
     parts = path.split(".")
-    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in LEAD else parts)
+    return " ".join(parts[1:] if is_path(path) else parts)
+
+
+def is_path(name: str) -> bool:
+    """Whether a name is the path of a number of a model, as `loads.gravity.density` is."""
+    return "." in name and name.split(".", maxsplit=1)[0] in LEAD
 
 
 def percent(share: float) -> str:
