@@ -41,6 +41,7 @@ from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
 from forward.model import Finding, FloatArray, ModelError
 from forward.observables.observable import Output
+from forward.readable import told
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest, shown
@@ -76,8 +77,9 @@ def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]
     edge = body.longest_edge
     for inclusion in inclusions:
         if inclusion.width < edge:
+            wide, cell = told(inclusion.width, "m", 6), told(edge, "m", 3)
             text = (
-                f"inclusions.{inclusion.label}.width = {inclusion.width:g} m is below a cell ({edge:.3g} m): few "
+                f"inclusions.{inclusion.label}.width = {wide} is below a cell ({cell}): few "
                 "quadrature points see the transition, and derivatives by place and size are rough."
             )
             yield Finding("warning", text)
@@ -89,8 +91,9 @@ def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[F
     for path, ends in ranges.items():
         largest = max(ends, key=abs)
         if path.startswith("displacements.") and abs(largest) > extent:
+            far, long = told(largest, "m", 3), told(extent, "m", 3)
             text = (
-                f"{path} reaches {largest:.3g} m, more than the length of the body, {extent:.3g} m: is it given in "
+                f"{path} reaches {far}, more than the length of the body, {long}: is it given in "
                 "another unit than metres?"
             )
             yield Finding("warning", text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from forward.words import NONE, number, with_error
 
@@ -18,6 +19,7 @@ SIZES: dict[str, tuple[tuple[float, str], ...]] = {
     "N/m": ((1e3, "kN/m"), (1.0, "N/m"), (1e-3, "mN/m")),
 }
 LEAD = ("loads", "material", "inclusions", "regions", "fields", "model")  # of paths, not said
+ROUNDING = 1e-9  # of the largest coordinate of a place
 MOST = 6  # digits of a number without an error
 
 
@@ -67,6 +69,11 @@ def size(value: float, unit: str, digits: int = 2, like: float | None = None) ->
     return _with(number(value / one, digits), name)
 
 
+def told(value: float, unit: str, digits: int = 2) -> str:
+    """Write what `size` writes for a line of text: with an ordinary space before the unit."""
+    return size(value, unit, digits).replace("\u00a0", " ")
+
+
 def and_error(value: float, error: float, unit: str) -> str:
     """Write a value and its error in one unit: 12.311 ± 0.009 cm."""
     one, name = scale(value, unit)
@@ -83,6 +90,13 @@ def between(lower: float, upper: float, unit: str, digits: int = 4) -> str:
     """Write two ends in one fitting unit: 28.78 to 29.06 mm."""
     one, name = scale(max(abs(lower), abs(upper)), unit)
     return _with(f"{number(lower / one, digits)} to {number(upper / one, digits)}", name)
+
+
+def place(x: Sequence[float], digits: int = 3) -> str:
+    """Write a place (m) in one unit; a coordinate that is rounding beside the others is zero."""
+    largest = max(map(abs, x))
+    one, unit = scale(largest, "m")
+    return _with(", ".join(number(c / one if abs(c) > ROUNDING * largest else 0.0, digits) for c in x), unit)
 
 
 def interval(lower: float, upper: float, unit: str, at: float) -> str:

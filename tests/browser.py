@@ -182,3 +182,27 @@ def browser() -> Iterator[Page]:
             process.kill()
             os.close(to_it)
             os.close(from_it)
+
+
+def without_fault(page: Page, report: Path) -> None:
+    """Open a report on a screen and a telephone, light, dark and printed: what is wrong with it fails."""
+    viewers = "[...document.querySelectorAll('.viewer')]"
+    # Whoever cannot see hears what each picture and control is.
+    unnamed = "img:not([alt]), img[alt=''], button:not([aria-label]):empty, canvas:not([aria-label])"
+    for width in (1280, 390):
+        page.open(report, width)
+        for media, scheme in (("", "light"), ("", "dark"), ("print", "light")):
+            page.call(
+                "Emulation.setEmulatedMedia", media=media, features=[{"name": "prefers-color-scheme", "value": scheme}]
+            )
+            page.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            said = f"{report} at {width}, {media} {scheme}"
+            assert page.errors == [], said
+            assert [url for url in page.requests if not url.startswith(("file:", "data:", "blob:"))] == [], said
+            assert page.run(f"{viewers}.map((v) => v.dataset.why || 'ready').filter((w) => w !== 'ready')") == [], said
+            if media == "print":
+                assert page.run(f"{viewers}.every((v) => v.querySelectorAll('.stills img').length > 0)"), said
+            else:  # nothing is wider than the window
+                assert page.run("document.documentElement.scrollWidth") <= width, said
+        assert page.run(f"document.querySelectorAll({json.dumps(unnamed)}).length") == 0, said
+        assert page.run("document.querySelectorAll('h1').length") == 1, said

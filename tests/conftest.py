@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +18,32 @@ def pytest_collection_modifyitems(items):
     launching = Counter(item.path for item in items if item.get_closest_marker("mpi"))
     solving = Counter(item.path for item in items if item.get_closest_marker("fem"))
     items.sort(key=lambda item: (-launching[item.path], -solving[item.path]))
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """One browser for all tests of a process; None where there is none."""
+    from tests.browser import browser, executable
+
+    if executable() is None:
+        yield None
+        return
+    with browser() as page:
+        yield page
+
+
+@pytest.fixture
+def looked_at(chromium):
+    """Open the report in a folder of results as people do; where there is no browser, it only has to exist."""
+    from tests.browser import without_fault
+
+    def look(folder):
+        report = Path(folder) / "report.html"
+        assert report.exists()
+        if chromium is not None:
+            without_fault(chromium, report)
+
+    return look
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from forward.bodies.elements import default_quadrature
 from forward.bodies.mesh_file import MeshFile
 from forward.model import Finding, FloatArray
+from forward.readable import told
 from forward.settings import Settings
 
 Axis = Literal["x", "y", "z"]
@@ -443,7 +444,7 @@ def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...
     moved = (
         f"{len(far)} points lie outside the body and are" if len(far) > 1 else "1 point lies outside the body and is"
     )
-    text = f"{moved} moved to its surface, by up to {far[name]:.2g} m ('{name}')."
+    text = f"{moved} moved to its surface, by up to {told(far[name], 'm')} ('{name}')."
     return (Finding("note", text),)
 
 

@@ -23,6 +23,7 @@ from forward.bodies.location import nearest_of
 from forward.bodies.mesh import CLOSE, FACES, TETRAHEDRA, Contents, Loaded, Point, contents, divided, divided_contents
 from forward.bodies.mesh_reading import digest_of, load
 from forward.model import FloatArray, ModelError
+from forward.readable import told
 from forward.settings import Settings
 
 LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
@@ -199,7 +200,7 @@ class MeshFile(Settings):
         extent = max(high - low for low, high in self.bounds)
         if not SMALL <= extent <= LARGE:
             yield (
-                f"model.body.unit = {self.unit:g} makes the body {extent:.3g} m long: "
+                f"model.body.unit = {self.unit:g} makes the body {told(extent, 'm', 3)} long: "
                 "is that meant? Coordinates in millimetres have unit = 1e-3"
             )
 

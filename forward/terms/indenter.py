@@ -22,6 +22,7 @@ from pydantic import model_validator
 from forward.bodies.geometry import Body, Direction, Vector, tolerance, unit_vector
 from forward.bodies.surface import edges, facets, points
 from forward.model import Finding, FloatArray
+from forward.readable import told
 from forward.scalars import Scalar
 from forward.settings import Settings
 from forward.terms import tools
@@ -424,16 +425,18 @@ class Indenter(Term):
         near = np.linalg.norm(corners.mean(axis=1) - np.array(self.at), axis=1).argmin()
         edge = float(edges(corners[[near]])[0])
         if 0 < self.size < edge:
+            radius, cell = told(self.size, "m"), told(edge, "m")
             text = (
-                f"loads.{self.label} touches '{self.on}' over a radius of about {self.size:.2g} m, which is below the "
-                f"edges of the cells there ({edge:.2g} m): its force and pressure are rough. Refine the mesh there."
+                f"loads.{self.label} touches '{self.on}' over a radius of about {radius}, which is below the "
+                f"edges of the cells there ({cell}): its force and pressure are rough. Refine the mesh there."
             )
             yield Finding("warning", text)
         rim = self.edge or SHARP * (self.radius or 0)
         if self.shape == "flat" and rim < edge / ALONG:
+            over, apart = told(rim, "m"), told(edge / ALONG, "m")
             text = (
-                f"The edge of loads.{self.label} is rounded over {rim:.2g} m, less than the distance of the points at "
-                f"which contact is looked for on '{self.on}' ({edge / ALONG:.2g} m): where these pass it there are "
+                f"The edge of loads.{self.label} is rounded over {over}, less than the distance of the points at "
+                f"which contact is looked for on '{self.on}' ({apart}): where these pass it there are "
                 "several equilibria, whose forces differ by up to 15 % on coarse meshes, and one of them is found. "
                 "Refine the mesh there, or give it a rounder edge."
             )

@@ -10,6 +10,7 @@ from annotated_types import Gt, Unit
 
 from forward.bodies.geometry import Body, Direction, unit_vector
 from forward.model import Finding
+from forward.readable import told
 from forward.terms.term import Place, Term
 from forward.words import listed
 
@@ -43,8 +44,9 @@ class Spot(Term):
         """Say where the spot is too small for the mesh."""
         edge = body.longest_edge / body.degree
         if self.width < edge / 2:
+            wide, apart = told(self.width, "m", 6), told(edge, "m", 3)
             text = (
-                f"loads.{self.label}.width = {self.width:g} m is below half the distance of nodes ({edge:.3g} m): the "
+                f"loads.{self.label}.width = {wide} is below half the distance of nodes ({apart}): the "
                 "mesh hardly sees the spot."
             )
             yield Finding("warning", text)

@@ -294,7 +294,8 @@ def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
     moved = {name: shift for name, shift in shifts.items() if np.isfinite(shift)}
     everywhere = float(np.sqrt((nodes**2).mean())) if len(nodes) else 0.0
     worst = max([abs(shift) for shift in moved.values()] + [everywhere], default=0.0)
-    listed = [f"{name} {shift:+.2g}" for name, shift in sorted(moved.items(), key=lambda item: -abs(item[1]))]
+    ordered = sorted(moved.items(), key=lambda item: -abs(item[1]))
+    listed = [f"{name} {shift:+.2g}".replace(" -", " −") for name, shift in ordered]
     listed += [f"values at the vertices {everywhere:.2g} (root mean square)"] if len(nodes) else []
     return ", ".join(listed), worst
 

@@ -45,7 +45,7 @@ def test_points_within_a_thousandth_are_moved_and_that_is_said():
     assert not at((1.0, 0.5, 0.5), (1.0 + 1e-15, 0.5, 0.5))
     (note,) = at((1.001, 0.5, 0.5), (0.5, 0.5, -2e-4), (0.1, 0.1, 0.1))
     assert note.severity == "note"
-    assert note.text == "2 points lie outside the body and are moved to its surface, by up to 0.001 m ('u0')."
+    assert note.text == "2 points lie outside the body and are moved to its surface, by up to 1 mm ('u0')."
 
 
 def test_the_specification_without_mistakes_is_accepted():

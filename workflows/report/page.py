@@ -138,7 +138,7 @@ class _Group:
 
     @property
     def two(self) -> bool:
-        return any(name == "body" for name, _ in self.sections)
+        return any(isinstance(block, Viewer) for name, blocks in self.sections if name == "body" for block in blocks)
 
 
 def _grouped(parts: Parts) -> list[_Group]:

@@ -132,6 +132,7 @@ SECTIONS = Kinds(
         "error-budget": f"{_HERE}.error_budget:ErrorBudget",
         "synthetic-data": f"{_HERE}.synthetic_data:SyntheticData",
         "design": f"{_HERE}.design:ChosenObservations",
+        "reduced": f"{_HERE}.reduced:ReducedModelOfBody",
         "evidences": f"{_HERE}.evidences:Evidences",
         "path": f"{_HERE}.path:Curve",
         "error-against-cost": f"{_HERE}.error_against_cost:ErrorAgainstCost",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, Severity
+from forward.readable import told
 from forward.registry import named
 from inverse.data.shared_motion import said
 from uq.findings import add
@@ -100,7 +101,9 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         count, farthest, rms = int(one["points_moved"]), float(one["largest_move"]), float(one["rms_move"])
         points = "1 point" if count == 1 else f"{count} points"
         where = " outside the body" if not study.measurements[number].on_surface else ""
-        moved = f"{points}{where} moved to its surface, by up to {farthest:.2g} m (root mean square {rms:.2g} m)"
+        moved = (
+            f"{points}{where} moved to its surface, by up to {told(farthest, 'm')} (root mean square {told(rms, 'm')})"
+        )
         found.append(criticism.Doubt("note", moved, ""))
     if "points_moved" in one:
         measured = study.measurements[number]

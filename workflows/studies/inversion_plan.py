@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.readable import told
 from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
@@ -81,7 +82,8 @@ def _moved(count: int, usable: list[Measurement]) -> str:
     are = f"point{where} is" if count == 1 else f"points{where} are"
     farthest = max(m.moved.max(initial=0.0) for m in usable)
     square = float(np.mean(np.concatenate([m.moved for m in usable]) ** 2))
-    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m (root mean square {np.sqrt(square):.2g} m)"
+    rms = told(np.sqrt(square), "m")
+    return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
 
 
 def plan_of_outputs(study: OutputInversion) -> list[str]:

@@ -442,7 +442,7 @@ def test_what_was_found_is_listed(file):
 def test_units_are_checked(file):
     warned = [line for line in plan(parse(tomllib.loads(text(unit=1e-5)), folder=file.parent)) if "warning" in line]
     assert len(warned) == 1
-    assert "model.body.unit = 1e-05 makes the body 1e-05 m long" in warned[0]
+    assert "model.body.unit = 1e-05 makes the body 10 µm long" in warned[0]
     assert not any("warning" in line for line in plan(parse(tomllib.loads(text()), folder=file.parent)))
 
 

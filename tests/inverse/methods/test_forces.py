@@ -237,7 +237,7 @@ def test_synthetic_tables_hold_forces_with_errors_of_their_own(folder):
     assert study.labels(0)[int(np.flatnonzero(forces)[0])].endswith(", pull, grip")
 
 
-def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(folder):
+def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(folder, looked_at):
     blind, seeing = load(folder / "blind.toml"), load(folder / "few.toml")
     assert any(RATIOS in finding.text and "material.mu" in finding.text for finding in blind.findings)
     assert not any(RATIOS in finding.text for finding in seeing.findings)
@@ -254,6 +254,7 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
     measured = found["measured"].values[found["datum_axis"].values >= 3]
     np.testing.assert_allclose(predicted, measured, rtol=0.06)
     page = (folder / "out-few" / "report.html").read_text()
+    looked_at(folder / "out-few")
     assert "grip by load case, measured and predicted" in page
     assert page.count("residual over its error") == 1
 

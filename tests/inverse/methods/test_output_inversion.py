@@ -96,7 +96,7 @@ def ran(study, out, *changes, report=False):
     return main(["run", str(study), "--out", str(out), "--quiet", *([] if report else ["--no-report"]), *sets])
 
 
-def test_a_linear_model_has_its_exact_posterior(folder):
+def test_a_linear_model_has_its_exact_posterior(folder, looked_at):
     """Mode, standard deviations and evidence; the residuals, repeated measurements among them; nothing of meshes."""
     assert ran(folder / "stated.toml", folder / "stated", report=True) == 0
     one = results(folder / "stated").isel(data_set=0)
@@ -114,12 +114,13 @@ def test_a_linear_model_has_its_exact_posterior(folder):
     assert set(summary["posterior"]) == {"a", "b"}
     assert "can be trusted" in summary["verdict"]
     page = (folder / "stated" / "report.html").read_text()
+    looked_at(folder / "stated")
     assert "values of outputs" in page
     assert "predicted" in page
     assert "oad case" not in page
 
 
-def test_tables_are_data_sets_side_by_side(folder):
+def test_tables_are_data_sets_side_by_side(folder, looked_at):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     files = "data={files='data', noise={relative=0.1}}"
     assert ran(folder / "stated.toml", folder / "batch", files, report=True) == 3
@@ -134,6 +135,7 @@ def test_tables_are_data_sets_side_by_side(folder):
     table = (folder / "batch" / "batch.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
     assert "All data sets" in (folder / "batch" / "report.html").read_text()
+    looked_at(folder / "batch")
 
 
 def test_a_wrong_jacobian_is_named(folder):

@@ -86,7 +86,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_linear_models_have_their_exact_evidences(folder):
+def test_linear_models_have_their_exact_evidences(folder, looked_at):
     """Stated in the study or in a table; the report and summary.json name them; nothing is said of meshes."""
     out = folder / "out"
     assert main(["run", str(folder / "rivals.toml"), "--out", str(out), "--quiet"]) == 0
@@ -100,6 +100,7 @@ def test_linear_models_have_their_exact_evidences(folder):
         assert found.attrs["quantity"] == "output"
     assert set(json.loads((out / "summary.json").read_text())["models"]) == {"one", "one-alone", "other"}
     assert "one-alone" in (out / "report.html").read_text()
+    looked_at(out)
     study, table = load(folder / "rivals.toml"), 'data={file="table.csv", sigma={w=0.3}}'
     assert (
         load(folder / "rivals.toml", [table]).data_groups["all"].sigma.tolist()

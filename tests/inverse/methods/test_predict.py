@@ -154,7 +154,7 @@ def exactly():
     return covariance @ (B.T @ (VALUES / ERRORS**2) + MEAN / STD**2), covariance
 
 
-def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(folder, capsys):
+def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(folder, capsys, looked_at):
     """To the sampling error of the posterior's points; the terminal, summary.json and the report say it."""
     out = folder / "same"
     assert main(["run", str(folder / "same.toml"), "--out", str(out)]) == 0
@@ -174,6 +174,7 @@ def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(fold
     assert told["mesh_error"] is None
     assert "outputs: v 0.8" in capsys.readouterr().out
     page = (out / "report.html").read_text()
+    looked_at(out)
     assert "Predictions" in page
     assert "share of the variance" in page
 

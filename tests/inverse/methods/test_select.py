@@ -491,7 +491,7 @@ def test_other_studies_do_not_import_inversion():
     assert run_script(None, script).stdout.strip() == "False"
 
 
-def test_a_study_from_the_command_line(small):
+def test_a_study_from_the_command_line(small, looked_at):
     """One rank or two: the same bytes; a report; nothing to do the second time."""
     done = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
     assert done.returncode == 0, done.stderr
@@ -505,6 +505,7 @@ def test_a_study_from_the_command_line(small):
     assert done.returncode == 0, done.stderr
     assert (small.parent / "one/results.nc").read_bytes() == (small.parent / "two/results.nc").read_bytes()
     page = (small.parent / "one" / "report.html").read_text()
+    looked_at(small.parent / "one")
     for words in (
         "Evidences and probabilities",
         "measured by hand",

@@ -323,8 +323,9 @@ def test_same_bits_on_any_number_of_groups(small, tmp_path):
 
 
 @pytest.mark.fem
-def test_report_of_a_study(small):
+def test_report_of_a_study(small, looked_at):
     page = (small / "out" / "report.html").read_text()
+    looked_at(small / "out")
     for text in ("Models", "cells × 2", "1 iteration", "correlation", "groups", "plain Monte Carlo"):
         assert text in page, text
     summary = json.loads((small / "out" / "summary.json").read_text())

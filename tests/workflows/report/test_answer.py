@@ -8,10 +8,10 @@ import pytest
 import xarray as xr
 from scipy import integrate, stats
 
+from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
 from workflows.report import bodies, plots
 from workflows.report.page import write_report
-from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
 from workflows.report.sections import answer
 
 

@@ -1,23 +1,33 @@
 """Reports in a real browser: nothing fails, nothing is fetched, bodies turn, sliders move what Python computes."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.browser import browser, executable
-from tests.workflows.report.test_report import CUBE, solve, study, write
+from forward.model import FunctionModel
+from tests.browser import executable, without_fault
+from tests.workflows.report.test_report import CUBE, HEXAHEDRON, solve, study, write
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Normal, Uniform
+from uq.inputs.draws import Draws
+from uq.inputs.random_parameters import Inputs
+from uq.methods.chaos import Chaos
 from uq.surrogates.expansion import Expansion
-from workflows.report.page import write_report
+from workflows.report.blocks import Heading, Table
+from workflows.report.page import render, write_report
+from workflows.report.scene.scene import Quantity, Scene
+from workflows.report.scene.sliders import sliders
+from workflows.report.sections.body import turning
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium is installed (Debian: chromium)")
 VIEWER = "document.querySelector('.viewer').viewer"
 
 
-@pytest.fixture(scope="module")
-def page():
-    with browser() as found:
-        yield found
+@pytest.fixture
+def page(chromium):
+    return chromium
 
 
 @pytest.fixture(scope="module")
@@ -44,19 +54,24 @@ def reports(tmp_path_factory, expanded):
     return {name: write_report(write(folder / name, dataset)) for name, dataset in kinds.items()}
 
 
-@pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("name", ["chaos", "sampled", "local"])
-def test_reports_open_without_a_fault(page, reports, name, width):
-    for options in ({}, {"dark": True}, {"printed": True}):
-        page.open(reports[name], width, **options)
-        assert page.errors == []
-        assert [url for url in page.requests if not url.startswith(("file:", "data:", "blob:"))] == []
-        assert page.run("document.querySelector('.viewer').dataset.why || 'ready'") == "ready"
-        # Nothing is wider than the window, and what cannot be read is not there.
-        assert options.get("printed") or page.run("document.documentElement.scrollWidth") <= width
-        assert page.run("getComputedStyle(document.querySelector('.stills')).display !== 'none'") == bool(
-            options.get("printed")
-        )
+def test_reports_open_without_a_fault(page, reports, name):
+    """Those of other kinds of studies are looked at where these are tested."""
+    without_fault(page, reports[name])
+    page.open(reports[name], printed=True)
+    assert page.run("getComputedStyle(document.querySelector('.stills')).display") != "none"
+    page.open(reports[name])
+    assert page.run("getComputedStyle(document.querySelector('.stills')).display") == "none"
+
+
+def test_what_is_wrong_with_a_report_is_found(page, tmp_path):
+    (tmp_path / "report.html").write_text("<h1>x</h1><div style='width: 500px'>x</div>")
+    with pytest.raises(AssertionError, match="390"):
+        without_fault(page, tmp_path / "report.html")
+    for wrong in ("<script>throw new Error('x')</script>", "<img src='http://127.0.0.1:9/x.png' alt='x'>", "<img>"):
+        (tmp_path / "report.html").write_text(f"<h1>x</h1>{wrong}")
+        with pytest.raises(AssertionError):
+            without_fault(page, tmp_path / "report.html")
 
 
 def test_a_body_turns_and_can_be_used_without_a_mouse(page, reports, tmp_path):
@@ -147,3 +162,111 @@ def test_tables_are_sorted_and_saved(page, reports):
     assert page.run("document.querySelectorAll('figure .tools button').length") == page.run(
         "document.querySelectorAll('figure > img').length"
     )
+
+
+def test_numbers_of_different_units_are_sorted(page, tmp_path):
+    cells = ["28.9 ± 0.1 mm", "3.1 cm", "(2.0 ± 0.1) × 10⁻⁴ m", "−1 kPa", "–", "2 mm³"]
+    parts = [("x", [Heading("x", 1), Table(["number", "which"], [[cell, str(i)] for i, cell in enumerate(cells)])])]
+    (tmp_path / "report.html").write_text(render("x", parts))
+    page.open(tmp_path / "report.html")
+    page.run("document.querySelector('th button').click()")
+    order = page.run("[...document.querySelector('table').tBodies[0].rows].map((r) => r.cells[1].textContent)")
+    assert order == ["3", "5", "2", "0", "1", "4"]  # in SI units; what is missing stays below
+
+
+def test_the_keyboard_reaches_all_controls(page, reports):
+    """By Tab from one to the next: the body, its quantity, a slider, a sorted table, a saved picture."""
+    page.open(reports["chaos"])
+    seen = set()
+    for _ in range(60):
+        for kind in ("keyDown", "keyUp"):
+            page.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        seen.add(page.run("document.activeElement.tagName + '.' + (document.activeElement.type || '')"))
+    assert {"CANVAS.", "SELECT.select-one", "INPUT.range", "INPUT.checkbox", "BUTTON.button"} <= seen
+
+
+SHAPE = -0.1 * CUBE[:, :1] * np.array([0.2, 1.0, 0.0])
+
+
+def turned(folder, dataset, inputs, field, quantities):
+    """Write a page with a body and the sliders of an expansion."""
+    told = sliders(dataset, SimpleNamespace(given=inputs.marginals, inputs=inputs, units_of=lambda _: {}))
+    assert told is not None
+    scene = Scene(CUBE, np.array(HEXAHEDRON), 12, np.eye(3)[2], field, quantities, sliders=told)
+    (folder / "report.html").write_text(render("x", [("body", [Heading("x", 1), turning(scene, "a body")])]))
+    return folder / "report.html"
+
+
+def dependent():
+    """An expansion in one independent parameter and two with correlated draws, and a body of 8 nodes that it moves."""
+    rng = np.random.default_rng(4)
+    z = rng.multivariate_normal([0, 0], [[1, 0.8], [0.8, 1]], size=600)
+    draws = Draws(("material.C1", "material.C2"), [2e4, 4e4] + z * [2e3, 3e3], np.full(600, 1 / 600), 600.0)
+    inputs = Inputs({"loads.gravity.density": Uniform(lower=600.0, upper=900.0)}, draws=draws)
+
+    def function(x):
+        return np.array([x[0] * (x[1] + 2 * x[2]) / 1e7, (x[2] / 4e4) ** 2])
+
+    def jacobian(x):
+        return np.array([[(x[1] + 2 * x[2]) / 1e7, x[0] / 1e7, 2 * x[0] / 1e7], [0, 0, 2 * x[2] / 16e8]])
+
+    model = FunctionModel(function, inputs.names, ("sag", "push"), jacobian)
+    dataset = Chaos(samples=40, max_order=2, fields=False).run(inputs, SerialEvaluate(model))
+    coefficients = dataset["coefficients"].to_numpy()[:, 0][:, None, None] * SHAPE
+    fields = {"field_coefficients": (("term", "node", "component"), coefficients), "unit": ("output", ["m", "m"])}
+    return dataset.assign(fields), inputs
+
+
+def test_what_depends_on_a_fixed_parameter_follows_it(page, tmp_path):
+    """Outputs where all is fixed are Python's; conditional means and deviations those of the Gaussian of the draws."""
+    dataset, inputs = dependent()
+    expansion = Expansion.of(dataset)
+    field = dataset["field_coefficients"][0].to_numpy()
+    size = Quantity("Mean displacement", np.linalg.norm(field, axis=1), "m")
+    page.open(turned(tmp_path, dataset, inputs, field, [size]))
+    assert page.errors == []
+    names = expansion.parameters
+    for point in ([700.0, 2.1e4, 4.3e4], [620.0, 1.8e4, 3.9e4]):
+        found = page.run(f"{VIEWER}.at({json.dumps(dict(zip(names, point, strict=True)))})")["outputs"]
+        np.testing.assert_allclose([o["mean"] for o in found], expansion.outputs(np.array([point]))[0], rtol=1e-12)
+        moved = np.reshape(page.run(f"Array.from({VIEWER}.motion)"), (-1, 3))
+        rounding = page.run(f"{VIEWER}.expansion.field.rounding")
+        assert np.abs(moved - expansion.displacements(np.array([point]))[0]).max() <= rounding
+    # C2 = v: C1 follows by C_12/C_22 (v − mean), and keeps 1 − ρ² of its variance.
+    v = 4.4e4
+    found = page.run(f"{VIEWER}.at({{'material.C2': {v}}})")["outputs"]
+    covariance = np.cov(inputs.draws.values.T)
+    middle, second = inputs.draws.values.mean(axis=0)
+    first = middle + covariance[0, 1] / covariance[1, 1] * (v - second)
+    left = covariance[0, 0] - covariance[0, 1] ** 2 / covariance[1, 1]
+    assert found[0]["mean"] == pytest.approx(750 * (first + 2 * v) / 1e7, rel=2e-3)
+    std = np.sqrt(300**2 / 12 * (first + 2 * v) ** 2 + (750**2 + 300**2 / 12) * left) / 1e7
+    assert found[0]["std"] == pytest.approx(std, rel=0.03)
+    assert found[1]["std"] == pytest.approx(0, abs=1e-9)  # it depends on C2 alone
+    assert page.run(f"{VIEWER}.expansion.follows(1)") == pytest.approx(first, rel=2e-3)
+    deviations = page.run(f"Array.from({VIEWER}.expansion.deviations(8))")
+    np.testing.assert_allclose(deviations, std * np.linalg.norm(SHAPE, axis=1), rtol=0.03, atol=1e-6)
+    # Nothing fixed: the moments of the study. Two values that no draw has together: it says so.
+    found = page.run(f"{VIEWER}.at({{}})")["outputs"]
+    np.testing.assert_allclose([o["mean"] for o in found], dataset["coefficients"][0], rtol=1e-12)
+    outside = f"{VIEWER}.at({{'material.C1': 2.4e4, 'material.C2': 3.5e4}}) && {VIEWER}.expansion.outside().length"
+    assert page.run(outside) == 2
+    assert page.run(outside.replace("3.5e4", "4.5e4")) == 0
+
+
+def test_many_parameters_have_sliders_the_most_important_first(page, tmp_path):
+    d = 40
+    inputs = Inputs({f"material.c{i}": Normal(mean=1.0, std=0.1) for i in range(d)})
+    slopes = 1.0 / (1 + np.abs(np.arange(d) - 30))  # c30 matters most
+    model = FunctionModel(lambda x: np.array([slopes @ x]), inputs.names, ("y",), lambda x: slopes[None, :])
+    dataset = Chaos(samples=8, max_order=1, fields=False).run(inputs, SerialEvaluate(model))
+    still = Quantity("x", np.ones(8), "m")
+    page.open(turned(tmp_path, dataset.assign(unit=("output", ["m"])), inputs, 0 * CUBE, [still]))
+    order = page.run("[...document.querySelectorAll('.slider input[type=range]')].map((r) => r.dataset.path)")
+    assert len(order) == d
+    assert order[0] == "material.c30"
+    assert set(order[1:3]) == {"material.c29", "material.c31"}
+    assert page.run("document.querySelectorAll('.rows > .slider').length") == 6  # the others are folded
+    x = np.linspace(0.9, 1.1, d)
+    found = page.run(f"{VIEWER}.at({json.dumps(dict(zip(inputs.names, x.tolist(), strict=True)))})")["outputs"]
+    assert found[0]["mean"] == pytest.approx(slopes @ x, rel=1e-12)

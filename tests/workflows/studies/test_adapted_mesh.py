@@ -84,7 +84,7 @@ def test_samples_are_solved_on_the_mesh_that_was_refined(study, finished):
     assert float(found.nominal.sel(output="near")) == pytest.approx(last["values"][0], rel=1e-6)
 
 
-def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished):
+def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished, looked_at):
     found = xr.load_dataset(finished / "results.nc")
     grid = pyvista.read(finished / "fields" / "mesh.vtu")
     assert grid.n_cells == found.sizes["mesh_cell"] == found.sizes["cell"]
@@ -94,6 +94,7 @@ def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished):
     np.testing.assert_allclose(by_volume, grid.cell_data["indicator"], rtol=1e-6)
     assert (finished / "fields" / "displacement.vtu").exists()
     page = (finished / "report.html").read_text()
+    looked_at(finished)
     assert ">The mesh</h2>" in page
     assert "Estimated errors, mesh by mesh." in page
     assert "cells in bright colours" in page

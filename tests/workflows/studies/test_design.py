@@ -107,7 +107,7 @@ def exact(chosen, std=(1, 2, 3)):
     return np.linalg.slogdet(P)[1] / 2, np.linalg.inv(P) * np.outer(std, std)
 
 
-def test_a_linear_model_is_the_closed_form_with_any_ranks(folder):
+def test_a_linear_model_is_the_closed_form_with_any_ranks(folder, looked_at):
     path = line(folder)
     study = load(path)
     assert parse(document(study)) == study
@@ -128,6 +128,7 @@ def test_a_linear_model_is_the_closed_form_with_any_ranks(folder):
     assert [one["name"] for one in design["chosen"]] == [NAMES[i] for i in chosen]
     assert design["random_equal"] is None or design["random_equal"] >= 4
     assert "Which observations tell most" in (folder / "out-3" / "report.html").read_text()
+    looked_at(folder / "out-3")
     table = (folder / "out-3" / "design.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in table[1:]] == [NAMES[i] for i in chosen]
 
@@ -356,7 +357,7 @@ number = 3
 """
 
 
-def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch):
+def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch, looked_at):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "curves", raising=False)
     (tmp_path / "curves.py").write_text(CURVES)
@@ -369,6 +370,7 @@ def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch):
         assert done.returncode == 0, done.stderr
     assert_same_bits(tmp_path / "out-None", tmp_path / "out-2")
     assert "Expected ln Bayes factor" in (tmp_path / "out-2" / "report.html").read_text()
+    looked_at(tmp_path / "out-2")
     found = xr.load_dataset(tmp_path / "out-2" / "results.nc")
     X = np.linspace(0.2, 2, 10)[found["chosen"].to_numpy()]
     roots = [0.5 * X[:, None], np.column_stack([0.5 * X, 0.1 * X**2])]

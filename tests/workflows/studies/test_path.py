@@ -37,7 +37,7 @@ samples = 6
 
 @pytest.mark.fem
 @pytest.mark.mpi
-def test_curves_are_the_same_on_any_number_of_ranks(tmp_path):
+def test_curves_are_the_same_on_any_number_of_ranks(tmp_path, looked_at):
     study = tmp_path / "curve.toml"
     study.write_text(STUDY)
     for ranks, words in ((None, ()), (2, ("--no-report",))):
@@ -56,12 +56,13 @@ def test_curves_are_the_same_on_any_number_of_ranks(tmp_path):
     assert list(summary["outputs"])[-1] == "narrow.3"
     assert summary["outputs"]["force.1"]["mesh_error"] is not None
     page = (tmp_path / "None" / "report.html").read_text()
+    looked_at(tmp_path / "None")
     assert "Over the path" in page
     assert "displacements.grip.x = 0.1, 0.2, -0.3 m in 3 steps" in page
 
 
 @pytest.mark.fem
-def test_a_measured_curve_is_inverted(tmp_path):
+def test_a_measured_curve_is_inverted(tmp_path, looked_at):
     study = tmp_path / "curve.toml"
     measured = STUDY.partition("[parameters]")[0] + INVERSION
     study.write_text(measured)
@@ -79,6 +80,7 @@ def test_a_measured_curve_is_inverted(tmp_path):
     assert float(found["mean"][0]) == pytest.approx(expected, abs=0.1 * float(found["std"][0]))
     assert float(found["std"][0]) == pytest.approx((slopes @ slopes) ** -0.5, rel=0.1)
     assert "force, measured and predicted." in (tmp_path / "out" / "report.html").read_text()
+    looked_at(tmp_path / "out")
 
 
 @pytest.mark.fem

@@ -15,6 +15,7 @@ from tests.launch import TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
 from uq.inputs.distributions import LogNormal, Normal
 from workflows.config.study import load
+from workflows.report.page import write_report
 from workflows.run.run import run
 
 MODULE = """
@@ -84,7 +85,7 @@ def texts(directory):
     return [one["text"] for one in json.loads((directory / "summary.json").read_text())["findings"]]
 
 
-def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path):
+def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path, looked_at):
     """The same bytes on any number of ranks and after an end amid it, and without the data a finding that says so."""
     mean, std, each = closed_form(VALUES, 1.0, Normal(mean=0.0, std=1.0))
     more = f'distribution = "normal"\nstudy = "{batch / "invert.toml"}"'
@@ -106,6 +107,10 @@ def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path)
     np.testing.assert_allclose(found["specimen_mean"][:, 0], each, atol=0.5 * std)
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())
     assert summary["evaluations"] > 4 * 128
+    page = write_report(tmp_path / "one").read_text()
+    lines = page.partition("<h2>Its specimens</h2>")[2]
+    assert all(lines.count(f'<td class="text">s{k}</td>') == 1 for k in range(len(each)))  # a line for each specimen
+    looked_at(tmp_path / "one")
     assert any(text.startswith("Few draws of s0") and "drawn again" in text for text in texts(tmp_path / "one"))
     alone = population(tmp_path, batch / "results", 'distribution = "normal"')
     assert run(load(alone), "population", tmp_path / "alone", quiet=True, report=False) == 0

@@ -105,7 +105,7 @@ def test_draws_give_the_moments_of_a_loop_over_them_with_any_ranks(folder):
     np.testing.assert_allclose(found["mean"], [np.mean(a + 2 * b + c), np.mean(a * np.exp(b))], rtol=1e-14)
 
 
-def test_a_study_reads_itself_without_its_source(folder):
+def test_a_study_reads_itself_without_its_source(folder, looked_at):
     path = study(folder)
     made = load(path)
     blocks = document(made)
@@ -119,6 +119,7 @@ def test_a_study_reads_itself_without_its_source(folder):
     (folder / "out" / "report.html").unlink()
     write_report(folder / "out")
     page = (folder / "out" / "report.html").read_text()
+    looked_at(folder / "out")
     assert "draws" in page
     assert made.source.digest in page
 

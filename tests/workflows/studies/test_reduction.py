@@ -67,7 +67,7 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_the_command_makes_a_model_with_known_errors(folder):
+def test_the_command_makes_a_model_with_known_errors(folder, looked_at):
     told = json.loads((folder / "made" / "summary.json").read_text())["reduced"]
     assert told["snapshots"] == 12
     assert told["unseen"] == 6
@@ -76,12 +76,13 @@ def test_the_command_makes_a_model_with_known_errors(folder):
     assert all(error < 0.02 for error in told["errors of gradients"].values())
     assert (folder / "made" / "reduced.npz").read_bytes() == (folder / "model.npz").read_bytes()
     assert (folder / "made" / "report.html").exists()
+    looked_at(folder / "made")
     found = xr.load_dataset(folder / "made" / "results.nc")
     assert found.reduced_error.shape == (6, 2)
     assert np.abs(found.reduced_error - found.reduced_estimate).max() < np.abs(found.reduced_error).max()
 
 
-def test_a_study_of_it_gives_what_the_body_gives(folder):
+def test_a_study_of_it_gives_what_the_body_gives(folder, looked_at):
     (folder / "used.toml").write_text(USED.format(upper=1200, more=""))
     assert main(["run", str(folder / "used.toml"), "--out", str(folder / "used"), "--quiet"]) == 0
     (folder / "direct.toml").write_text(BODY + '[method]\nkind = "quasi-monte-carlo"\nsamples = 32\nscrambles = 4\n')
@@ -91,6 +92,7 @@ def test_a_study_of_it_gives_what_the_body_gives(folder):
         np.testing.assert_allclose(found[name], body[name], rtol=5e-3)
     np.testing.assert_allclose(found.field_mean, body.field_mean, atol=5e-3 * float(np.abs(body.field_mean).max()))
     assert (folder / "used" / "report.html").exists()
+    looked_at(folder / "used")
 
 
 def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):

@@ -53,6 +53,7 @@
       if (table.tBodies[0].rows.length < 2) return;
       const words = document.createElement("button");
       words.type = "button"; words.title = "sort"; words.append(...head.childNodes);
+      if (!words.textContent.trim()) words.setAttribute("aria-label", "sort by this column");
       words.addEventListener("click", () => sort(table, column, head));
       head.append(words);
     });

@@ -167,6 +167,121 @@ class Expansion {
   }
 }
 
+// --- parameters that depend on each other: what is not fixed follows what is ---------------------------------------------
+function solved(rows, k) {  // X of A X = B, given the rows of (A B) with A (k, k), by Gaussian elimination
+  for (let p = 0; p < k; p++) {
+    let best = p;
+    for (let q = p; q < k; q++) if (Math.abs(rows[q][p]) > Math.abs(rows[best][p])) best = q;
+    [rows[p], rows[best]] = [rows[best], rows[p]];
+    for (let q = 0; q < k; q++) {
+      const f = q === p ? 0 : rows[q][p] / rows[p][p];
+      if (f) for (let c = p; c < rows[q].length; c++) rows[q][c] -= f * rows[p][c];
+    }
+  }
+  return rows.map((row, p) => row.slice(k).map((y) => y / row[p]));
+}
+
+class Dependent extends Expansion {
+  regroup() {
+    this.first = this.indices.findIndex((index) => index.every((a) => !a));
+    this.made = null;
+  }
+  of(arrays, joint) { this.joint = joint; this.samples = arrays[joint.samples]; return this; }
+  gain(fixed) {  // C_SS⁻¹ C_S
+    const C = this.joint.correlations;
+    return solved(fixed.map((i) => [...fixed.map((j) => C[i][j]), ...C[i]]), fixed.length);
+  }
+  drawn() {  // standardised parameters: of samples that were moved to where some are fixed
+    const key = JSON.stringify([this.fixed, this.values]);
+    if (this.made && this.made.key === key) return this.made;
+    const d = this.parameters.length, fixed = this.parameters.map((_, i) => i).filter((i) => this.fixed[i]);
+    const at = this.parameters.map((_, i) => this.coordinate(i, this.values[i]));
+    const n = fixed.length === d ? 1 : this.samples.length / d, gain = this.gain(fixed), x = new Float64Array(n * d);
+    for (let k = 0; k < n; k++) {
+      const row = x.subarray(k * d, (k + 1) * d);
+      row.set(this.samples.subarray(k * d, (k + 1) * d));
+      const off = fixed.map((i) => at[i] - row[i]);
+      off.forEach((e, s) => gain[s].forEach((g, j) => { row[j] += e * g; }));
+      fixed.forEach((i) => { row[i] = at[i]; });
+    }
+    const psi = Array.from({ length: n }, (_, k) => this.functions(x.subarray(k * d, (k + 1) * d)));
+    return (this.made = { key, x, psi, n });
+  }
+  functions(row) {
+    const { start, parting, indices, inverse, numbers } = this.joint;
+    const tables = this.parameters.map((_, i) => {
+      if (i < start) return this.table(i, row[i]);
+      let t = 0;
+      parting.forEach((column, j) => { t += row[start + j] * column[i - start]; });
+      return this.table(i, t);
+    });
+    const products = indices.map((index) => index.reduce((product, a, i) => (a ? product * tables[start + i][a] : product), 1));
+    const together = inverse[0].map((_, q) => products.reduce((sum, y, p) => sum + y * inverse[p][q], 0));
+    return Float64Array.from(this.indices, (index, k) => {
+      let product = together[numbers[k]];
+      for (let i = 0; i < start; i++) if (index[i]) product *= tables[i][index[i]];
+      return product;
+    });
+  }
+  outputs() {
+    const { psi, n } = this.drawn(), some = this.fixed.some(Boolean);
+    return this.wanted.map((output) => {
+      const c = output.coefficients, values = psi.map((row) => row.reduce((sum, y, k) => sum + y * c[k], 0));
+      let mean = values.reduce((a, b) => a + b, 0) / n, variance = values.reduce((a, b) => a + (b - mean) ** 2, 0) / n;
+      if (!some) { mean = c[this.first]; variance = c.reduce((sum, y, k) => (k === this.first ? sum : sum + y * y), 0); }
+      values.sort((a, b) => a - b);
+      const at = (p) => values[Math.min(n - 1, Math.floor(p * n))];
+      return {
+        name: output.name, unit: output.unit, mean, std: Math.sqrt(variance), error: output.error, values: n > 1 ? values : [],
+        interval: n > 1 ? [at(0.025), at(0.975)] : [mean - 1.96 * output.error, mean + 1.96 * output.error], shares: null,
+      };
+    });
+  }
+  follows(i) {  // the middle of a parameter, given those that are fixed
+    const { x, n } = this.drawn(), d = this.parameters.length, p = this.parameters[i];
+    let mean = 0;
+    for (let k = 0; k < n; k++) mean += x[k * d + i] / n;
+    const value = p.centre + p.scale * mean;
+    return p.logarithmic ? Math.exp(value) : value;
+  }
+  amplitudes() {
+    const { psi } = this.drawn(), { factors } = this.field, r = factors[0].length;
+    return psi.map((row) => { const a = new Float64Array(r); row.forEach((y, k) => { for (let j = 0; j < r; j++) a[j] += y * factors[k][j]; }); return a; });
+  }
+  displacements(out) {
+    const all = this.amplitudes(), a = new Float64Array(all[0].length);
+    all.forEach((one) => one.forEach((y, j) => { a[j] += y / all.length; }));
+    return this.combined(a, out);
+  }
+  deviations(nodes) {
+    const all = this.amplitudes(), r = all[0].length, mean = new Float64Array(r), C = Array.from({ length: r }, () => new Float64Array(r));
+    all.forEach((one) => one.forEach((y, j) => { mean[j] += y / all.length; }));
+    all.forEach((one) => { for (let i = 0; i < r; i++) for (let j = 0; j < r; j++) C[i][j] += (one[i] - mean[i]) * (one[j] - mean[j]) / all.length; });
+    const sum = new Float32Array(nodes), modes = this.modes;
+    for (let v = 0; v < nodes; v++) {
+      let total = 0;
+      for (let c = 0; c < 3; c++) {
+        const p = (3 * v + c) * r;
+        for (let i = 0; i < r; i++) for (let j = 0; j < r; j++) total += modes[p + i] * C[i][j] * modes[p + j];
+      }
+      sum[v] = Math.sqrt(Math.max(total, 0));
+    }
+    return sum;
+  }
+  outside() {  // beyond the range of a parameter, or where no draw has this combination
+    const found = super.outside(), fixed = this.parameters.map((_, i) => i).filter((i) => this.fixed[i]);
+    if (found.length || fixed.length < 2) return found;
+    const d = this.parameters.length, k = fixed.length, C = this.joint.correlations;
+    // How far from the middle: vᵀ C_SS⁻¹ v, for the fixed values and for all draws.
+    const unit_ = fixed.map((_, s) => fixed.map((__, q) => Number(s === q)));
+    const inverse = solved(fixed.map((i, s) => [...fixed.map((j) => C[i][j]), ...unit_[s]]), k);
+    const far = (v) => v.reduce((sum, y, s) => sum + v.reduce((part, z, q) => part + y * inverse[s][q] * z, 0), 0);
+    let most = 0;
+    for (let n = 0; n < this.samples.length / d; n++) most = Math.max(most, far(fixed.map((i) => this.samples[n * d + i])));
+    return far(fixed.map((i) => this.coordinate(i, this.values[i]))) > most ? fixed.map((i) => this.parameters[i]) : [];
+  }
+}
+
 // --- colours ---------------------------------------------------------------------------------------------------------
 const MAPS = {
   viridis: ["440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"],
@@ -258,7 +373,7 @@ class Viewer {
       name: inside.name, paint: rgb(inside.colour).map((x) => x / 255), opacity: inside.opacity, shown: inside.shown, outside: inside.outside,
     }));
     this.arrows = told.arrows.map((a) => ({ name: a.name, places: get(a.places), vectors: get(a.vectors), sizes: get(a.sizes), shown: false }));
-    this.expansion = told.sliders ? new Expansion(told.sliders, arrays) : null;
+    this.expansion = told.sliders ? (told.sliders.joint ? new Dependent(told.sliders, arrays).of(arrays, told.sliders.joint) : new Expansion(told.sliders, arrays)) : null;
     this.warp = 1; this.outlined = true; this.opacity = this.insides.some((i) => i.shown && !i.outside) ? 0.22 : 1;
     this.cut = { axis: told.cut, place: 0.5 };
     this.surfaceProgram = this.program(...SURFACE); this.lineProgram = this.program(...LINE);
@@ -604,8 +719,10 @@ class Viewer {
       rows.forEach((row, i) => {
         row.line.classList.toggle("fixed", x.fixed[i]);
         row.box.checked = x.fixed[i];
-        row.number.textContent = x.fixed[i] ? digits(x.values[i], 4) : "random";
-        row.share.textContent = x.fixed[i] ? "" : `${Math.round(100 * outputs[0].shares[i])} % of the variance of ${outputs[0].name}`;
+        const follows = x.joint && fixed && !x.fixed[i] ? x.follows(i) : null;
+        if (follows !== null) row.range.value = follows;
+        row.number.textContent = x.fixed[i] ? digits(x.values[i], 4) : follows !== null ? `about ${digits(follows, 3)}` : "random";
+        row.share.textContent = x.fixed[i] || !outputs[0].shares ? "" : `${Math.round(100 * outputs[0].shares[i])} % of the variance of ${outputs[0].name}`;
         const place = (x.values[i] - x.parameters[i].low) / (x.parameters[i].high - x.parameters[i].low);
         row.mark.setAttribute("x1", 100 * place); row.mark.setAttribute("x2", 100 * place);
         row.mark.style.display = x.fixed[i] ? "" : "none";
@@ -652,10 +769,12 @@ class Viewer {
     free.addEventListener("click", () => {
       x.fixed.fill(false); x.values = x.parameters.map((p) => p.start); rows.forEach((row, i) => { row.range.value = x.values[i]; }); x.regroup(); moved();
     });
-    const many = 6, lines = rows.map((row) => row.line);
+    // What matters most comes first.
+    const start = x.outputs(), weight = (i) => Math.max(...start.map((o) => (o.shares ? o.shares[i] : 0)));
+    const many = 6, lines = rows.map((_, i) => i).sort((a, b) => weight(b) - weight(a) || a - b).map((i) => rows[i].line);
     const more = lines.length > many ? [make("details", {}, make("summary", { textContent: `${lines.length - many} more parameters` }), ...lines.slice(many))] : [];
     const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${x.field.loo !== null && isFinite(x.field.loo) ? `, whose leave-one-out error is ${digits(100 * x.field.loo, 2)} % of the standard deviation` : ""}.` : "";
-    panel.append(make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${error}` }),
+    panel.append(make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}` }),
       table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free);
     panel.hidden = false;
     shown();

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import spoken
 from forward.words import named
+from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.scene.pack import Packer
 from workflows.results.level import IntArray
@@ -19,10 +21,13 @@ if TYPE_CHECKING:
 
     from uq.inputs.distributions import Distribution
 
-MOST = 24  # parameters
+MOST = 160  # parameters
+MANY = 24  # parameters from which on each is told with fewer numbers
+SAMPLES = 1024  # of dependent parameters
 BYTES = 3_500_000  # of the modes of a field, before they are written as text
 STEPS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)  # of the largest displacement, from fine to coarse
-QUANTILES = 256  # of each parameter
+QUANTILES, FEWER = 256, 64  # of each parameter
+CURVE, SHORTER = 61, 31  # points of each density
 SINGLE = 2.0**-21  # relative rounding of sums in the browser, which are of single precision
 CHECKED = 64  # points at which the error of the packed field is measured
 FARTHEST = 3.72  # standard normal deviations that a slider reaches where a distribution has tails
@@ -33,13 +38,14 @@ class Sliders:
     """An expansion, and what its parameters are."""
 
     expansion: Expansion
-    given: dict[str, Distribution | None]
+    given: Mapping[str, Distribution | None]
     parameter_units: dict[str, str]
     units: dict[str, str]
     loo: FloatArray
     std: FloatArray
     drawn: list[str]
     field_loo: float
+    samples: FloatArray | None = None  # (n, d) of parameters that depend on each other
 
     def packed(self, pack: Packer, nodes: IntArray) -> dict[str, Any]:
         """Put the modes of the field at some nodes among other arrays, and return the rest."""
@@ -58,14 +64,47 @@ class Sliders:
                 if name in self.drawn
             ],
         }
+        if self.samples is not None:
+            told["joint"] = self._joint(pack, self.samples)
         if of.fields is not None:
             told["field"] = self._field(pack, of.fields[:, nodes].reshape(len(of.coefficients), -1))
         return told
 
+    def _joint(self, pack: Packer, samples: FloatArray) -> dict[str, Any]:
+        """Return what dependent parameters are drawn by, and what functions of them are made of.
+
+        Standardised samples of all parameters; some are fixed, and the others follow by x + (v − x_S) C_SS⁻¹ C_S, with
+        the correlations C of the samples: exact of Gaussian parameters.
+        """
+        basis = self.expansion.basis
+        coordinates = basis.coordinates
+        mixing = coordinates.mixing
+        assert basis.joint is not None
+        assert mixing is not None
+        start = int(basis.joint.members[0])
+        x = np.where(coordinates.logarithmic, np.log(np.where(coordinates.logarithmic, samples, 1.0)), samples)
+        x = (x - coordinates.centre) / coordinates.scale
+        correlations = np.eye(x.shape[1])
+        correlations[start:, start:] = mixing[start:, start:] @ mixing[start:, start:]
+        # With the means and correlations of the draws themselves, which some samples of them have but nearly.
+        own = np.cov(x.T, bias=True)
+        x = (x - x.mean(axis=0)) @ np.linalg.solve(np.linalg.cholesky(own).T, np.linalg.cholesky(correlations).T)
+        return {
+            "samples": pack.add(x, 1e-6),
+            "correlations": correlations.tolist(),
+            "start": start,
+            "parting": np.linalg.inv(mixing)[start:, start:].tolist(),
+            "indices": basis.joint.indices.tolist(),
+            "inverse": basis.joint.inverse.tolist(),
+            "numbers": basis.joint.number(basis.indices).tolist(),
+        }
+
     def _parameter(self, i: int, name: str) -> dict[str, Any]:
         distribution, basis = self.given[name], self.expansion.basis
         z = np.linspace(-FARTHEST, FARTHEST, 401)
-        u = (np.arange(QUANTILES) + 0.5) / QUANTILES
+        few = len(self.expansion.parameters) > MANY
+        count, points = (FEWER, SHORTER) if few else (QUANTILES, CURVE)
+        u = (np.arange(count) + 0.5) / count
         from scipy.special import ndtri
 
         if distribution is None:  # a coefficient of a random field
@@ -76,12 +115,18 @@ class Sliders:
         support = None if distribution is None else distribution.support
         low, high = support if support is not None else (float(values[0]), float(values[-1]))
         low, high = min(low, float(self.expansion.lower[i])), max(high, float(self.expansion.upper[i]))
-        at = np.linspace(low, high, 61)
-        density = np.interp(at, values, np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300), left=0, right=0)
+        at = np.linspace(low, high, points)
+        density = (
+            _heights(self.samples[:, i], at)
+            if self.samples is not None
+            else np.interp(at, values, np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300), left=0, right=0)
+        )
         coordinates = basis.coordinates
         logarithmic = bool(coordinates.logarithmic[i])
         centre, scale = float(coordinates.centre[i]), float(coordinates.scale[i])
         degree = int(basis.indices[:, i].max(initial=0))
+        if basis.joint is not None and i >= basis.joint.members[0]:
+            degree = int(basis.joint.indices.max(initial=0))
         return {
             "path": name,
             "name": named(spoken(name), self.parameter_units.get(name, "1")),
@@ -131,13 +176,20 @@ class Sliders:
 
 
 def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
-    """Return the sliders of a study; None without an expansion, or where parameters depend on each other."""
-    if "multi_index" not in dataset or "joint_index" in dataset or "coordinate_mixing" in dataset:
+    """Return the sliders of a study; None without an expansion, or of too many parameters.
+
+    Of parameters that depend on each other by a copula there are none: expansions are not of these.
+    """
+    given: Mapping[str, Distribution | None] | None = getattr(study, "given", None)
+    if "multi_index" not in dataset or given is None or dataset.sizes["parameter"] > MOST:
         return None
-    given = getattr(study, "given", None)
-    if given is None or dataset.sizes["parameter"] > MOST or bool(getattr(study, "correlations", False)):
+    if bool(getattr(study, "correlations", False)):
         return None
-    expansion = Expansion.of(dataset)
+    expansion, samples = Expansion.of(dataset), None
+    if expansion.basis.joint is not None:
+        inputs = study.inputs
+        given = inputs.marginals
+        samples = inputs.points(sobol_points(0, 0, 0, SAMPLES, len(inputs.names)))
     outputs = [str(name) for name in dataset["output"].values]
     drawn = outputs
     if "step" in dataset.coords:
@@ -151,4 +203,11 @@ def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
         dataset["std"].to_numpy(),
         drawn,
         float(dataset["field_loo_error"]) if "field_loo_error" in dataset else float("nan"),
+        samples,
     )
+
+
+def _heights(values: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the density (m,) at points of samples (n,), by Gaussian kernels; its scale does not matter."""
+    width = 1.06 * max(float(values.std()), 1e-300) * len(values) ** -0.2
+    return np.asarray(np.exp(-0.5 * ((at[:, None] - values) / width) ** 2).sum(axis=1))

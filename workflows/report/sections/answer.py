@@ -13,6 +13,8 @@ from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
 from workflows.report.sections.error_budget import counting, parts_of
+from workflows.report.sections.posterior import measured_kind
+from workflows.report.sections.reduced import card as reduced
 from workflows.studies.findings_selection import bayes_factor, by_probability, grade
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class AnswerFirst(Section):
             ("estimator", compared),
             ("clean", made),
             ("chosen", design),
+            ("reduced_error", reduced),
             ("nominal", forward),
             ("candidate_mean", forward),
         ):
@@ -229,7 +232,7 @@ def inversion(results: Results) -> Card:
     what = "What is inside" if kind == "displacements" else "Which parameters explain"
     whose = sets[0] if len(sets) == 1 else f"each of {len(sets)} specimens"
     if kind == "displacements":
-        question = f"{what} {whose}, given {data:,} measured components of displacements?"
+        question = f"{what} {whose}, given {data:,} measured {measured_kind(of, results.study)}?"
     else:
         question = f"{what} {data:,} measured {kind} of {whose}?"
     if len(sets) > 1:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from forward.readable import scale, size
-from forward.words import NONE, number, with_unit
+from forward.readable import place, size
+from forward.words import NONE, number
 from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import design as plots
 from workflows.report.section import Results, Section
 from workflows.results.summary import against_random
 
-ROUNDING = 1e-9  # of the largest coordinate of a place
 WORTH = {
     "information": "What they tell (nat)",
     "parameters": "Share of the parameters' variances that they take away",
@@ -80,13 +79,6 @@ def card(results: Results) -> Card:
         case = [f"load case {one['case']}"] if one["case"] else []
         answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 3)} nat", [*case, *where]))
     return Card("Which observations tell most of what is not known?", answers)
-
-
-def place(x: Sequence[float], digits: int = 3) -> str:
-    """Write a place (m) in one unit; a coordinate that is rounding beside the others is zero."""
-    largest = max(map(abs, x))
-    one, unit = scale(largest, "m")
-    return with_unit(", ".join(number(c / one if abs(c) > ROUNDING * largest else 0.0, digits) for c in x), unit)
 
 
 def _table(results: Results) -> Table:

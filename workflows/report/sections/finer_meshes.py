@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.readable import spoken
 from forward.words import NONE
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
@@ -44,7 +45,8 @@ def meshes(dataset: xr.Dataset) -> Table:
             rows.append((str(model), "no", NONE, NONE, NONE, f"not checked: {one['mesh_why'].item()}"))
             continue
         error, shift = one["mesh_error"].to_numpy(), one["mesh_shift"].dropna("parameter")
-        listed = [f"{name} {float(shift.sel(parameter=name)):+.2g}" for name in shift.parameter.values]
+        shifts = [(spoken(str(name)), float(shift.sel(parameter=name))) for name in shift.parameter.values]
+        listed = [f"{name} {by:+.2g}".replace(" -", " −") for name, by in shifts]
         size, most = (f"{value:.2g}" for value in (float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(abs(error)))))
         moved = change_in_words(float(one["mesh_log_evidence"]), float(abs(shift).max()))
         corrected = "yes" if bool(one["mesh_corrected"]) else "no"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from forward.bodies.geometry import AXES
 from forward.readable import precise, scale, size, spoken
 from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
@@ -31,19 +32,28 @@ DRAWN = 8  # data sets that have more than a row in the table
 
 
 class Words(NamedTuple):
-    """Words for a part of the data, several parts, and the data themselves."""
+    """Words for a part of the data, and for several parts."""
 
     part: str
     several: str
-    data: str
 
 
-DISPLACEMENTS = Words("load case", "load cases", "components of displacements")
-OUTPUTS = Words("output", "outputs", "values of outputs")
+DISPLACEMENTS = Words("load case", "load cases")
+OUTPUTS = Words("output", "outputs")
 
 
 def _words(one: xr.Dataset) -> Words:
     return OUTPUTS if one.attrs.get("quantity") == "output" else DISPLACEMENTS
+
+
+def measured_kind(of: xr.Dataset, study: Any) -> str:
+    """Say what was measured of specimens: displacements, forces, or both."""
+    axes = of["datum_axis"].to_numpy()[np.isfinite(of["measured"].to_numpy())] if "datum_axis" in of else np.zeros(1)
+    if (axes < len(AXES)).all():
+        return "components of displacements"
+    units = {output.unit for case in study.model.cases for output in case.outputs}
+    other = "forces" if units == {"N"} else "values of outputs"
+    return other if (axes >= len(AXES)).all() else f"components of displacements and {other}"
 
 
 class Posterior(Section):
@@ -59,7 +69,7 @@ class Posterior(Section):
         for one in first(results):
             yield from verdict(results, one)
             yield from again(results, one)
-            yield Pairs([*amounts(one, one.sizes["direction"])])
+            yield Pairs([*amounts(one, one.sizes["direction"], results.study)])
             yield posterior(one, units)
             if _words(one) is OUTPUTS:
                 yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
@@ -106,13 +116,14 @@ def again(results: Results, one: xr.Dataset) -> Iterator[Block]:
         yield specimen(one, results)
 
 
-def amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, list[str]]]:
+def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, list[str]]]:
     """Amounts of data, information and work, given the total number of directions."""
-    return ((word, [text]) for word, text in _amounts(one, directions))
+    return ((word, [text]) for word, text in _amounts(one, directions, study))
 
 
-def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
-    yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {_words(one).data}"
+def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
+    kind = "values of outputs" if _words(one) is OUTPUTS else measured_kind(one, study)
+    yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {kind}"
     if "points_moved" in one and (moved := int(one["points_moved"])):
         yield (
             "outside the body",

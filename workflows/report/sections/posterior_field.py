@@ -41,7 +41,7 @@ class FieldPosterior(Section):
         for one in first(results):
             yield from verdict(results, one)
             yield from again(results, one)
-            yield Pairs([*amounts(one, one.sizes["node"]), *more_amounts(one)])
+            yield Pairs([*amounts(one, one.sizes["node"], results.study), *more_amounts(one)])
             yield posterior(one, results.study.units_of("/"))
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one)])
             alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
