@@ -52,6 +52,7 @@ from benchmarks import (
     tails,
     throughput,
     tolerance,
+    turning,
     variance,
 )
 
@@ -59,6 +60,7 @@ ALL = {
     "realisation": realisation.main,
     "reduced": reduced.main,
     "live": live.main,
+    "turning": turning.main,
     "bookkeeping": bookkeeping.main,
     "kernels": kernels.main,
     "throughput": throughput.main,

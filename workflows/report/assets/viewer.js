@@ -462,8 +462,8 @@ class Viewer {
     const q = this.told.quantities[this.chosen], x = this.expansion;
     if (x && x.field && x.fixed.some(Boolean)) {
       if (this.chosen === 0) {
-        const out = new Float32Array(this.nodes), u = this.motion;
-        for (let i = 0; i < this.nodes; i++) out[i] = Math.hypot(u[3 * i], u[3 * i + 1], u[3 * i + 2]);
+        const out = (this.sizes ||= new Float32Array(this.nodes)), u = this.motion;
+        for (let i = 0; i < this.nodes; i++) out[i] = Math.sqrt(u[3 * i] * u[3 * i] + u[3 * i + 1] * u[3 * i + 1] + u[3 * i + 2] * u[3 * i + 2]);
         return out;
       }
       if (q.std) return x.deviations(this.nodes);
@@ -478,7 +478,7 @@ class Viewer {
     for (const s of [this.skin, ...this.insides]) this.place(s, warp, values, low, width);
     if (this.ghost && !this.ghost.placed) { this.place(this.ghost, 0, values, low, width); this.ghost.placed = true; }
     this.slice(warp, values, low, width);
-    this.legend();
+    if (this.told_ !== this.chosen) { this.told_ = this.chosen; this.legend(); }
     this.draw();
   }
   place(s, warp, values, low, width) {

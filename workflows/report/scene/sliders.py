@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 MOST = 160  # parameters
 MANY = 24  # parameters from which on each is told with fewer numbers
 SAMPLES = 1024  # of dependent parameters
-BYTES = 3_500_000  # of the modes of a field, before they are written as text
-STEPS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)  # of the largest displacement, from fine to coarse
+BYTES = 8_000_000  # of the modes of a field, before they are written as text
+STEPS = (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)  # of the largest displacement, from fine to coarse
 QUANTILES, FEWER = 256, 64  # of each parameter
 CURVE, SHORTER = 61, 31  # points of each density
 SINGLE = 2.0**-21  # relative rounding of sums in the browser, which are of single precision
