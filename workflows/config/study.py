@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -242,6 +243,9 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     ]
 
 
+# A part of a dotted key: in quotes, or without dots.
+QUOTED = re.compile(r"""(?:^|\.)(?:"([^"]*)"|'([^']*)'|([^."']+))""")
+
 # Files that count by their contents, not their path.
 _FILES = {
     "model.body.contents.digest": "model.body.file",
@@ -296,7 +300,10 @@ def _override(blocks: dict[str, Any], assignment: str) -> None:
 
 
 def _path(key: str, blocks: Mapping[str, Any]) -> list[str]:
-    """Split a dotted key; the keys of `parameters` hold dots themselves."""
+    """Split a dotted key; those of `parameters` hold dots themselves, and what is in quotes is one key, as in TOML."""
+    parts = [quoted or single or bare for quoted, single, bare in QUOTED.findall(key)]
+    if len(parts) > 1 and re.search(r"""["']""", key):
+        return parts
     if key.startswith("parameters."):
         rest = key.removeprefix("parameters.")
         for path in blocks.get("parameters", {}):

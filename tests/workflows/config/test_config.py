@@ -241,6 +241,10 @@ def test_overrides():
     assert study.model.loads[0].density == 800
     assert study.parameters["material.D1"].a == 3
     assert parse(blocks(), ["method.kind=monte-carlo"]).method.kind == "monte-carlo"
+    for quoted in ('parameters."material.D1".a=3', "parameters.'material.D1'.a=3", '"parameters"."material.D1"."a"=3'):
+        assert parse(blocks(), [quoted]).parameters["material.D1"].a == 3
+    new = parse(blocks(), ['parameters."material.C1"={ kind = "uniform", lower = 9e3, upper = 11e3 }'])
+    assert new.parameters["material.C1"].lower == 9e3
 
 
 @pytest.mark.parametrize(
@@ -251,6 +255,7 @@ def test_overrides():
         ("method.samples.x=1", "'samples' is a value, not a block"),
         ("model.loads.wind.density=1", "no element is called 'wind'"),
         ("method.sampels=1", "did you mean 'samples'"),
+        ('parameters."material.C9".a=3', r"parameters\.material\.C9\.kind: missing"),
     ],
 )
 def test_bad_overrides(assignment, message):
