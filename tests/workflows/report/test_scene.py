@@ -3,6 +3,7 @@
 import base64
 import json
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,7 +170,7 @@ def test_stills_are_drawn_with_what_is_inside():
             assert still(scene, quantity).startswith(PNG)
 
 
-def test_sliders_are_of_independent_parameters_only():
+def test_sliders_have_the_distributions_of_parameters():
     case = study(kind="chaos", samples=8)
     dataset = solve(case)
     found = sliders(dataset, case)
@@ -180,6 +181,6 @@ def test_sliders_are_of_independent_parameters_only():
     assert told["parameters"][1]["low"] < 3e5 - 3 * 2e4
     # The quantiles have the moments of the coordinate.
     assert np.std(density["quantiles"]) == pytest.approx(1, abs=0.01)
-    assert sliders(dataset.assign(joint_index=0), case) is None
+    assert sliders(dataset, SimpleNamespace(given=case.given, correlations=[("a", "b", 0.5)])) is None
     assert sliders(solve(study()), study()) is None
     assert len(HEXAHEDRON) == 1
