@@ -16,7 +16,7 @@ from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
-from workflows.config.study import load
+from workflows.config.study import differences, document, load
 
 STUDY = """
 [model]
@@ -100,6 +100,38 @@ def test_what_cannot_stand_for_the_body_is_refused_in_one_line(folder):
         load(study, ["method.reduced=nowhere.npz"])
     wider = "parameters={'material.C1'={kind='uniform',lower=700,upper=2000}}"
     assert any("was trained from" in one.text for one in load(study, [reduced, wider]).findings)
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+def test_batches_with_a_corrected_mesh_and_unknown_noise(folder):
+    """Each data set is checked by itself; what finer meshes say is corrected as it is without a reduced model."""
+    for name, end in (("a", -0.0955), ("b", -0.092)):
+        (folder / f"{name}.csv").write_text(f"output,value\nend,{end}\nend,{end + 4e-4}\nmiddle,{0.473 * end}\n")
+    words = ["data={files=['a.csv','b.csv'],noise={absolute=2e-4}}", "method.mesh_error=correct", "method.samples=32"]
+    words.append("method.noise={kind='log-normal',mean=1,std=0.5}")
+    sets = [part for word in words for part in ("--set", word)]
+    assert ran(folder, "batch", *sets, *BY_REDUCED) in {0, 3}
+    assert ran(folder, "batch-direct", *sets) in {0, 3}
+    found, direct = (
+        xr.load_dataset(folder / out / "results.nc", engine="h5netcdf") for out in ("batch", "batch-direct")
+    )
+    np.testing.assert_allclose((found["mode"] - direct["mode"]) / direct["std"], 0, atol=0.05)
+    assert (found["reduced_share"] > 0.9).all()
+    assert (found["solves"] < 15).all()
+    assert found["mesh_corrected"].all()
+    np.testing.assert_allclose(found["mesh_error"], direct["mesh_error"], rtol=0.05)
+
+
+@pytest.mark.fem
+def test_the_file_counts_by_what_it_holds(folder, tmp_path):
+    study = folder / "study.toml"
+    (tmp_path / "elsewhere.npz").write_bytes((folder / "model.npz").read_bytes())
+    one, other = load(study, ["method.reduced=model.npz"]), load(study, [f"method.reduced={tmp_path}/elsewhere.npz"])
+    assert one.identity() == other.identity()
+    assert differences(document(one), document(other)) == []
+    with pytest.raises(StudyError, match="has changed since the study was begun"):
+        load(study, [f"method.reduced={{file='model.npz',digest='{'0' * 16}'}}"])
 
 
 @pytest.mark.fem
