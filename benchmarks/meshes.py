@@ -129,7 +129,14 @@ def lattice(log: FloatArray, vertices: FloatArray) -> Factor:
     return lambda places: np.asarray(np.exp(grid(places.clip(0, 1))))
 
 
-def made(model: SpecimenModel, name: str, truths: FloatArray, factors: Sequence[Factor], mus: FloatArray) -> FloatArray:
+def made(
+    model: SpecimenModel,
+    name: str,
+    truths: FloatArray,
+    factors: Sequence[Factor],
+    mus: FloatArray,
+    cube: Cube | None = None,
+) -> FloatArray:
     """Return data (n, m) of truths (n, d) without noise; kept in a file as they are made, since they take minutes."""
     file = FOLDER / f"meshes-{name}.npz"
     found: list[FloatArray] = []
@@ -138,7 +145,7 @@ def made(model: SpecimenModel, name: str, truths: FloatArray, factors: Sequence[
         same = min(len(there["truths"]), len(truths))
         if np.allclose(there["truths"][:same], truths[:same]):
             found = list(there["data"][:same])
-    cube, states = Cube(OVERKILL, 1.0), dict[str, FloatArray]()
+    cube, states = cube or Cube(OVERKILL, 1.0), dict[str, FloatArray]()
     FOLDER.mkdir(parents=True, exist_ok=True)
     for k in range(len(found), len(truths)):
         moved = []

@@ -1,7 +1,9 @@
 """The same as `benchmarks.meshes` for a random stiffness at the vertices of the cube.
 
-Expected of posteriors that are linear at the truth: shares of intervals, over all noise and all truths of the prior, of
-the values at the vertices, of the mean over the body, and along the directions of which the data say most.
+The data are made on tetrahedra that lie in the cells of the inversion, between which the stiffness has kinks: meshes
+that cross them have another stiffness, which the data tell. Expected of posteriors that are linear at the truth:
+shares of intervals, over all noise and all truths of the prior, of the values at the vertices, of the mean over the
+body, and along the directions of which the data say most.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +19,6 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.meshes import (
-    CELLS,
     NOISES,
     SEED,
     WIDE,
@@ -31,12 +33,14 @@ from benchmarks.meshes import (
     specimen,
     trusted,
 )
+from benchmarks.other_code import Cube
 from forward.fem.finer import extrapolated
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import ApproximationError, Places
+from inverse.data.approximation_error import ApproximationError, Places, Whitening, along
+from inverse.data.errors import NORMAL
 from inverse.data.observations import Components
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
@@ -49,7 +53,7 @@ if TYPE_CHECKING:
 
     from forward.bodies.random_fields import NodalPrior
 
-TRUTHS, ALSO_INVERTED = 8, 3
+CELLS, TRUTHS, ALSO_INVERTED = 3, 8, 3
 DIRECTIONS = 4  # of which the data say most
 EXPECTED = (
     "noise",
@@ -97,8 +101,8 @@ def main(options: Sequence[str] = ()) -> None:
     coordinates = np.random.default_rng([given.seed, 1]).standard_normal((count, len(problem.root)))
     truths = problem.offset + coordinates @ problem.root.T
     factors = [lattice(truth, problem.model.vertices.coordinates) for truth in truths]
-    data = f"fields-{spec.body.vertex_count}-{given.seed}"
-    clean = made(problem.model, data, truths, factors, np.full(count, 1e4))
+    data, cube = f"fields-within-{given.cells}-{given.seed}", Cube.around(given.cells, 1.0)
+    clean = made(problem.model, data, truths, factors, np.full(count, 1e4), cube)
     if given.truths:
         _expect(problem, truths[: given.truths], clean[: given.truths], name)
     if given.inverted:
@@ -145,13 +149,15 @@ def _linear(problem: Problem, truth: FloatArray, clean: FloatArray) -> dict[str,
         raise SolveError(why)
     slopes = solution.tangent(root.T).T  # by coordinates that are standard normal a priori
     outputs = np.array(solution.outputs)
-    error = error_of(look, outputs, values, Places(3 * model.cases + model.axes, model.places))
+    plain = error_of(look, outputs, values, Places(3 * model.cases + model.axes, model.places))
     mass = problem.prior.matern.mass
     found: dict[str, Any] = {}
     for noise in NOISES:
         sigma = sigma_of(model, clean, noise)
-        first = np.linalg.svd(slopes / sigma[:, None], full_matrices=False)[2][:DIRECTIONS]
-        wanted = np.vstack([root, first, mass @ root / mass.sum()])
+        images, _, directions = np.linalg.svd(slopes / sigma[:, None], full_matrices=False)
+        wanted = np.vstack([root, directions[:DIRECTIONS], mass @ root / mass.sum()])
+        more = along(images.T, look.between, Whitening.of(sigma, None, NORMAL))
+        error = replace(plain, root=np.concatenate([plain.root, more]))
         size = float(np.sqrt((((clean - outputs) / sigma) ** 2).mean()))
         for treatment in WORDS:
             mesh: ApproximationError | None = error if treatment == "correct" else None

@@ -75,11 +75,32 @@ class Cube:
 
     def __init__(self, cells: int, size: float, thinner: tuple[float, float] = (24.0, 6.0)) -> None:
         self.cells, self.size = cells, size
+        self._mesh(self._graded(cells, thinner))
+
+    @classmethod
+    def around(cls, cells: int, size: float) -> Cube:
+        """Make one whose cells lie in those of a regular grid, so that stiffnesses with kinks there are smooth in each.
+
+        The first cells of that grid are divided: at z = 0 into three, at the sides into two.
+        """
+        cube = cls.__new__(cls)
+        cube.cells, cube.size = cells + 2, size
+        planes = np.arange(cells + 1) / cells
+        side = np.unique([*planes, 0.3 / cells, 1 - 0.3 / cells])
+        cube._mesh([size * side, size * side, size * np.unique([*planes, 0.12 / cells, 0.4 / cells])])
+        return cube
+
+    def _graded(self, cells: int, thinner: tuple[float, float]) -> list[FloatArray]:
+        """Planes between the cells along each axis."""
         t = np.linspace(0, 1, cells + 1)
         up = np.expm1(t * np.log(thinner[0])) / (thinner[0] - 1)
         ends = np.expm1(np.minimum(t, 1 - t) * 2 * np.log(thinner[1])) / (thinner[1] - 1) / 2
         side = np.where(t <= 0.5, ends, 1 - ends)
-        self.lines = [size * side, size * side, size * up]
+        return [self.size * side, self.size * side, self.size * up]
+
+    def _mesh(self, lines: list[FloatArray]) -> None:
+        """Divide the cells between planes into tetrahedra."""
+        cells, self.lines = self.cells, lines
         corner = np.array(list(product(range(cells), repeat=3)))
         self.tets = (corner[:, None, None] + KUHN).reshape(-1, 4, 3)  # corners in the grid
         bary = np.column_stack([DEGREE - POWERS.sum(axis=1), POWERS])

@@ -9,8 +9,8 @@ Finer meshes are quadratic, with as many nodes where the body is linear, and nev
 differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
 (docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are halved, and graded as those of the body: the
 edge of the contact may be anywhere. Where thin cells at a rim are squeezed until there is no equilibrium, meshes
-without them take their place. Where there are random fields cells are halved too, and the other mesh is that of the
-body: a mesh that does not contain its vertices has another field.
+without them take their place. A mesh that does not contain the vertices of a random field has another field: cells of
+boxes and blocks with fields are divided, and again at the rims of what is held (`forward.bodies.nested`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
+from forward.bodies.nested import RATIO, layers_of, within
 from forward.bodies.random_fields import RandomField
 from forward.extrapolated import HALVED, Begun, Extrapolated
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
@@ -50,6 +51,7 @@ QUADRATIC = {"degree": 2, "quadrature_degree": None}
 HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
 # Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
 ITERATIONS, LOAD_STEP = 12, 1 / 16
+FEWEST = 6  # cells along an edge of finer meshes of fields
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
@@ -66,7 +68,9 @@ def finer(spec: AnyBody) -> Any:
 
 def graded(spec: AnyBody) -> Any | None:
     """Return a body on a mesh that is graded as the finer one; None where it is graded so, or is not graded."""
-    if isinstance(spec.body, MeshFile) or spec.fields:
+    if isinstance(spec.body, MeshFile) or (spec.fields and _touched(spec)):
+        return None
+    if spec.fields and _parts(spec.body) == 1 and not _layers(spec):
         return None
     found = _on(spec, 1.0)
     return None if found.body == spec.body else found
@@ -76,6 +80,11 @@ def share(spec: AnyBody) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
     if isinstance(spec.body, MeshFile):
         return OF_LINEAR if spec.body.degree == 1 else HALVED
+    if spec.fields and not _touched(spec):
+        layers = _layers(spec)
+        if _parts(spec.body) == 2:
+            return 1 / (2**3 - 1)
+        return 1 / (RATIO ** (-OF_EQUAL * layers) - 1) if layers else OF_LINEAR
     if spec.fields or (_touched(spec) and spec.body.degree == 2):
         return HALVED
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
@@ -88,6 +97,22 @@ def held(spec: AnyBody) -> tuple[str, ...]:
     """Return the boundaries where a body is held, in any load case: by planes of symmetry and rollers it is not."""
     moved = [item.on for case in _cases(spec) for item in case.displacements if len(item.components) > 1]
     return tuple(dict.fromkeys([*(face for case in _cases(spec) for face in case.clamp), *moved]))
+
+
+def _thin(fine: Any, own: Any) -> bool:
+    """Whether cells of a finer mesh of a box or block are thinner at some faces than its own are."""
+    return isinstance(fine, MeshFile) or fine.grading != own.grading
+
+
+def _parts(body: Any) -> int:
+    """Into how many parts edges of cells are divided where there are fields; linear cells become quadratic first."""
+    return 1 if body.degree == 1 and min(body.cells) >= FEWEST else 2
+
+
+def _layers(spec: AnyBody) -> int:
+    """Return how often cells at rims are divided at least, where they are, on finer meshes of fields."""
+    body: Any = spec.body
+    return min((n for n in layers_of(body, _parts(body)) if n), default=0) if held(spec) else 0
 
 
 def _touched(spec: AnyBody) -> bool:
@@ -107,8 +132,13 @@ def _on(spec: AnyBody, times: float, *, thin: bool = True) -> Any:
         body = body.model_validate(body.model_dump(exclude={"contents"}) | QUADRATIC)
     elif isinstance(body, MeshFile):
         body = body.finer(times, held(spec), HELD, BESIDE)
+    elif spec.fields and (_touched(spec) or not thin):
+        body = body.with_cells(2.0) if times > 1 else body
     elif spec.fields:
-        body = body.with_cells(2.0)
+        most, here = _parts(body), _parts(body) if times > 1 else 1
+        layers = layers_of(body, most) if most > 1 or times > 1 else (0, 0, 0)
+        quadratic = body.model_validate(body.model_dump() | QUADRATIC) if linear else body
+        body = within(quadratic, here, held(spec), layers)
     else:
         if _touched(spec):  # the edge of the contact decides, wherever that is
             body = body.with_cells((2.0 if times > 1 else 1.0) / (2 if linear else 1))
@@ -143,7 +173,7 @@ def extrapolated(model: AnyModel, start: FloatArray | None = None) -> FinerMeshe
     spec = model.spec
     fine, beside = finer(spec), graded(spec)
     otherwise = None
-    if not isinstance(spec.body, MeshFile) and fine.body.grading != spec.body.grading:
+    if not isinstance(spec.body, MeshFile) and _thin(fine.body, spec.body):
         equal, less = (_hurried(_on(spec, times, thin=False), spec.solver.minimum_load_step) for times in (TIMES, 1.0))
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)

@@ -24,6 +24,8 @@ from inverse.data.errors import NormalErrors, StudentErrors
 # Standard deviations of what finer meshes still miss: of the pattern of the difference between them and of the error
 # itself, over these, and datum by datum, over the difference (chosen by `python -m benchmarks meshes`).
 OF_DIFFERENCE, OF_ERROR, OF_DATUM = 0.35, 0.1, 0.3
+# And along each direction of a field that the data determine (chosen by `python -m benchmarks meshes_of_fields`).
+OF_DIRECTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,26 @@ def uncertain(error: FloatArray, between: FloatArray, places: Places) -> FloatAr
     ]
     found = np.array(rows).reshape(-1, len(between))
     return np.asarray(found[np.abs(found).max(axis=1, initial=0.0) > 0])
+
+
+def along(images: FloatArray, between: FloatArray, whitening: Whitening) -> FloatArray:
+    """Return rows (r, m) of what is uncertain along the directions of a field, in addition to `uncertain`.
+
+    What the data determine best is what few patterns of all data determine, and a rest that is small in every datum may
+    lie along these: there it counts as much as the difference between the finer meshes.
+
+    Parameters
+    ----------
+    images
+        A u (r, m) of orthogonal directions u of the field: orthogonal patterns in independent errors.
+    between
+        Difference (m,) between the two finer meshes.
+    whitening
+        What makes errors independent without those of the mesh.
+    """
+    patterns = images / np.maximum(np.linalg.norm(images, axis=1, keepdims=True), 1e-300)
+    seen = OF_DIRECTION * np.abs(patterns @ whitening(between / whitening.sigma))
+    return np.asarray(seen[:, None] * whitening.undone(patterns) * whitening.sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
-from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, uncertain
+from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, along, uncertain
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.evaluate import Request
@@ -200,7 +200,7 @@ def corrected_field(
         Of the vertices (N,) in the mean over the body.
     """
     here = solve(posterior, None)
-    plain, known, mesh = here.found.mean, None, None
+    plain, images, known, mesh = here.found.mean, here.found.spectrum.images, None, None
     settled, moved, left = False, np.full(len(weights), np.nan), np.zeros(1)
     for solves in range(1, ROUNDS + 1):
         point = here.mode.point
@@ -208,6 +208,7 @@ def corrected_field(
         if look is None:
             break
         found = error_of(look, np.asarray(point.solution.outputs), point.values, places)
+        found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.whitening)]))
         over = found.error * posterior.measured / point.posterior.sigma  # nothing is said of data that are not there
         rest = found.error if mesh is None else found.error - mesh.error
         moved = _moved(here, rest)

@@ -198,17 +198,18 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     assert (same.body.cells, same.body.degree) == ((3, 3, 3), 2)
     assert same.body.grading == spec.body.grading
     assert share(Specimen.model_validate(CUBE)) == pytest.approx(1 / ((5 / 3) ** 3 - 1))
-    # As many nodes as linear cells that are smaller; but meshes of fields contain the vertices of the field.
+    # As many nodes as linear cells that are smaller.
     many = CUBE["body"] | {"cells": [12, 12, 8], "quadrature_degree": 3}
     one, field = CUBE | {"body": many}, {**FIELD, "basis": "nodes"}
     found = [make(Specimen.model_validate(one)).body for make in (finer, graded)]
     assert [(body.cells, body.degree) for body in found] == [((9, 9, 6), 2), ((6, 6, 4), 2)]
     assert found[0].quadrature_degree is None
     nested = Specimen.model_validate(one | {"fields": [field]})
-    assert (finer(nested).body.cells, finer(nested).body.degree) == ((24, 24, 16), 1)
-    assert finer(nested).body.grading == nested.body.grading
-    assert graded(nested) is None
-    assert share(nested) == HALVED
+    assert (finer(nested).body.cell_count, finer(nested).body.degree) == (14 * 14 * 10, 2)
+    assert (graded(nested).body.cell_count, graded(nested).body.degree) == (12 * 12 * 8, 2)
+    assert share(nested) == pytest.approx(1 / (0.35**-1.6 - 1))
+    free = nested.model_copy(update={"cases": [nested.cases[0].model_copy(update={"clamp": ()})]})
+    assert (finer(free).body.cell_count, graded(free), share(free)) == (12 * 12 * 8, None, OF_LINEAR)
     two = Specimen.model_validate(CUBE | {"body": many | {"degree": 2, "quadrature_degree": None}})
     assert (finer(two).body.cells, finer(two).body.degree) == ((18, 18, 12), 2)
     assert share(two) == pytest.approx(1 / (1.5**3 - 1))
@@ -216,6 +217,12 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     steep = CUBE["body"] | {"grading": {"z-min": 20.0}}
     assert finer(Specimen.model_validate(CUBE | {"body": steep})).body.grading["z-min"] == 20.0
     assert graded(same) is None
+    found = [make(two.model_copy(update={"fields": nested.fields})).body for make in (finer, graded)]
+    assert [(body.cell_count, body.degree) for body in found] == [(26 * 26 * 17, 2), (14 * 14 * 9, 2)]
+    few = nested.model_copy(update={"body": Box.model_validate(CUBE["body"])})
+    found = [make(few).body for make in (finer, graded)]
+    assert [(body.cell_count, body.degree) for body in found] == [(8 * 8 * 6, 2), (6 * 6 * 4, 2)]
+    assert share(few) == pytest.approx(1 / 7)
     fields = [{**FIELD, "basis": "modes", "modes": 3}, {**FIELD, "of": "density", "basis": "modes", "modes": 3}]
     heavy = {"kind": "gravity", "direction": (0, 0, -1), "density": 1000}
     cases = [{**CUBE["cases"][0], "loads": [*CUBE["cases"][0]["loads"], heavy]}]
@@ -242,6 +249,9 @@ def test_bodies_with_outputs_have_finer_meshes_too():
     many = PRESSED["body"] | {"cells": [8, 6, 6]}
     touched = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many})
     assert [make(touched).body.cells for make in (finer, graded)] == [(8, 6, 6), (4, 3, 3)]
+    field = {**FIELD, "basis": "nodes"}
+    varied = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many, "fields": [field]})
+    assert (finer(varied).body.cells, finer(varied).body.degree, graded(varied)) == ((16, 12, 12), 1, None)
     two = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many | {"degree": 2}})
     assert (finer(two).body.cells, finer(two).body.grading, graded(two)) == ((16, 12, 12), {}, None)
     assert share(two) == HALVED

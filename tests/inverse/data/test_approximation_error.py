@@ -9,10 +9,12 @@ from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import (
     OF_DATUM,
     OF_DIFFERENCE,
+    OF_DIRECTION,
     OF_ERROR,
     ApproximationError,
     Places,
     Whitening,
+    along,
     uncertain,
 )
 from inverse.data.errors import NORMAL, StudentErrors
@@ -202,6 +204,25 @@ class Identity:
         return g
 
 
+def covariance_along(A, sigma, between):
+    """Covariance along the directions that the data determine, by its definition: singular vectors of Γ_n^(-1/2) A."""
+    vectors = np.linalg.svd(A / sigma[:, None], full_matrices=False)[0] * sigma[:, None]
+    return OF_DIRECTION**2 * (vectors * (vectors.T @ (between / sigma**2)) ** 2) @ vectors.T
+
+
+def test_what_is_uncertain_along_directions_knows_errors_that_data_share():
+    """It is the same whether data or combinations of them have independent errors."""
+    A = RNG.standard_normal((M, 3))
+    shared = SIGMA * RNG.standard_normal((2, M))
+    gamma = np.diag(SIGMA**2) + shared.T @ shared
+    white = Whitening.of(SIGMA, None, NORMAL, shared)
+    images = (np.linalg.svd(white((A / SIGMA[:, None]).T).T, full_matrices=False)[0] * [3.0, 2.0, 1.0]).T
+    rows = along(images, BETWEEN, white)
+    root = np.linalg.cholesky(gamma)
+    mixed = covariance_along(np.linalg.solve(root, A), np.ones(M), np.linalg.solve(root, BETWEEN))
+    np.testing.assert_allclose(rows.T @ rows, root @ mixed @ root.T, atol=1e-12)
+
+
 def test_a_field_against_dense_algebra():
     A, b = RNG.standard_normal((M, 6)), 0.5 * RNG.standard_normal(M)
     names = tuple(f"m{i}" for i in range(6))
@@ -218,7 +239,8 @@ def test_a_field_against_dense_algebra():
     weights = np.full(6, 1 / 6)
     given = FieldPosterior(model, data, SIGMA, Identity())
     here, moved, found = corrected_field(given, solve, tends, PLACES, "correct", weights)
-    gamma = np.diag(SIGMA[seen] ** 2) + covariance_of(b, seen)
+    uncertainty = covariance_of(b, seen) + covariance_along(A[seen], SIGMA[seen], BETWEEN[seen])
+    gamma = np.diag(SIGMA[seen] ** 2) + uncertainty
     precision = np.eye(6) + A[seen].T @ np.linalg.solve(gamma, A[seen])
     mode = np.linalg.solve(precision, A[seen].T @ np.linalg.solve(gamma, data[seen] - b[seen]))
     np.testing.assert_allclose(here.found.mean, mode, rtol=1e-6, atol=1e-8)
@@ -228,7 +250,7 @@ def test_a_field_against_dense_algebra():
     assert found.corrected
     assert found.settled
     gain = np.linalg.solve(precision, A[seen].T @ np.linalg.inv(gamma))
-    left = np.sqrt(weights @ gain @ covariance_of(b, seen) @ gain.T @ weights)
+    left = np.sqrt(weights @ gain @ uncertainty @ gain.T @ weights)
     width = np.sqrt(weights @ np.linalg.inv(precision) @ weights)
     np.testing.assert_allclose(found.left, left / width, rtol=1e-6)
     plain = np.linalg.solve(
