@@ -31,7 +31,7 @@ BIASED, WRONG = (
 )  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
-OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
+OF_FIELD = 4.0  # error of the mesh over the noise up to which intervals of corrected fields were counted
 UNSEEN, SOME = 0.9, 0.05  # of the prior's deviation, above which data say little; share of vertices that is told
 SAME, HALF = 0.9, 0.5  # what weights between posteriors are worth where these are alike, and where they are not
 EXPANDED = 0.3  # error of an expansion over that of a datum that makes intervals wider by more than 4 %
@@ -278,7 +278,7 @@ def mesh_corrected(
     if decides(worst, uncertain):
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
     if len(nodes) and size > OF_FIELD:
-        why = "that is rough for a field: what the data determine best may be off by several deviations"
+        why = "that is more than was ever tested of a field: what the data determine best may be off"
         short = "its mesh is too coarse for what the data determine best"
         return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
     return [Doubt("note", text, "")]
