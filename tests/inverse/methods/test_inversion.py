@@ -260,7 +260,14 @@ def here(path, out, *changes):
     return run_study(load(path, changes), path.stem, out, quiet=True)
 
 
-WITHOUT_REPORT = """
+THICK = """
+import forward.bodies.nested
+
+forward.bodies.nested.THINNEST = 1.0  # no thin cells on finer meshes of fields, which take most of the time of these
+"""
+WITHOUT_REPORT = (
+    THICK
+    + """
 import sys
 import workflows.run.run
 from workflows.__main__ import main
@@ -268,6 +275,7 @@ from workflows.__main__ import main
 workflows.run.run._report = lambda directory: None
 sys.exit(main(sys.argv[1:]))
 """
+)
 
 
 @pytest.fixture(scope="module")
@@ -446,7 +454,9 @@ def test_solves_without_a_model_are_counted_in_batches_too(folder, monkeypatch):
     assert any(one["text"].startswith(told) for one in summary["findings"])
 
 
-KILLED = """
+KILLED = (
+    THICK
+    + """
 import os
 import sys
 import workflows.run.run
@@ -469,6 +479,7 @@ code = main(sys.argv[1:])
 print(f"{len(saved)} blocks")
 sys.exit(code)
 """
+)
 
 
 def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch):
