@@ -1,4 +1,7 @@
-"""Photograph the first screens of reports for the gallery: python -m tests.gallery RESULTS ... (needs Chromium)."""
+"""Photograph the first screens of reports, and draw some of their pictures: python -m tests.gallery RESULTS ...
+
+Results are told apart by the names of their folders. Needs Chromium.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,22 @@ import io
 import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
 from tests.browser import Page, browser
+from workflows.report import plots
+from workflows.report.plots import inversion, population, selection
+from workflows.results.directory import read_dataset
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FOLDER = Path(__file__).parents[1] / "docs" / "gallery"
 COLOURS = 200  # of a picture
 PHONE = 390
+PLACES = [f"inclusions.lump.{name}" for name in ("x", "y", "z", "radius")]
 SLIDE = """(() => { const s = document.querySelector('.slider input[type=range]');
     if (s) { s.value = Number(s.min) + 0.9 * (s.max - s.min); s.dispatchEvent(new Event('input')); } })()"""
 
@@ -40,6 +51,32 @@ def main(directories: list[Path]) -> None:
                 _save(page.screenshot(Path("/dev/null"), ".viewer"), f"report-{directory.name}-phone.png")
                 _film(page, report)
             assert not page.errors, page.errors
+            _pictures(directory)
+
+
+def _pictures(directory: Path) -> None:
+    """Draw what the gallery shows of a study."""
+    of = read_dataset(directory)
+    drawn: dict[str, Axes] = {}
+    if directory.name == "treloar":
+        best = next(name for name, colour in selection.colours(of).items() if colour == plots.HIGH)
+        group = str(of["group"].values[0])
+        drawn = {
+            "evidence": selection.evidence_bars(of),
+            "probability": selection.probability_bars(of),
+            "curves": selection.curves(of, group, "uniaxial"),
+            "corner": selection.corner(of, best, group, {"mu1": "Pa", "mu2": "Pa", "mu3": "Pa"}),
+        }
+    elif directory.name == "inclusion":
+        one = of.isel(data_set=0)
+        drawn = {"pairs": inversion.correlations(one, dict.fromkeys(PLACES, "m"))}
+    elif directory.name == "brain-population":
+        drawn = {"population": population.specimens(of, "mu1", "Pa")}
+    elif directory.name == "stiffness-field":
+        one = of.isel(data_set=0)
+        drawn = {"slices": inversion.slices(one, inversion.Cut.of(one)), "spectrum": inversion.spectrum(one)}
+    for name, ax in drawn.items():
+        _save(plots.png(ax), f"{name}.png")
 
 
 def _film(page: Page, report: Path) -> None:
