@@ -13,6 +13,7 @@ from forward.solvers.system import Found, Residual, System, Way
 
 WINDOW = 8  # differences that Anderson mixing keeps
 PATIENCE = 6  # corrections without a smaller residual before giving up
+TOUCHING, LESS = 4, 1 / 3  # corrections of a body in contact after which the residual must be this much smaller
 ROUGH = 1e-2  # relative residual of a state that only predicts the next
 SHORTEST = 1 / 8  # fraction of the path from the reference that is not divided further
 ROUNDED = 1e-2  # relative residual above which a useless correction is not due to rounding
@@ -79,7 +80,7 @@ def mix(
 ) -> Steps[tuple[FloatArray, Residual, bool]]:
     """Correct u with one factor; return the best state, its residual, and whether it is an equilibrium."""
     mixing = AndersonMixing(WINDOW, len(u), system.total, system.weights())
-    best, smallest, since = u, residual, 0
+    best, smallest, since, begun = u, residual, 0, residual.size
     sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(limit + 1):
@@ -94,6 +95,9 @@ def mix(
         else:
             since += 1
         if iteration == limit or since > PATIENCE:
+            break
+        if system.contact and iteration == TOUCHING and smallest.size > LESS * begun:
+            history.append("corrections: the area in contact moves too far")
             break
         last = (u, residual)
         u = mixing.next(u, residual.vector, (yield from correct(residual.vector)))
