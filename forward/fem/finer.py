@@ -99,6 +99,11 @@ def held(spec: AnyBody) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*(face for case in _cases(spec) for face in case.clamp), *moved]))
 
 
+def counted(spec: Any) -> bool:
+    """Whether it was counted how often intervals of fields of such a body hold: quadratic cells of boxes, no tools."""
+    return not isinstance(spec.body, MeshFile) and spec.body.degree == 2 and not _touched(spec)
+
+
 def _thin(fine: Any, own: Any) -> bool:
     """Whether cells of a finer mesh of a box or block are thinner at some faces than its own are."""
     return isinstance(fine, MeshFile) or fine.grading != own.grading

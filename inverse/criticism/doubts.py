@@ -31,7 +31,8 @@ BIASED, WRONG = (
 )  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
-OF_FIELD = 4.0  # error of the mesh over the noise up to which intervals of corrected fields were counted
+# Error of the mesh over the noise up to which intervals of corrected fields were counted; of other bodies than these.
+OF_FIELD, OF_OTHERS = 4.0, 0.3
 UNSEEN, SOME = 0.9, 0.05  # of the prior's deviation, above which data say little; share of vertices that is told
 SAME, HALF = 0.9, 0.5  # what weights between posteriors are worth where these are alike, and where they are not
 EXPANDED = 0.3  # error of an expansion over that of a datum that makes intervals wider by more than 4 %
@@ -251,7 +252,13 @@ def not_estimable(names: Sequence[str]) -> list[Doubt]:
 
 
 def mesh_corrected(
-    error: FloatArray, shifts: Mapping[str, float], left: Mapping[str, float], nodes: FloatArray, *, settled: bool
+    error: FloatArray,
+    shifts: Mapping[str, float],
+    left: Mapping[str, float],
+    nodes: FloatArray,
+    *,
+    settled: bool,
+    counted: bool = True,
 ) -> list[Doubt]:
     """Say what correcting the error of the mesh has done, and doubt it where it decides.
 
@@ -263,6 +270,8 @@ def mesh_corrected(
         Standard deviations of what is uncertain of that, by name, over those of the posterior.
     settled
         Whether the error at the mode is the one that was corrected.
+    counted
+        Whether it was counted how often intervals of fields of such bodies hold.
     """
     size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
     listed, worst = _moves(shifts, nodes)
@@ -277,8 +286,8 @@ def mesh_corrected(
         return [Doubt(severity, f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
     if decides(worst, uncertain):
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
-    if len(nodes) and size > OF_FIELD:
-        why = "that is more than was ever tested of a field: what the data determine best may be off"
+    if len(nodes) and size > (OF_FIELD if counted else OF_OTHERS):
+        why = "that is more than was tested of fields on such meshes: what the data determine best may be off"
         short = "its mesh is too coarse for what the data determine best"
         return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
     return [Doubt("note", text, "")]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.fem.finer import counted as counted_on
 from forward.model import Finding, Severity
 from forward.readable import told
 from forward.registry import named
@@ -125,5 +126,6 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
     if bool(one["mesh_corrected"]):
         left = dict(zip(names, one["mesh_left"].to_numpy().tolist(), strict=True))
-        return found + criticism.mesh_corrected(error, shifts, left, nodes, settled=bool(one["mesh_settled"]))
+        settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
+        return found + criticism.mesh_corrected(error, shifts, left, nodes, settled=settled, counted=counted)
     return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)

@@ -122,7 +122,7 @@ def test_the_mesh_is_doubted_by_what_it_does_to_the_unknowns():
     assert note.severity == "note"
     (doubt,) = mesh_too_coarse(True, "", error, {"x": 0.1, "radius": -0.9}, none)
     assert doubt.severity == "warning"
-    assert "radius -0.9, x +0.1" in doubt.text
+    assert "radius −0.9, x +0.1" in doubt.text
     assert mesh_too_coarse(True, "", error, {"x": 2.5}, none)[0].severity == "error"
     assert mesh_too_coarse(True, "", error, {"mean": 0.0}, np.full(9, 0.7))[0].severity == "warning"
     (doubt,) = mesh_too_coarse(False, "method.mesh_check = false", np.full(2, np.nan), {"x": np.nan}, none)
@@ -135,7 +135,7 @@ def test_a_corrected_mesh_is_a_note_unless_it_decides():
     (note,) = mesh_corrected(error, shifts, {"x": 0.3, "noise": np.nan}, none, settled=True)
     assert note.severity == "note"
     assert "was corrected" in note.text
-    assert "x +3.1, y -0.2" in note.text
+    assert "x +3.1, y −0.2" in note.text
     assert "up to 0.3 of these deviations" in note.text
     for changed in ({"settled": False}, {"left": {"x": 0.9}}, {"shifts": {"x": -25.0}}, {"nodes": np.full(3, 30.0)}):
         given = {"shifts": shifts, "left": {"x": 0.3}, "nodes": none, "settled": True} | changed
@@ -145,8 +145,9 @@ def test_a_corrected_mesh_is_a_note_unless_it_decides():
     (doubt,) = mesh_corrected(10 * error, shifts, {"x": 0.3}, none, settled=False)
     assert doubt.severity == "error"
     # Of a field, what the data determine best may be wrong where vertices are not.
-    for size, severity in ((3.5, "note"), (4.5, "warning")):
-        (doubt,) = mesh_corrected(np.full(9, size), {"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4), settled=True)
+    for size, counted, severity in ((3.5, True, "note"), (4.5, True, "warning"), (3.5, False, "warning")):
+        field = ({"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4))
+        (doubt,) = mesh_corrected(np.full(9, size), *field, settled=True, counted=counted)
         assert doubt.severity == severity
         assert ("what the data determine best" in doubt.text) == (severity == "warning")
 
