@@ -249,7 +249,7 @@ def test_predictions_are_worth_no_more_than_newtons_method_takes():
     assert bad.back_substitutions == still.back_substitutions
     np.testing.assert_array_equal(found[1].state, found[2].state)
     np.testing.assert_allclose(found[0].outputs, found[3].outputs, rtol=1e-6, atol=1e-9)
-    assert good.back_substitutions <= newton.back_substitutions + 20  # one series of corrections in vain
+    assert good.back_substitutions <= newton.back_substitutions + 8  # four corrections in vain
 
 
 @pytest.mark.fem
