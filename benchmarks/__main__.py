@@ -128,6 +128,7 @@ WITH_OPTIONS = {
     "oddities": oddities.main,
     "tolerance": tolerance.main,
     "estimates": estimates.main,
+    "phases": phases.main,
 }
 
 

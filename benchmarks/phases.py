@@ -1,11 +1,17 @@
-"""What a user of a shipped study waits for: CPU time by phase, with compiled forms at hand."""
+"""What a user of a shipped study waits for: CPU time by phase, with compiled forms and modules at hand.
+
+python -m benchmarks phases [--studies beam-chaos ...]
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.beams import CONFIG
@@ -53,13 +59,19 @@ sys.exit(code)
 """
 
 
-def main() -> None:
+def main(given: Sequence[str] = ()) -> None:
     """Print a row for each study; one run each. A first run compiles forms; what is measured is a second."""
+    options = argparse.ArgumentParser("phases", description=__doc__)
+    options.add_argument("--studies", nargs="+", default=STUDIES)
+    studies = options.parse_args(given).studies
+    modules = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     print("| study | " + " | ".join(f"{name} (s)" for name in PHASES) + " |")
     print("|---|" + "---|" * len(PHASES))
-    for name in STUDIES:
+    for name in studies:
         with tempfile.TemporaryDirectory() as out:
             command = [sys.executable, "-c", SCRIPT, str(CONFIG.parent / f"{name}.toml"), str(Path(out) / "out")]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=CONFIG.parent.parent, check=False)
+            done = subprocess.run(
+                command, stdout=subprocess.PIPE, text=True, cwd=CONFIG.parent.parent, check=False, env=modules
+            )
         spent = json.loads(done.stdout.splitlines()[-1])
         print(f"| `{name}.toml` | " + " | ".join(f"{spent[phase]:.2f}" for phase in PHASES) + " |", flush=True)
