@@ -4,7 +4,7 @@ Between two states of a slender body it is mostly the orientation of its parts t
 is turned along with them: K(u)⁻¹ ≈ R K̄⁻¹ Rᵀ, where R holds at each node the rotation from the reference state to u. On
 the published beam this halves the number of corrections (docs/decisions/0004-turned-reference.md). The rotations are
 those of the polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. Stat. Comput. 7 (1986)
-1160–1174.
+1160–1174, scaled by determinants: R. Byers, H. Xu, SIAM J. Matrix Anal. Appl. 30 (2008) 822–843.
 """
 
 from __future__ import annotations
@@ -21,30 +21,32 @@ from forward.solvers.steps import Steps
 
 def rotations(F: FloatArray) -> FloatArray:
     """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n); the identity where det F is negative."""
-    good = _determinant(F) > 0
-    identity = np.broadcast_to(np.eye(3)[:, :, None], F.shape)
-    X = np.where(good, F, identity)
+    good = _determinant(_cofactors(F), F) > 0
+    X = np.where(good, F, np.eye(3)[:, :, None])
     for _ in range(30):
         cofactors = _cofactors(X)
-        inverse = cofactors / (X[0] * cofactors[0]).sum(axis=0)  # transposed
-        scale = ((inverse**2).sum(axis=(0, 1)) / (X**2).sum(axis=(0, 1))) ** 0.25
-        before, X = X, (scale * X + inverse / scale) / 2
+        determinant = _determinant(cofactors, X)
+        scale = np.cbrt(determinant)
+        before, X = X, X * (0.5 / scale)
+        cofactors *= 0.5 * scale / determinant  # over the determinant, they are the transposed inverse
+        X += cofactors
         if np.abs(X - before).max(initial=0.0) < 1e-4:  # the error is its square
             break
     return X
 
 
 def _cofactors(F: FloatArray) -> FloatArray:
-    a, b, c = F
-    return np.array([_cross(b, c), _cross(c, a), _cross(a, b)])
+    cofactors = np.empty(F.shape)
+    for i in range(3):  # rows are vector products of the other two; indices count from the end
+        b, c = F[i - 2], F[i - 1]
+        for j in range(3):
+            np.multiply(b[j - 2], c[j - 1], out=cofactors[i, j])
+            cofactors[i, j] -= b[j - 1] * c[j - 2]
+    return cofactors
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-def _determinant(F: FloatArray) -> FloatArray:
-    return np.asarray((F[0] * _cross(F[1], F[2])).sum(axis=0))
+def _determinant(cofactors: FloatArray, F: FloatArray) -> FloatArray:
+    return np.asarray(F[0, 0] * cofactors[0, 0] + F[0, 1] * cofactors[0, 1] + F[0, 2] * cofactors[0, 2])
 
 
 def turn(x: FloatArray, R: FloatArray) -> FloatArray:
