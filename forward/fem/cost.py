@@ -105,7 +105,7 @@ SOLVED = {True: 24, False: 16}  # of a derivative
 LANCZOS = 16  # to know that a state is stable
 COARSE = 0.5  # of an assembly, for the coarse level
 NEWTON_FROM_PREDICTION = 3
-SINGLE_FROM = 1e8  # bytes of a reference's factor, from which on one in single precision takes less time too
+SINGLE_FROM = 5e7  # bytes of a reference's factor, from which on one in single precision takes less time too
 WORTH, DERIVATIVES = 0.7, 4  # times a first solve and so many derivatives with factors, below which none are made
 
 
