@@ -28,6 +28,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def followed(path: str, mail: Mail) -> None:
         while True:
             parameters, modes, uncertain = mail.receive()
             try:
-                mail.send(local(model, parameters, modes, uncertain))
+                found = local(model, parameters, modes, uncertain)
+                mail.send(replace(found, inverse=found.inverse.astype(np.float32)))  # in half the room
             except SolveError as error:
                 mail.send(str(error))
     except (EOFError, OSError, KeyboardInterrupt):
@@ -230,7 +232,7 @@ class Loop:
             return
         self._busy = False
         if isinstance(found, Local):
-            self.stream.moved(found)
+            self.stream.moved(replace(found, inverse=found.inverse.astype(float)))
             self._made = time.monotonic()
 
     def _slid(self, view: Mail) -> None:
@@ -247,9 +249,11 @@ class Loop:
         if not self._busy and (self.stream.lost or not np.array_equal(self._asked, self._now)):
             start = None if self.stream.lost else self.stream.modes
             try:
-                self._busy, self._asked = self._helper.send((self._now, start, self._uncertain)), self._now
+                self._busy = self._helper.send((self._now, start, self._uncertain))
             except OSError:  # it has ended
                 self.ended = True
+            if self._busy:
+                self._asked = self._now
         now = time.monotonic()
         if self._view is not None and now - self._shown >= SHOWN:
             self._shown = now

@@ -7,6 +7,8 @@ left out, which is right for whatever only the newest value matters of.
 
 from __future__ import annotations
 
+import errno
+import os
 import pickle
 import socket
 from typing import Any
@@ -39,8 +41,11 @@ class Mail:
         OSError
             If the other end is closed, or there would never be as much room.
         """
+        packet = pickle.dumps(message, protocol=5)
+        if len(packet) > LARGEST:  # the other end would read a part of it
+            raise OSError(errno.EMSGSIZE, os.strerror(errno.EMSGSIZE))
         try:
-            self._end.send(pickle.dumps(message, protocol=5), socket.MSG_DONTWAIT)
+            self._end.send(packet, socket.MSG_DONTWAIT)
         except BlockingIOError:
             return False
         return True

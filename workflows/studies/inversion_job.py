@@ -14,7 +14,6 @@ from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
-from inverse.methods.by_reduced import invert_by_reduced
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
@@ -233,7 +232,9 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         solving.append(kept)
         data = study.measured(number)
         if reduced is not None:
-            return invert_by_reduced(study.inputs, kept, reduced, data, method, errors, finer, ensemble.say)
+            by_reduced = named("inverse.methods.by_reduced:invert_by_reduced")
+            posterior: xr.Dataset = by_reduced(study.inputs, kept, reduced, data, method, errors, finer, ensemble.say)
+            return posterior
         return invert_by_group(
             study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say, shared
         )
@@ -381,7 +382,8 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
         errors = study.data.errors
         shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
         if reduced is not None:
-            found = invert_by_reduced(study.inputs, recorders["/"], reduced, data, study.method, errors, finer, say)
+            by_reduced = named("inverse.methods.by_reduced:invert_by_reduced")
+            found = by_reduced(study.inputs, recorders["/"], reduced, data, study.method, errors, finer, say)
         else:
             full = recorders["/"]
             found = invert_by_all(study.inputs, full, data, study.method, made.look, errors, finer, say, shared)

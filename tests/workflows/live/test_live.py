@@ -124,6 +124,8 @@ def test_mail_is_whole_or_not_there():
     assert one.send(large)
     for _ in range(sent):
         other.receive()
+    with pytest.raises(OSError, match="too long"):
+        one.send(np.zeros(200_000))
     one.close()
     with pytest.raises(EOFError):
         other.receive()
