@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] = ()) -> None:
         for modes in MODES:
             for cut in CUTS:
                 sizes = Sizes(modes, 2e-3, 3e-3, 0, cut)
-                if cut is not None or modes - given.snapshots < max(MODES) / 4:
+                if cut is not None or modes <= 2 * given.snapshots:
                     _row("the whole" if cut is None else " × ".join(map(str, cut)), reduction, trained, sizes, unseen)
     if given.only in (None, "tool"):
         place = inputs.names.index("loads.spot.x")

@@ -111,14 +111,13 @@ SAG = '{name = "uy_max", kind = "max-displacement", component = "y"}'
 STRESS = '{name = "stress", kind = "max-von-mises"}'
 COARSE = {"kind": "mesh", "coarser": 2.0}
 LINEAR = {"kind": "mesh", "coarser": 1.0, "degree": 1}
-BOTH = {"kind": "mesh", "coarser": 2.0, "degree": 1}
 
 
 def beam(
     title: str, changes: Sequence[str], cheap: Sequence[Any], reference: dict[str, Any], repeats: int, budget: int
 ) -> None:
     """Compare with the tangent on the beam: errors are those of repeats, costs processor times."""
-    study = load(CONFIG.with_name("beam-field.toml") if "modes" in title else CONFIG, list(changes))
+    study = load(CONFIG, list(changes))
     entries: list[dict[str, Any]] = [
         {"kind": "monte-carlo", "budgets": (budget,)},
         {"name": "tangent", "kind": "sensitivity-monte-carlo", "budgets": (budget,)},
@@ -156,7 +155,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks multifidelity")
     parser.add_argument("--repeats", type=int, default=REPEATS, help="of closed forms")
     parser.add_argument("--beam", type=int, default=20, help="repeats on the beam")
-    parser.add_argument("--only", choices=["closed", "beam", "field"], default=None)
+    parser.add_argument("--only", choices=["closed", "beam"], default=None)
     given = parser.parse_args(arguments)
     if given.only in (None, "closed"):
         closed_forms(given.repeats)
@@ -167,16 +166,6 @@ def main(arguments: Sequence[str] = ()) -> None:
             [outputs, "model.body.cells=[12,2,4]"],
             [COARSE, LINEAR],
             {"kind": "chaos", "samples": 64, "max_order": 8},
-            given.beam,
-            96,
-        )
-    if given.only in (None, "field"):
-        field = 'model.fields=[{of="stiffness", length=0.05, std=0.5, modes=30}]'
-        beam(
-            "A stiffness field of 30 modes, standard deviation 0.5",
-            [outputs, field],
-            [COARSE, LINEAR, BOTH],
-            {"kind": "sensitivity-monte-carlo", "samples": 2048, "coefficient": "optimal"},
             given.beam,
             96,
         )

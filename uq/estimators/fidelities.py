@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +142,22 @@ class Found:
         return Problem(np.array(told), costs, taken)
 
 
+class Fold(NamedTuple):
+    """Which samples (n,) of all models tell weights, and the share of the estimate that these are for."""
+
+    kept: NDArray[np.bool_]
+    share: float
+
+
+def folds(whole: Samples, *, inner: bool) -> list[Fold]:
+    """Cut the samples of all models into parts, each of which the others weigh; if they count in the estimate."""
+    n = whole.count
+    if not inner:
+        return [Fold(np.ones(n, dtype=bool), 1.0)]
+    part = np.arange(n) % min(FOLDS, n)
+    return [Fold(part != f, size / n) for f, size in enumerate(np.bincount(part))]
+
+
 def estimated(
     samples: Sequence[Samples], offset: FloatArray, variances: FloatArray, apart: Samples | None = None
 ) -> Found:
@@ -159,21 +176,19 @@ def estimated(
     """
     whole = apart or samples[0]
     groups, counts = [one.group for one in samples], np.array([float(one.count) for one in samples])
-    n, m = whole.count, offset.size
-    fold = np.arange(n) % min(FOLDS, n) if apart is None else np.zeros(n, dtype=int)
-    shares = np.bincount(fold) / n
+    m = offset.size
+    cut = folds(whole, inner=apart is None)
     first, second = ([np.zeros((one.count, m)) for one in samples] for _ in range(2))
     fitted = []
     for j in range(m):
         V = variances[:, j]
         middle = _middle(samples, j)
-        for f, share in enumerate(shares):
-            kept = fold != f if apart is None else fold == f
+        for kept, share in cut:
             fit = Fitted.of(whole.deviations[kept, :, j], whole.controls[kept, :, j], V)
             a = [weights(informations(groups, c), counts) for c in fit.covariances]
             for g, one in enumerate(samples):
                 inner = g == 0 and apart is None
-                rows = fold == f if inner else slice(None)
+                rows = ~kept if inner else slice(None)
                 w, T = one.deviations[rows, :, j], one.controls[rows, :, j]
                 portion = 1.0 if inner else share
                 for sums, r, by, centre in zip(

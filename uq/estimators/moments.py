@@ -487,6 +487,16 @@ def quantiles_from_replicates(
     return _between(values, p, (p * (1 - p))[:, None] / spread**2 * (Z / t) ** 2, t)
 
 
+def quantiles_of_shares(values: FloatArray, probabilities: tuple[float, ...], errors: FloatArray) -> Quantiles:
+    """Quantiles of values (n, m) that stand for a distribution, with standard errors (k, m) of the shares below them.
+
+    As `quantiles_from_replicates`, with the intervals of so many independent samples as give these shares as well.
+    """
+    p = np.array(probabilities)[:, None]
+    counts = p * (1 - p) / np.maximum(errors, 1e-3 / len(values)) ** 2
+    return _between(values, p[:, 0], np.minimum(counts, 1e9), Z)
+
+
 def _between(values: FloatArray, p: FloatArray, counts: FloatArray, factor: float) -> Quantiles:
     """Quantiles of values (n, m), with intervals as from these numbers of independent samples (k, m)."""
     ordered = np.sort(values, axis=0)

@@ -11,8 +11,20 @@ import numpy as np
 from forward.model import Finding, FloatArray, SolveError
 from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
-from uq.estimators.fidelities import Found, correlations, estimated, gains
-from uq.estimators.moments import ESTIMATES, Estimates, Z, combine, controlled, ratio, student, term
+from uq.estimators.fidelities import Found, Samples, correlations, estimated, gains
+from uq.estimators.fidelity_quantiles import quantiles_of_groups
+from uq.estimators.moments import (
+    ESTIMATES,
+    Estimates,
+    Quantiles,
+    Z,
+    combine,
+    controlled,
+    quantiles,
+    ratio,
+    student,
+    term,
+)
 from uq.estimators.tails import of_influences, unseen
 from uq.evaluation.evaluate import Evaluations
 from uq.findings import add
@@ -47,13 +59,22 @@ class ByModels:
         self._team = team
         self.pilot = self.found = self._estimated()
 
-    def _estimated(self) -> Found:
-        """Estimate from all groups that count; from the pilot, as long as nothing else was taken."""
+    def _samples(self) -> tuple[list[Samples], Samples | None]:
+        """All groups that count, the pilot as long as nothing else was taken; and one that tells weights only."""
         team = self._team
         counted = [g for g in team.taken if g != PILOT] or [PILOT]
         apart = team.samples(PILOT) if PILOT in team.taken and counted != [PILOT] else None
-        counted.sort()
-        found = estimated([team.samples(g) for g in counted], team.offsets[0], team.variances, apart)
+        return [team.samples(g) for g in sorted(counted)], apart
+
+    def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
+        """Return quantiles of the outputs."""
+        samples, apart = self._samples()
+        return quantiles_of_groups(samples, self._team.offsets[0], probabilities, apart)
+
+    def _estimated(self) -> Found:
+        team = self._team
+        samples, apart = self._samples()
+        found = estimated(samples, team.offsets[0], team.variances, apart)
         return replace(found, estimates=with_tails(team, found.estimates, found.moved))
 
     @property
@@ -156,6 +177,11 @@ class ByExpansion:
             deviations(regression, _without_fields(pilot), centre),
             Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
         )
+
+    def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
+        """Return quantiles of the outputs, of the samples of the study's model alone."""
+        samples = self._team.samples(self._own)
+        return quantiles(self._team.offsets[0] + samples.deviations[:, 0], probabilities)
 
     @property
     def _own(self) -> int:

@@ -26,7 +26,7 @@ from uq.methods.cheap import CHEAP, CheapModel
 from uq.methods.fidelity_team import OWN_LABEL, Team
 from uq.methods.fidelity_ways import ByExpansion, ByModels, described, preferred, useless
 from uq.methods.method import MESH
-from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
+from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED, Probability
 from uq.methods.stopping import Amount
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
 class Multifidelity(Amount):
     """Approximate control variates: mean and standard deviation from a model and cheap ones, without bias.
 
-    Displacement fields and quantiles are not estimated: models may live on different meshes.
+    Displacement fields are not estimated: models may live on different meshes.
 
     Parameters
     ----------
@@ -69,6 +69,8 @@ class Multifidelity(Amount):
     control
         What is taken off every model first: "tangent", its tangent at the mean parameters, or "none". "auto": its
         tangent, and where an expansion is predicted to be better than all models, that in their place.
+    quantiles
+        Probabilities of the quantiles of the outputs.
     seed
         Seed of the random points; every group of models has its own stream.
     """
@@ -78,6 +80,7 @@ class Multifidelity(Amount):
     pilot: Annotated[int, Field(ge=FEWEST)] | None = None
     reuse: bool = True
     control: Literal["auto", "tangent", "none"] = "auto"
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -159,9 +162,9 @@ class Multifidelity(Amount):
         Returns
         -------
         xarray.Dataset
-            Estimates by output (`mean`, `mean_error`, `std`, `std_error`), the `gain` over plain Monte Carlo, what each
-            model costs and how it is correlated (`fidelity_…`), what was taken of each group (`group_…`), and what
-            other methods are predicted to need (`alternative_solves`); see docs/results.md.
+            Estimates by output (`mean`, `mean_error`, `std`, `std_error`, `quantiles`, …), the `gain` over plain Monte
+            Carlo, what each model costs and how it is correlated (`fidelity_…`), what was taken of each group
+            (`group_…`), and what other methods are predicted to need (`alternative_solves`); see docs/results.md.
 
         Raises
         ------
@@ -202,6 +205,9 @@ class Multifidelity(Amount):
         amount = f"{team.count} samples that cost {team.spent:.4g} solves"
         stopped = self.why_stopped(reached, f"relative error {reached:.3g}", 1 - int(poor), 1, amount)
         dataset = described(team, way, models, expansion)
+        if self.quantiles:
+            dataset = dataset.assign_coords(quantile=list(self.quantiles))
+            dataset = dataset.assign(way.quantiles(self.quantiles).variables)
         add(dataset, *told, *way.doubts())
         dataset.attrs["stopped"] = stopped
         return dataset
