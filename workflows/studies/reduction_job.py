@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.reduction import Reduce, ReductionStudy
 
+OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
 CANDIDATES = 8  # for each snapshot that is drawn where errors are large
 UNSEEN = 10_000  # number of the first random point at which errors are measured
@@ -113,6 +114,8 @@ class _Making:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
         self._start = linearise(inputs, evaluate).prediction
         self._sizes = Sizes(method.modes, method.truncation, method.cubature)
+        if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
+            self._sizes = replace(self._sizes, more=max(self._sizes.more, OF_STATES * method.modes))
         if method.blocks is not None:
             self._sizes = replace(self._sizes, cut=method.blocks.cut, full=method.blocks.full)
         self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
