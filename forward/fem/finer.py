@@ -100,8 +100,9 @@ def held(spec: AnyBody) -> tuple[str, ...]:
 
 
 def counted(spec: Any) -> bool:
-    """Whether it was counted how often intervals of fields of such a body hold: quadratic cells of boxes, no tools."""
-    return not isinstance(spec.body, MeshFile) and spec.body.degree == 2 and not _touched(spec)
+    """Whether it was counted how often intervals of fields of such a body hold: quadratic hexahedra, no tools."""
+    body = spec.body
+    return not isinstance(body, MeshFile) and (body.cell, body.degree) == ("hexahedron", 2) and not _touched(spec)
 
 
 def _thin(fine: Any, own: Any) -> bool:

@@ -15,20 +15,15 @@ from uq.inputs.distributions import Distribution
 
 FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
 UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance for a warning, an error
-END, CROWDED = (
-    0.02,
-    5.0,
-)  # share of the prior at an end of a range, and how many times that share the posterior has there
+END, CROWDED = 0.02, 5.0  # share of the prior at an end of a range, and how many times that the posterior has there
 NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data above which the model explains nothing
 STRANGE = 0.01  # probability that any of all data is as far out as an outlier
 LISTED = 5
 LINEAR = 2.0  # posterior deviations up to which a first-order shift of ln Z is about right
 MOVED = 1.0  # by which a finer mesh moves ln Z, "not worth more than a bare mention" (Kass and Raftery 1995)
-BIASED, WRONG = (
-    0.5,
-    2.0,
-)  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
+# Shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half.
+BIASED, WRONG = 0.5, 2.0
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
 # Error of the mesh over the noise up to which intervals of corrected fields were counted; of other bodies than these.

@@ -10,7 +10,7 @@ from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh import contents, divided
 from forward.bodies.mesh_file import MeshFile
 from forward.extrapolated import HALVED
-from forward.fem.finer import OF_LINEAR, OtherMesh, extrapolated, finer, graded, held, share
+from forward.fem.finer import OF_LINEAR, OtherMesh, counted, extrapolated, finer, graded, held, share
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.specimen import Specimen
@@ -218,6 +218,8 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     assert finer(Specimen.model_validate(CUBE | {"body": steep})).body.grading["z-min"] == 20.0
     assert graded(same) is None
     found = [make(two.model_copy(update={"fields": nested.fields})).body for make in (finer, graded)]
+    other = two.model_copy(update={"body": two.body.model_copy(update={"cell": "tetrahedron"})})
+    assert [counted(spec) for spec in (two, nested, other)] == [True, False, False]  # linear cells, tetrahedra
     assert [(body.cell_count, body.degree) for body in found] == [(26 * 26 * 17, 2), (14 * 14 * 9, 2)]
     few = nested.model_copy(update={"body": Box.model_validate(CUBE["body"])})
     found = [make(few).body for make in (finer, graded)]
@@ -254,7 +256,7 @@ def test_bodies_with_outputs_have_finer_meshes_too():
     assert (finer(varied).body.cells, finer(varied).body.degree, graded(varied)) == ((16, 12, 12), 1, None)
     two = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many | {"degree": 2}})
     assert (finer(two).body.cells, finer(two).body.grading, graded(two)) == ((16, 12, 12), {}, None)
-    assert share(two) == HALVED
+    assert (share(two), counted(two)) == (HALVED, False)
 
 
 @pytest.mark.fem
