@@ -168,7 +168,7 @@ def test_a_candidate_with_regions_of_a_mesh(site, tmp_path):
     found = json.loads((tmp_path / "2" / "summary.json").read_text())["models"]
     assert sum(model["probability"] for model in found.values()) == pytest.approx(1.0)
     rows = rows_of((tmp_path / "None" / "report.html").read_text())
-    assert [row for row in rows if row[2:3] == ["material.c"] and row[3].endswith(" Pa")]
+    assert [row for row in rows if row[2:3] == ["material.c"] and row[3].endswith("\N{NO-BREAK SPACE}kPa")]
     assert {(row[2], row[4]) for row in rows if row[3:4] and row[3].startswith("uniform")} == {("regions.right.b", "1")}
     assert "my_tissue" in json.loads((tmp_path / "2" / "sources.json").read_text())["files"]
 

@@ -380,7 +380,7 @@ def test_a_tool_sharper_than_the_mesh_is_said_to_be():
     texts = [finding.text for finding in body(tool(radius=1e-3, depth=1e-4)).findings]
     assert any("below the edges of the cells there" in text for text in texts)
     assert not body(tool(radius=1.0, depth=1e-3)).findings
-    assert any("is rounded over 0.0001 m" in f.text for f in body(only("flat", edge=1e-4)).findings)
+    assert any("is rounded over 100 µm" in f.text for f in body(only("flat", edge=1e-4)).findings)
     assert not body(only("flat", radius=8e-3, edge=4e-3)).findings
 
 

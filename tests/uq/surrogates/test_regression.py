@@ -101,6 +101,20 @@ def test_outputs_that_nothing_explains_leave_the_others_theirs(d, gradients):
     assert (both.fit.relative[1:] > 0.8).all()
 
 
+def test_rounding_that_few_samples_explain_by_chance_decides_nothing():
+    """A plane through eight samples leaves 0.6 of one rounding in a hundred, which a parabola would not follow."""
+    inputs = inputs_of(2)
+    points = inputs.points(sobol_points(3, 0, 0, 8, 2))
+    smooth = np.exp(points[:, [0]] + points[:, [1]] / 2)
+    alone = Regression.of(inputs, points, smooth, None, 2)
+    rng = np.random.default_rng(0)
+    chances = [np.hstack([smooth, 1e-17 * rng.standard_normal((8, 1))]) for _ in range(100)]
+    found = [Regression.of(inputs, points, values, None, 2).fit for values in chances]
+    assert min(fit.relative[1] for fit in found) < 0.8
+    assert {fit.chosen.order for fit in found} == {alone.fit.chosen.order}
+    np.testing.assert_allclose([fit.relative[0] for fit in found], alone.fit.relative[0], rtol=1e-6)
+
+
 def test_few_values_in_ten_parameters():
     """The weight of a wing (A. Forrester, A. Sóbester, A. Keane, Engineering Design via Surrogate Modelling, 2008)."""
     lower = (150, 220, 6, -10, 16, 0.5, 0.08, 2.5, 1700, 0.025)

@@ -347,8 +347,8 @@ def test_a_displacement_larger_than_the_body_is_questioned():
     document_["parameters"]["displacements.x-max.x"] = {"kind": "uniform", "lower": 0.0, "upper": 2.0}
     texts = [finding.text for finding in parse(document_).findings if finding.text.startswith("displacements.")]
     assert [text.partition(":")[0] for text in texts] == [
-        "displacements.x-max.y reaches -3 m, more than the length of the body, 0.28 m",
-        "displacements.x-max.x reaches 2 m, more than the length of the body, 0.28 m",
+        "displacements.x-max.y reaches −3 m, more than the length of the body, 28 cm",
+        "displacements.x-max.x reaches 2 m, more than the length of the body, 28 cm",
     ]
     assert any("displacements.x-max.y reaches" in line for line in plan(parse(document_)))
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from forward.words import number
+from forward.readable import size
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from uq.findings import findings
 from workflows.config.mistakes import StudyError
@@ -198,7 +198,7 @@ def test_the_summary_and_the_terminal_say_it(tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Error budget" in page
     assert page.index("Error budget") < page.index("What was computed")
-    assert number(of["total_error"], 2) in page
+    assert size(of["total_error"], "m") in page
 
 
 @pytest.mark.fem

@@ -225,7 +225,8 @@ def test_studies_without_it_import_nothing_of_it(tmp_path):
     (tmp_path / "body.toml").write_text(SAMPLED)
     script = (
         "import sys; from workflows.__main__ import main\n"
-        f"main(['run', {str(tmp_path / 'body.toml')!r}, '--out', {str(tmp_path / 'out')!r}, '--quiet'])\n"
+        f"main(['run', {str(tmp_path / 'body.toml')!r}, '--out', {str(tmp_path / 'out')!r}, '--no-report', '--quiet']"
+        ")\n"
         "print([name for name in sys.modules if 'reduc' in name and name.startswith(('forward', 'workflows'))])"
     )
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
