@@ -125,3 +125,16 @@ def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **change
 def unloaded_body(material, **changes):
     """The same block without loads."""
     return loaded_body(material, density=0.0, traction=0.0, pressure=0.0, **changes)
+
+
+def cantilever(**changes):
+    """A block that bends a little: its stiffness is symmetric."""
+    blocks = {
+        "formulation": "displacement",
+        "body": {"size": (0.1, 0.02, 0.02), "cells": (3, 1, 1), "cell": "hexahedron"},
+        "material": {"kind": "neo-hookean", "C1": 5e3, "D1": 5e4},
+        "clamp": ("x-min",),
+        "loads": ({"kind": "traction", "on": "x-max", "direction": (0.0, -1.0, 0.0), "size": 60.0},),
+        "outputs": ({"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "y"},),
+    }
+    return Hyperelastic.model_validate(blocks | changes)

@@ -5,30 +5,20 @@ import pytest
 from mpi4py import MPI
 
 from forward.fem.dolfinx import single
-from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, ReferenceSolution, Stability
-from tests.bodies import loaded_body
+from tests.bodies import cantilever, loaded_body
 
 pytestmark = pytest.mark.fem
 
 
-def cantilever(precision="single", **changes):
-    blocks = {
-        "formulation": "displacement",
-        "body": {"size": (0.1, 0.02, 0.02), "cells": (3, 1, 1), "cell": "hexahedron"},
-        "material": {"kind": "neo-hookean", "C1": 5e3, "D1": 5e4},
-        "clamp": ("x-min",),
-        "loads": ({"kind": "traction", "on": "x-max", "direction": (0.0, -1.0, 0.0), "size": 60.0},),
-        "outputs": ({"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "y"},),
-        "solver": {"precision": precision},
-    }
-    return Hyperelastic.model_validate(blocks | changes)
+def single_cantilever(precision="single", **changes):
+    return cantilever(**({"solver": {"precision": precision}} | changes))
 
 
 SPECS = {
-    "definite": cantilever(),
-    "indefinite": cantilever(formulation="mixed"),
-    "not symmetric": loaded_body("mooney-rivlin").model_copy(update={"solver": cantilever().solver}),
+    "definite": single_cantilever(),
+    "indefinite": single_cantilever(formulation="mixed"),
+    "not symmetric": loaded_body("mooney-rivlin").model_copy(update={"solver": single_cantilever().solver}),
 }
 THERE = pytest.mark.skipif(single.library() is None, reason="MUMPS is not there in single precision")
 
@@ -87,7 +77,7 @@ def test_negative_eigenvalues_are_counted_beyond_buckling():
         "loads": ({"kind": "traction", "on": "x-max", "direction": (-1.0, 0.0, 0.0), "size": 1.0},),
         "solver": {"precision": "single", "accept_unstable": True},
     }
-    model = cantilever(**column).build(MPI.COMM_SELF, ("loads.traction.size",))
+    model = single_cantilever(**column).build(MPI.COMM_SELF, ("loads.traction.size",))
     counted = []
     for load in (20.0, 120.0, 900.0):
         equations = model.equations
@@ -105,7 +95,7 @@ def test_negative_eigenvalues_are_counted_beyond_buckling():
 
 def test_what_single_precision_cannot_tell_is_factorised_in_double():
     """A thread, of which a factor in single precision has negative eigenvalues."""
-    thread = cantilever(body={"size": (1.0, 0.02, 0.02), "cells": (40, 1, 1), "cell": "hexahedron"})
+    thread = single_cantilever(body={"size": (1.0, 0.02, 0.02), "cells": (40, 1, 1), "cell": "hexahedron"})
     equations = thread.build(MPI.COMM_SELF, ()).equations
     equations.set_state(np.zeros(equations.size))
     solver = equations.new_factor()
@@ -124,7 +114,7 @@ MEAN, POINTS = np.array([5e3, 60.0]), np.array([[4.5e3, 50.0], [5.5e3, 70.0], [5
 
 def solved(precision, **changes):
     """States, tangents and what was done at points that are predicted from the mean."""
-    model = cantilever(precision, **changes).build(MPI.COMM_SELF, PARAMETERS)
+    model = single_cantilever(precision, **changes).build(MPI.COMM_SELF, PARAMETERS)
     mean = model.solve(MEAN)
     state, slopes = np.array(mean.state), mean.state_tangent(np.eye(2))
     reference = ReferenceSolution(MEAN, state, 0.1 * MEAN)
@@ -161,8 +151,8 @@ def test_where_it_cannot_be_compiled_there_is_no_library(monkeypatch, tmp_path):
 
 
 def test_only_large_factors_are_in_single_precision_of_themselves():
-    small = cantilever("auto")
-    large = cantilever("auto", body={"size": (0.1, 0.1, 0.1), "cells": (12, 12, 12), "cell": "hexahedron"})
+    small = single_cantilever("auto")
+    large = single_cantilever("auto", body={"size": (0.1, 0.1, 0.1), "cells": (12, 12, 12), "cell": "hexahedron"})
     assert (small.single, large.single) == (False, True)
     words = dict(large.described({}))["linear"]
     assert words.endswith("; that of the reference in single precision")

@@ -5,24 +5,10 @@ import pytest
 from mpi4py import MPI
 
 from forward.fem.dolfinx import linear
-from forward.hyperelastic import Hyperelastic
 from forward.model import Stability
-from tests.bodies import loaded_body
+from tests.bodies import cantilever, loaded_body
 
 pytestmark = pytest.mark.fem
-
-
-def cantilever(**changes):
-    """A block that bends a little: its stiffness is symmetric."""
-    blocks = {
-        "formulation": "displacement",
-        "body": {"size": (0.1, 0.02, 0.02), "cells": (3, 1, 1), "cell": "hexahedron"},
-        "material": {"kind": "neo-hookean", "C1": 5e3, "D1": 5e4},
-        "clamp": ("x-min",),
-        "loads": ({"kind": "traction", "on": "x-max", "direction": (0.0, -1.0, 0.0), "size": 60.0},),
-        "outputs": ({"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "y"},),
-    }
-    return Hyperelastic.model_validate(blocks | changes)
 
 
 SPECS = {
