@@ -113,3 +113,12 @@ def test_a_comparison_of_methods_names_the_best(tmp_path):
     results = answer.Results(xr.Dataset(), {"methods": json.loads(json.dumps(rows))}, None)
     card = answer.compared(results)
     assert [one.name for one in card.answers if one.leads] == ["b"]
+
+
+def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():
+    """The truth and the prior are given, so no posterior says how exactly they are known: 450 Pa is not 400 Pa."""
+    posterior = {"mean": 540.0, "std": 120.0, "lower": 282.0, "upper": 719.0}
+    known = {"prior_mean": 500.0, "prior_std": 250.0, "true": 450.0}
+    lines = "\n".join(answer._unknown(xr.Dataset(posterior | known), "material.C1", "Pa").lines).replace("\u00a0", " ")
+    assert "truth 450 Pa, inside" in lines
+    assert "before the data 500 ± 250 Pa" in lines

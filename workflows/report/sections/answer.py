@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import and_error, interval, percent, quantity, size, spoken
+from forward.readable import and_error, interval, percent, precise, quantity, size, spoken
 from forward.words import duration, number
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
@@ -275,12 +275,12 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     narrower = wide / std if std > 0 else np.inf
     lines = [
         f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {size(std, unit, like=mean)}",
-        f"before the data {and_error(before, wide, unit)}: "
+        f"before the data {precise(before, wide, unit)}: "
         + (f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"),
     ]
     if np.isfinite(one["true"]):
         inside = "inside" if lower <= float(one["true"]) <= upper else "outside the interval"
-        lines.append(f"truth {quantity(float(one['true']), std, unit)}, {inside}")
+        lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
         return Answer(spoken(name), quantity(mean, std, unit), lines, *_curve(at, curve, (lower, upper), unit, mean))
