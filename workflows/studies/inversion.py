@@ -34,7 +34,7 @@ from workflows.config.priors import (
 from workflows.config.report import Report
 from workflows.studies.measured import DataFiles, DataSet, digest_of, read_measurement
 from workflows.studies.predictions import has_mesh, meshes_of
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, measures_outputs
 
 if TYPE_CHECKING:
     from forward.model import FloatArray
@@ -160,9 +160,7 @@ class InversionStudy(StudyKind):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> InversionStudy:
         """Check the blocks of an inversion of displacements of a specimen, or of outputs of any model."""
-        model = blocks.get("model")
-        body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
-        if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
+        if measures_outputs(blocks.get("model")):
             other: type[InversionStudy] = named("workflows.studies.output_inversion:OutputInversion")
             return other.model_validate(blocks).with_data(folder)
         return Inversion.model_validate(blocks).with_data(folder)

@@ -46,7 +46,7 @@ class OutputSynthesis(SynthesisStudy):
         As of `SynthesisStudy`.
     """
 
-    model: Annotated[ModelSpec, OfKind(MODELS)]
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
 
     @cached_property
     def spec(self) -> ModelSpec:

@@ -27,7 +27,7 @@ from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, measures_outputs
 
 if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
@@ -250,9 +250,7 @@ class Comparison(StudyKind):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
         """Check the blocks of a comparison on a specimen, on another model, or without one on material points."""
-        model = blocks.get("model")
-        body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
-        if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
+        if measures_outputs(blocks.get("model")):
             other: type[Comparison] = named("workflows.studies.output_selection:OutputSelection")
             return other.made(blocks, folder)
         if "model" in blocks:

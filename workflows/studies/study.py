@@ -27,6 +27,17 @@ SAMPLING = "sampling"  # the kind of study whose methods solve at points
 WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 
 
+def measures_outputs(model: Any) -> bool:
+    """Whether the block of a model is one whose outputs are measured, not the displacements of a specimen.
+
+    A block without a kind that has outputs of its own, and no load cases, is a body.
+    """
+    if not isinstance(model, Mapping):
+        return False
+    body = "outputs" in model and "cases" not in model
+    return bool(model.get("kind", "hyperelastic" if body else "specimen") != "specimen")
+
+
 class Sampled(NamedTuple):
     """A model with random parameters."""
 

@@ -32,7 +32,7 @@ from workflows.config.priors import mistakes_of_priors, ranges
 from workflows.config.report import Report
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration, formulation, times_of
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, measures_outputs
 from workflows.studies.synthetic_surfaces import facets_among, surfaces
 
 if TYPE_CHECKING:
@@ -86,8 +86,7 @@ class SynthesisStudy(StudyKind):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> SynthesisStudy:
         """Check the blocks of a study that measures displacements of a specimen, or outputs of any model."""
-        model = blocks.get("model")
-        if isinstance(model, Mapping) and model.get("kind", "specimen") != "specimen":
+        if measures_outputs(blocks.get("model")):
             other: type[SynthesisStudy] = named("workflows.studies.output_synthesis:OutputSynthesis")
             return other.model_validate(blocks)
         return Synthesis.model_validate(blocks)
