@@ -111,7 +111,8 @@ noise = { relative = 0.03 }
 
 
 def test_tools_that_are_pressed_from_afar_cost_more_than_a_step_further(tmp_path):
-    (tmp_path / "once.toml").write_text(CONTACT.replace('kind = "KIND"\n', "").replace("DEPTH", "1e-3"))  # a body has outputs
+    """One study names no kind: it has outputs and no load cases, so it is a body."""
+    (tmp_path / "once.toml").write_text(CONTACT.replace('kind = "KIND"\n', "").replace("DEPTH", "1e-3"))
     (tmp_path / "steps.toml").write_text(CONTACT.replace("KIND", "path").replace("DEPTH", "[0.5e-3, 1e-3]"))
     once, steps = (load(tmp_path / f"{name}.toml").spec.cost() for name in ("once", "steps"))
     assert once.contact
