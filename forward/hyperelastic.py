@@ -1,28 +1,25 @@
-"""The specification of a hyperelastic body: geometry, material, loads, outputs and solver; no FEniCSx until built.
+"""The specification of a hyperelastic body under loads; no FEniCSx until built.
 
-It is long because it holds one whole block of a study: all numbers, mistakes and findings that need the complete body.
+What the body consists of is in `forward.solid`, what holds it in `forward.terms.support`.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-import numpy as np
-from annotated_types import Ge, Gt, Le
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward import adapt as adaptive
 from forward.adapt import Adapt
-from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_points, unit_vector
-from forward.bodies.inclusions import Inclusion
+from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
+from forward.bodies.inclusions import too_narrow
 from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
-from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
 from forward.fem.cost import (
     SINGLE_FROM,
@@ -35,85 +32,27 @@ from forward.fem.cost import (
     sum_of,
     times,
 )
-from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.materials.admissible import Materials, moduli
-from forward.materials.block import Material
-from forward.materials.material import MATERIALS, constants, splits
+from forward.fem.locking import Ranges
+from forward.materials.material import splits
 from forward.model import Finding, FloatArray, ModelError
 from forward.observables.observable import Output
-from forward.readable import told
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
-from forward.settings import Settings, nearest, shown
+from forward.settings import nearest, shown
+from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
-from forward.spec import UNREFINED, ModelSpec
-from forward.terms.displacement import Displacement
+from forward.spec import UNREFINED
+from forward.terms.displacement import Displacement, too_far
 from forward.terms.steps import Block, lists
+from forward.terms.support import Support
 from forward.terms.term import Load
 
-CONTRAST = "contrast"
 INCREMENTS = 10  # of a load with friction
 IN_WORDS = {  # what linear systems are solved with
     Linear.FACTOR: "factors of the stiffness",
     Linear.BOTH: "multigrid; a factor of the stiffness for the reference only",
     Linear.MULTIGRID: "multigrid, without a factor of the stiffness",
 }
-
-
-class RegionNumbers(Settings):
-    """What a region may have besides material constants.
-
-    Parameters
-    ----------
-    contrast
-        Factor (1) on the stiffness that follows from its constants.
-    """
-
-    contrast: Annotated[float, Gt(0)]
-
-
-def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]:
-    """Find inclusions whose transition is below the size of a cell."""
-    edge = body.longest_edge
-    for inclusion in inclusions:
-        if inclusion.width < edge:
-            wide, cell = told(inclusion.width, "m", 6), told(edge, "m", 3)
-            text = (
-                f"inclusions.{inclusion.label}.width = {wide} is below a cell ({cell}): few "
-                "quadrature points see the transition, and derivatives by place and size are rough."
-            )
-            yield Finding("warning", text)
-
-
-def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
-    """Find prescribed displacements, among numbers and their ranges by path, that are larger than the body."""
-    extent = max(high - low for low, high in body.bounds)
-    for path, ends in ranges.items():
-        largest = max(ends, key=abs)
-        if path.startswith("displacements.") and abs(largest) > extent:
-            far, long = told(largest, "m", 3), told(extent, "m", 3)
-            text = (
-                f"{path} reaches {far}, more than the length of the body, {long}: is it given in "
-                "another unit than metres?"
-            )
-            yield Finding("warning", text)
-
-
-def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], parameters: Collection[str]) -> Materials:
-    """Return the materials of a body and of its regions as functions of some of its numbers, by their paths."""
-    energy = str(getattr(material, "kind"))  # noqa: B009 - every material has a kind
-
-    def own(place: str, values: Mapping[str, float]) -> dict[str, float | str]:
-        paths = {name: f"{place}.{name}" for name in values}
-        return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
-
-    names = constants(energy)
-    shared = own("material", {name: getattr(material, name) for name in names})
-    found = {"material": shared}
-    for region, numbers in regions.items():
-        place = f"regions.{region}"
-        found[place] = shared | own(place, {name: value for name, value in numbers.items() if name in names})
-    return Materials(energy, found)
 
 
 def _without_lists(block: Block, given: Any) -> Any:
@@ -125,7 +64,7 @@ def _without_lists(block: Block, given: Any) -> Any:
     return given
 
 
-class Hyperelastic(ModelSpec):
+class Hyperelastic(Solid):
     """A hyperelastic body under loads, solved by finite elements.
 
     Parameters
@@ -141,6 +80,12 @@ class Hyperelastic(ModelSpec):
         Balls that are stiffer or softer: their factors multiply the energy density.
     fields
         Random fields that multiply the stiffness or the density.
+    solver
+        Path, tolerance and limits of the solver; a word stands for its kind, `solver = "newton"`.
+    formulation
+        Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
+        and a material with a constant D1 or a stated volumetric part). "auto" is mixed where that is possible and κ/μ
+        may be above 3: for some values of the inputs in a study, otherwise for the constants as given.
     clamp
         Boundaries that do not move.
     displacements
@@ -150,12 +95,6 @@ class Hyperelastic(ModelSpec):
         Gravity, tractions and pressures.
     outputs
         What is computed from the deformed body.
-    solver
-        Path, tolerance and limits of the solver; a word stands for its kind, `solver = "newton"`.
-    formulation
-        Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
-        and a material with a constant D1 or a stated volumetric part). "auto" is mixed where that is possible and κ/μ
-        may be above 3: for some values of the inputs in a study, otherwise for the constants as given.
     adapt
         Whether the mesh is refined first, and until when; tetrahedra only, in studies that sample.
     stresses
@@ -166,24 +105,12 @@ class Hyperelastic(ModelSpec):
     iterative: ClassVar[bool] = True
     shareable: ClassVar[bool] = True
     kind: Literal["hyperelastic"] = "hyperelastic"
-    formulation: Formulation = "auto"
-    body: Body
-    material: Material
-    regions: dict[str, dict[str, float]] = Field(default={})
-    inclusions: tuple[Inclusion, ...] = ()
-    fields: tuple[RandomField, ...] = ()
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
     outputs: tuple[Output, ...] = Field(min_length=1)
-    solver: SolverSettings = SolverSettings()
     adapt: Adapt | None = None
     stresses: bool = False
-
-    @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
-    @classmethod
-    def _kind_alone(cls, given: Any) -> Any:
-        return {"kind": given} if isinstance(given, str) else given
 
     @field_validator("loads", mode="before")
     @classmethod
@@ -198,23 +125,7 @@ class Hyperelastic(ModelSpec):
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
-        found = {}
-        for name in constants(self.energy):
-            found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
-        for region, numbers in self.regions.items():
-            for name, value in numbers.items():
-                block = RegionNumbers if name == CONTRAST else type(self.material)
-                if name in block.model_fields:
-                    found[f"regions.{region}.{name}"] = Scalar(value, block, name)
-        for inclusion in self.inclusions:
-            for name in type(inclusion).model_fields:
-                if name not in {"kind", "name"}:
-                    within: tuple[Any, ...] = ()
-                    if name in AXES:  # the centre stays in the body
-                        low, high = self.body.bounds[AXES.index(name)]
-                        within = Ge(low), Le(high)
-                    value = getattr(inclusion, name)
-                    found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
+        found = self.own_scalars
         for load in self.loads:
             for name, scalar in load.scalars.items():
                 found[f"loads.{load.label}.{name}"] = scalar
@@ -222,20 +133,6 @@ class Hyperelastic(ModelSpec):
             for axis, value in displacement.components.items():
                 found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
         return found
-
-    def materials(self, parameters: Collection[str] = ()) -> Materials:
-        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
-        return materials(self.material, self.regions, parameters)
-
-    @property
-    def coefficients(self) -> tuple[str, ...]:
-        """Paths of the coefficients of the random fields, which can be parameters too."""
-        return tuple(path for field in self.fields for path in field.paths(self.body))
-
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns: displacements and, in the mixed form, pressures."""
-        return 3 * self.body.nodes + (self.body.vertex_count if self.mixed else 0)
 
     @property
     def symmetric(self) -> bool:
@@ -291,54 +188,10 @@ class Hyperelastic(ModelSpec):
         stated = [getattr(load, "increments", None) or -(-INCREMENTS // steps) for load in self.loads if load.contact]
         return steps * max(stated, default=1) if self.frictional else 1
 
-    @property
-    def contact_modulus(self) -> float:
-        """E/(1 − ν²) (Pa) of the stiffest material of the body, with the constants as they are stated."""
-        largest = 0.0
-        for place, values in self.materials().constants.items():
-            shear, bulk = moduli(self.energy, values)
-            contrast = self.regions.get(place.removeprefix("regions."), {}).get(CONTRAST, 1.0)
-            share = 1.0 if np.isinf(bulk) else (3 * bulk + shear) / (3 * bulk + 4 * shear)
-            largest = max(largest, float(contrast * 4 * shear * share))
-        return largest
-
-    @property
-    def mixed(self) -> bool:
-        """Whether pressures are unknowns too."""
-        return self.decision({}).mixed
-
-    def decision(self, ranges: Ranges) -> Decision:
-        """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
-        return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
-
-    def over(self, ranges: Ranges) -> Self:
-        """Return the same body with the formulation that suits all values of parameters within ranges."""
-        return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
-
-    def locking(self, ranges: Ranges) -> Iterator[Finding]:
-        """Find where displacements alone are too stiff for values of parameters within ranges."""
-        yield from of_locking(self.decision(ranges), self.body.cell, self.body.degree, self.materials(ranges))
-
     def unlocked(self) -> Self:
         """Return the same body on the same mesh in the form that locks least."""
         body = self.body.model_copy(update={"degree": 2, "quadrature_degree": None})
-        return self.model_copy(update={"body": body, "formulation": "mixed" if self._splits else "displacement"})
-
-    @property
-    def _splits(self) -> bool:
-        """Whether the energy is the sum of an isochoric and a purely volumetric part."""
-        return splits(self.energy)
-
-    @property
-    def energy(self) -> str:
-        """Kind of the material."""
-        return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
-
-    @property
-    def fibres(self) -> tuple[Vector, ...]:
-        """Unit vectors along the families of fibres in the undeformed body."""
-        given = getattr(self.material, "fibres", ())
-        return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
+        return self.model_copy(update={"body": body, "formulation": "mixed" if splits(self.energy) else "displacement"})
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -460,13 +313,6 @@ class Hyperelastic(ModelSpec):
         body = MeshFile.model_validate({"file": file, "contents": contents, **elements})
         adapt = None if self.adapt is None else self.adapt.model_copy(update={"refined": True})
         return self.model_copy(update={"body": body, "adapt": adapt})
-
-    def mistakes_of_samples(self) -> Iterator[Mistake]:
-        """Find random fields whose coefficients cannot be drawn."""
-        for i, field in enumerate(self.fields):
-            if field.basis == "nodes":
-                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
-                yield ("model", "fields", i, "basis"), message, field.basis
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Findings before anything is solved, for values of parameters within ranges, by their paths."""
@@ -610,49 +456,18 @@ class Hyperelastic(ModelSpec):
             for name, count in names.items():
                 if count > 1:
                     yield (block,), f"{count} of them are called '{name}', expected different names", name
-        for i, inclusion in enumerate(self.inclusions):
-            centre = (inclusion.x, inclusion.y, inclusion.z)
-            if not self.body.contains(centre):
-                message = f"its centre lies outside the body, which lies in {self._bounds}"
-                yield ("inclusions", i), message, list(centre)
-        yield from self._mistakes_of_materials()
-        yield from self._mistakes_of_fields()
+        yield from self.own_mistakes()
+        for i, field in enumerate(self.fields):
+            if field.of == "density" and not any(load.of_density for load in self.loads):
+                yield ("fields", i, "of"), "no load is gravity, expected one where the density varies", field.of
         yield from self._mistakes_of_outputs()
-        yield from self._mistakes_of_formulation()
         yield from self._mistakes_of_linear_solver()
-        yield from self._contradictions()
+        support = Support(self.body, self.clamp, self.displacements, self.loads)
+        yield from support.contradictions()
         yield from adaptive.mistakes(self)
         if self.adapt is not None and self.frictional:
             yield ("adapt",), "errors of the mesh are not estimated with friction, expected friction = 0", True
-        yield from self._mistakes_of_support(any_unknown=bool(unknown))
-
-    def _mistakes_of_support(self, *, any_unknown: bool) -> Iterator[Mistake]:
-        """Loads that cannot act on the body, and a body that can move freely."""
-        moved = any(value for item in self.displacements for value in item.components.values())
-        alone = not moved and len(self.loads) == 1
-        for i, load in enumerate(self.loads):
-            if getattr(load, "on", "") in self.body.boundaries:
-                for field, said, given in load.mistakes(self.body, alone=alone):
-                    yield ("loads", i, field), said, given
-                if load.contact and not self._gives_way(load):
-                    message = "this boundary is held where the tool presses on it, expected one that can move"
-                    yield ("loads", i, "on"), message, getattr(load, "on", "")
-        if free := self._free:
-            message = f"nothing holds the body along {', '.join(free)}, expected a clamp or prescribed displacements"
-            yield ("clamp",), message, ()
-        elif not any_unknown and not self._held_against_turning():
-            message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
-            yield ("displacements",), message, ()
-
-    def _gives_way(self, tool: Any) -> bool:
-        """Whether the boundary that a tool may touch can move along its direction."""
-        held = {axis for item in self.displacements if item.on == tool.on for axis in item.components}
-        free = [d for d, axis in zip(unit_vector(tool.direction), "xyz", strict=True) if axis not in held]
-        return tool.on not in self.clamp and any(free)
-
-    @property
-    def _bounds(self) -> str:
-        return " × ".join(f"[{low:g}, {high:g}]" for low, high in self.body.bounds) + " m"
+        yield from support.mistakes(complete=not unknown)
 
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
         held = set(self.clamp) | {item.on for item in self.displacements}
@@ -668,46 +483,7 @@ class Hyperelastic(ModelSpec):
             if output.of_held and on in self.body.boundaries and on not in held:
                 yield ("outputs", i, "on"), "nothing holds this boundary, expected one that is clamped or moved", on
             if at is not None and not holds(self.body, at):
-                yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(at)
-
-    def _mistakes_of_materials(self) -> Iterator[Mistake]:
-        wrong = list(self._mistakes_of_regions())
-        yield from wrong
-        if not wrong:
-            for where, objection in self.materials().objections({}):
-                yield tuple(where.split(".", 1)), objection, {}
-
-    def _mistakes_of_regions(self) -> Iterator[Mistake]:
-        known = (*(name for name in type(self.material).model_fields if name != "kind"), CONTRAST)
-        for region, numbers in self.regions.items():
-            if region not in self.body.regions:
-                hint = nearest(region, self.body.regions) if self.body.regions else "this body has none"
-                yield ("regions", region), f"unknown region; {hint}", numbers
-            for name, value in numbers.items():
-                if name not in known:
-                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
-                    yield ("regions", region, name), message, value
-                    continue
-                objection = self.scalars[f"regions.{region}.{name}"].objection(value)
-                if objection is not None:
-                    yield ("regions", region, name), objection, value
-
-    def _mistakes_of_fields(self) -> Iterator[Mistake]:
-        for i, field in enumerate(self.fields):
-            if field.of == "density" and not any(load.of_density for load in self.loads):
-                yield ("fields", i, "of"), "no load is gravity, expected one where the density varies", field.of
-            if field.modes is not None and field.modes > self.body.vertex_count:
-                message = f"more modes than the mesh has vertices, expected at most {self.body.vertex_count}"
-                yield ("fields", i, "modes"), message, field.modes
-
-    def _mistakes_of_formulation(self) -> Iterator[Mistake]:
-        if self.formulation == "mixed" and not self._splits:
-            split = ", ".join(name for name in MATERIALS if splits(name))
-            message = f"the energy '{self.energy}' has no part of the volume alone; a mixed form has: {split}"
-            yield ("formulation",), message, self.formulation
-        if self.formulation == "mixed" and self.body.degree < 2:
-            message = "a mixed form on cells of degree 1 is not stable, expected body.degree = 2"
-            yield ("formulation",), message, self.formulation
+                yield ("outputs", i, "at"), f"outside the body, which lies in {extent(self.body)}", list(at)
 
     def _mistakes_of_linear_solver(self) -> Iterator[Mistake]:
         asked = self.solver.linear
@@ -724,48 +500,3 @@ class Hyperelastic(ModelSpec):
             objection = "the textbook solver has a factor for every step"
         if objection:
             yield ("solver", "linear"), f"{objection}; expected 'factor' or 'auto'", asked
-
-    def _contradictions(self) -> Iterator[Mistake]:
-        """Boundaries that are both clamped and moved, and components that are prescribed twice."""
-        times = Counter((item.on, axis) for item in self.displacements for axis in item.components)
-        for i, item in enumerate(self.displacements):
-            twice = [axis for axis in item.components if times[item.on, axis] > 1]
-            if item.on in self.clamp:
-                yield ("displacements", i, "on"), "this boundary is clamped, expected one that is not", item.on
-            elif twice:
-                message = f"{', '.join(twice)} prescribed more than once on this boundary"
-                yield ("displacements", i, "on"), message, item.on
-
-    @property
-    def _touched(self) -> list[tuple[Vector, Vector]]:
-        """Points (m) of the body and the directions in which tools hold them against what presses them there."""
-        on_body = [load for load in self.loads if getattr(load, "on", "") in self.body.boundaries]
-        found = [one for load in on_body for one in load.holds(self.body)]
-        pressed = any(not load.contact for load in self.loads)
-        return [one for one in found if pressed or any(np.dot(one[1], other) < 0 for _, other in found)]
-
-    @property
-    def _prescribed(self) -> list[tuple[str, Axis]]:
-        """Boundaries with the axes along which they are held or moved."""
-        moved = [(item.on, axis) for item in self.displacements for axis in item.components]
-        return [(on, axis) for on in self.clamp for axis in AXES] + moved
-
-    @property
-    def _free(self) -> list[str]:
-        """Axes along which nothing holds the body."""
-        units = dict(zip(AXES, np.eye(3), strict=True))
-        held = [np.zeros(3), *(units[axis] for _, axis in self._prescribed), *(along for _, along in self._touched)]
-        rank = np.linalg.matrix_rank(held)
-        return [axis for axis in AXES if np.linalg.matrix_rank([*held, units[axis]]) > rank]
-
-    def _held_against_turning(self) -> bool:
-        """Whether each of the 6 small rigid motions t + r × x moves something that is held."""
-        extent = np.ptp(self.body.vertices, axis=0).max()
-        middle = np.mean(self.body.vertices, axis=0)
-        units = np.eye(3)
-        held = [(p, units[AXES.index(axis)]) for on, axis in self._prescribed for p in self.body.corners_of(on)]
-        rows = [  # the part of t + r × x along a direction e: t·e + r·(x × e)
-            np.concatenate([direction, np.cross(np.subtract(place, middle), direction) / extent])
-            for place, direction in [*held, *self._touched]
-        ]
-        return int(np.linalg.matrix_rank(rows)) == 6

@@ -16,11 +16,12 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from forward.fem.cost import Estimate, Times, sum_of
-from forward.hyperelastic import Hyperelastic, too_far
+from forward.hyperelastic import Hyperelastic
 from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
+from forward.terms.displacement import too_far
 from forward.terms.steps import Block, label, lists
 from forward.words import with_unit
 

@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Iterator
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.bodies.geometry import AXES, Body, Vector, holds
-from forward.bodies.inclusions import Inclusion
-from forward.bodies.random_fields import RandomField
+from forward.bodies.geometry import AXES, Vector, holds
 from forward.fem.affordable import own_estimate
 from forward.fem.cost import Estimate, Times, sum_of
-from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.hyperelastic import Hyperelastic, materials
-from forward.materials.admissible import Materials
-from forward.materials.block import Material
-from forward.materials.material import splits
+from forward.fem.locking import Ranges
+from forward.hyperelastic import Hyperelastic
 from forward.model import Finding, ModelError
 from forward.observables.displacement import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
-from forward.solvers.settings import SolverSettings
-from forward.spec import ModelSpec
+from forward.solid import Solid
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
@@ -103,7 +97,7 @@ class _Loaded(Hyperelastic):
                 yield ("loads", i, "friction"), message, getattr(load, "friction", None)
 
 
-class Specimen(ModelSpec):
+class Specimen(Solid):
     """A body that is tested in several load cases.
 
     Parameters
@@ -118,20 +112,8 @@ class Specimen(ModelSpec):
 
     shareable: ClassVar[bool] = True
     kind: Literal["specimen"] = "specimen"
-    body: Body
-    material: Material
-    regions: dict[str, dict[str, float]] = Field(default={})
-    inclusions: tuple[Inclusion, ...] = ()
-    fields: tuple[RandomField, ...] = ()
-    solver: SolverSettings = SolverSettings()
-    formulation: Formulation = "auto"
     cases: tuple[LoadCase, ...] = Field(min_length=1)
     observed: tuple[Observed, ...] = ()
-
-    @field_validator("solver", mode="before")
-    @classmethod
-    def _kind_alone(cls, given: Any) -> Any:
-        return {"kind": given} if isinstance(given, str) else given
 
     def loaded(self, case: LoadCase) -> Hyperelastic:
         """Return the body in one load case."""
@@ -156,37 +138,6 @@ class Specimen(ModelSpec):
             found |= self.loaded(case).scalars
         return found
 
-    def materials(self, parameters: Collection[str] = ()) -> Materials:
-        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
-        return materials(self.material, self.regions, parameters)
-
-    def decision(self, ranges: Ranges) -> Decision:
-        """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
-        return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
-
-    @property
-    def mixable(self) -> bool:
-        """Whether it can have pressures as unknowns."""
-        return self.body.degree > 1 and splits(self.loaded(self.cases[0]).energy)
-
-    def over(self, ranges: Ranges) -> Self:
-        """Return the same specimen with the formulation that suits all values of parameters within ranges."""
-        return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
-
-    def locking(self, ranges: Ranges) -> Iterator[Finding]:
-        """Find where displacements alone are too stiff for values of parameters within ranges."""
-        yield from of_locking(self.decision(ranges), self.body.cell, self.body.degree, self.materials(ranges))
-
-    @property
-    def coefficients(self) -> tuple[str, ...]:
-        """Paths of the coefficients of the random fields, which can be parameters too."""
-        return tuple(path for field in self.fields for path in field.paths(self.body))
-
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns of each load case."""
-        return self.loaded(self.cases[0]).unknowns
-
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the load cases before anything is solved, each once."""
@@ -201,7 +152,7 @@ class Specimen(ModelSpec):
         else:
             if not outputs:
                 yield ("model", "observed"), "nothing is observed, expected points", ()
-        yield from self.loaded(self.cases[0]).mistakes_of_samples()
+        yield from super().mistakes_of_samples()
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Findings before anything is solved, for values of parameters within ranges, by their paths."""

@@ -448,6 +448,11 @@ def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...
     return (Finding("note", text),)
 
 
+def extent(body: Body) -> str:
+    """Say in which box a body lies."""
+    return " × ".join(f"[{low:g}, {high:g}]" for low, high in body.bounds) + " m"
+
+
 def holds(body: Body, point: Vector) -> bool:
     """Whether a point (m) lies in the undeformed body, or no farther outside than `tolerance`.
 

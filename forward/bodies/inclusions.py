@@ -7,7 +7,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
@@ -15,8 +15,9 @@ import numpy as np
 from annotated_types import Gt, Unit
 from pydantic import BeforeValidator, Field
 
-from forward.bodies.geometry import Length
-from forward.model import FloatArray
+from forward.bodies.geometry import Body, Length
+from forward.model import Finding, FloatArray
+from forward.readable import told
 from forward.settings import Named
 
 TINY = 1e-12  # of the squared radius: keeps distances from the centre, and angles, differentiable at zero
@@ -139,6 +140,19 @@ OPS = SimpleNamespace(ln=np.log, exp=np.exp, sqrt=np.sqrt, tanh=np.tanh, sin=np.
 def stiffness_factor(ops: Any, X: Any, kind: str, *, contrast: Any, **shape: Any) -> Any:
     """contrast^s at X, with s the indicator of a kind of inclusion; `shape` holds the numbers of its block."""
     return ops.exp(INDICATORS[kind](ops, X, **shape) * ops.ln(contrast))
+
+
+def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]:
+    """Find inclusions whose transition is below the size of a cell."""
+    edge = body.longest_edge
+    for inclusion in inclusions:
+        if inclusion.width < edge:
+            wide, cell = told(inclusion.width, "m", 6), told(edge, "m", 3)
+            text = (
+                f"inclusions.{inclusion.label}.width = {wide} is below a cell ({cell}): few "
+                "quadrature points see the transition, and derivatives by place and size are rough."
+            )
+            yield Finding("warning", text)
 
 
 # --- what follows from the numbers -----------------------------------------------------------------------------------

@@ -16,9 +16,10 @@ from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
-from forward.hyperelastic import CONTRAST, Hyperelastic
+from forward.hyperelastic import Hyperelastic
 from forward.materials.material import energy_of, isochoric
 from forward.model import FloatArray
+from forward.solid import CONTRAST
 from forward.terms import tools
 from forward.terms.term import Place, Since, Term
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 from annotated_types import Unit
 from pydantic import model_validator
 
-from forward.bodies.geometry import AXES, Axis
+from forward.bodies.geometry import AXES, Axis, Body
+from forward.model import Finding
+from forward.readable import told
 from forward.settings import Named
 
 
@@ -36,3 +39,17 @@ class Displacement(Named):
             message = "prescribes nothing, expected at least one of x, y, z"
             raise ValueError(message)
         return self
+
+
+def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+    """Find prescribed displacements, among numbers and their ranges by path, that are larger than the body."""
+    extent = max(high - low for low, high in body.bounds)
+    for path, ends in ranges.items():
+        largest = max(ends, key=abs)
+        if path.startswith("displacements.") and abs(largest) > extent:
+            far, long = told(largest, "m", 3), told(extent, "m", 3)
+            text = (
+                f"{path} reaches {far}, more than the length of the body, {long}: is it given in "
+                "another unit than metres?"
+            )
+            yield Finding("warning", text)

@@ -1,0 +1,195 @@
+"""What a body consists of, whatever acts on it: geometry and mesh, materials, inclusions, random fields, unknowns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from typing import Annotated, Any, Self
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from pydantic import Field, field_validator
+
+from forward.bodies.geometry import AXES, Body, Vector, extent
+from forward.bodies.inclusions import Inclusion
+from forward.bodies.random_fields import RandomField
+from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.materials.admissible import Materials, moduli
+from forward.materials.block import Material
+from forward.materials.material import MATERIALS, constants, splits
+from forward.model import Finding
+from forward.scalars import Mistake, Scalar
+from forward.settings import Settings, nearest
+from forward.solvers.settings import SolverSettings
+from forward.spec import ModelSpec
+
+CONTRAST = "contrast"
+
+
+class RegionNumbers(Settings):
+    """What a region may have besides material constants.
+
+    Parameters
+    ----------
+    contrast
+        Factor (1) on the stiffness that follows from its constants.
+    """
+
+    contrast: Annotated[float, Gt(0)]
+
+
+class Solid(ModelSpec):
+    """A body of a hyperelastic material: the part of a specification that knows neither supports nor loads.
+
+    What its fields mean is said in `forward.hyperelastic.Hyperelastic`, from which the reference of settings is made.
+    """
+
+    formulation: Formulation = "auto"
+    body: Body
+    material: Material
+    regions: dict[str, dict[str, float]] = Field(default={})
+    inclusions: tuple[Inclusion, ...] = ()
+    fields: tuple[RandomField, ...] = ()
+    solver: SolverSettings = SolverSettings()
+
+    @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
+    @classmethod
+    def _kind_alone(cls, given: Any) -> Any:
+        return {"kind": given} if isinstance(given, str) else given
+
+    @property
+    def own_scalars(self) -> dict[str, Scalar]:
+        """Numbers of the material, of regions and of inclusions that can be made parameters, by their paths."""
+        found = {}
+        for name in constants(self.energy):
+            found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for region, numbers in self.regions.items():
+            for name, value in numbers.items():
+                block = RegionNumbers if name == CONTRAST else type(self.material)
+                if name in block.model_fields:
+                    found[f"regions.{region}.{name}"] = Scalar(value, block, name)
+        for inclusion in self.inclusions:
+            for name in type(inclusion).model_fields:
+                if name not in {"kind", "name"}:
+                    within: tuple[Any, ...] = ()
+                    if name in AXES:  # the centre stays in the body
+                        low, high = self.body.bounds[AXES.index(name)]
+                        within = Ge(low), Le(high)
+                    value = getattr(inclusion, name)
+                    found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
+        return found
+
+    @property
+    def energy(self) -> str:
+        """Kind of the material."""
+        return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Unit vectors along the families of fibres in the undeformed body."""
+        given = getattr(self.material, "fibres", ())
+        return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials:
+        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
+
+        def own(place: str, values: Mapping[str, float]) -> dict[str, float | str]:
+            paths = {name: f"{place}.{name}" for name in values}
+            return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
+
+        names = constants(self.energy)
+        shared = own("material", {name: getattr(self.material, name) for name in names})
+        found = {"material": shared}
+        for region, numbers in self.regions.items():
+            place = f"regions.{region}"
+            found[place] = shared | own(place, {name: value for name, value in numbers.items() if name in names})
+        return Materials(self.energy, found)
+
+    @property
+    def contact_modulus(self) -> float:
+        """E/(1 − ν²) (Pa) of the stiffest material of the body, with the constants as they are stated."""
+        largest = 0.0
+        for place, values in self.materials().constants.items():
+            shear, bulk = moduli(self.energy, values)
+            contrast = self.regions.get(place.removeprefix("regions."), {}).get(CONTRAST, 1.0)
+            share = 1.0 if np.isinf(bulk) else (3 * bulk + shear) / (3 * bulk + 4 * shear)
+            largest = max(largest, float(contrast * 4 * shear * share))
+        return largest
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Paths of the coefficients of the random fields, which can be parameters too."""
+        return tuple(path for field in self.fields for path in field.paths(self.body))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns: displacements and, in the mixed form, pressures."""
+        return 3 * self.body.nodes + (self.body.vertex_count if self.mixed else 0)
+
+    @property
+    def mixed(self) -> bool:
+        """Whether pressures are unknowns too."""
+        return self.decision({}).mixed
+
+    @property
+    def mixable(self) -> bool:
+        """Whether they can be."""
+        return self.body.degree > 1 and splits(self.energy)
+
+    def decision(self, ranges: Ranges) -> Decision:
+        """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
+        return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
+
+    def over(self, ranges: Ranges) -> Self:
+        """Return the same body with the formulation that suits all values of parameters within ranges."""
+        return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
+
+    def locking(self, ranges: Ranges) -> Iterator[Finding]:
+        """Find where displacements alone are too stiff for values of parameters within ranges."""
+        yield from of_locking(self.decision(ranges), self.body.cell, self.body.degree, self.materials(ranges))
+
+    def mistakes_of_samples(self) -> Iterator[Mistake]:
+        """Find random fields whose coefficients cannot be drawn."""
+        for i, field in enumerate(self.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+
+    def own_mistakes(self) -> Iterator[Mistake]:
+        """Find what no single block can see: inclusions outside, unknown regions, no material, a form that is not."""
+        for i, inclusion in enumerate(self.inclusions):
+            centre = (inclusion.x, inclusion.y, inclusion.z)
+            if not self.body.contains(centre):
+                message = f"its centre lies outside the body, which lies in {extent(self.body)}"
+                yield ("inclusions", i), message, list(centre)
+        of_regions = list(self._mistakes_of_regions())
+        yield from of_regions
+        if not of_regions:
+            for where, objection in self.materials().objections({}):
+                yield tuple(where.split(".", 1)), objection, {}
+        for i, field in enumerate(self.fields):
+            if field.modes is not None and field.modes > self.body.vertex_count:
+                message = f"more modes than the mesh has vertices, expected at most {self.body.vertex_count}"
+                yield ("fields", i, "modes"), message, field.modes
+        if self.formulation == "mixed" and not splits(self.energy):
+            split = ", ".join(name for name in MATERIALS if splits(name))
+            message = f"the energy '{self.energy}' has no part of the volume alone; a mixed form has: {split}"
+            yield ("formulation",), message, self.formulation
+        if self.formulation == "mixed" and self.body.degree < 2:
+            message = "a mixed form on cells of degree 1 is not stable, expected body.degree = 2"
+            yield ("formulation",), message, self.formulation
+
+    def _mistakes_of_regions(self) -> Iterator[Mistake]:
+        known = (*(name for name in type(self.material).model_fields if name != "kind"), CONTRAST)
+        for region, numbers in self.regions.items():
+            if region not in self.body.regions:
+                hint = nearest(region, self.body.regions) if self.body.regions else "this body has none"
+                yield ("regions", region), f"unknown region; {hint}", numbers
+            for name, value in numbers.items():
+                if name not in known:
+                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
+                    yield ("regions", region, name), message, value
+                    continue
+                objection = self.own_scalars[f"regions.{region}.{name}"].objection(value)
+                if objection is not None:
+                    yield ("regions", region, name), objection, value
