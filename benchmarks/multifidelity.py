@@ -13,10 +13,11 @@ from mpi4py import MPI
 from benchmarks.beams import CONFIG
 from benchmarks.coverage import Case, Vectorised
 from forward.model import FloatArray
+from uq.estimators.scores import gains
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
-from uq.methods.compare import Compare, gains
+from uq.methods.compare import Compare
 from uq.methods.multifidelity import Multifidelity
 from workflows.config.study import load
 

@@ -24,7 +24,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from uq.methods.compare import gains
+from uq.estimators.scores import gains
 from workflows.config.study import parse
 from workflows.report import plots
 from workflows.results.directory import read_dataset

@@ -6,31 +6,30 @@ share of repeats whose claimed 95 % interval holds e* says whether its claims ar
 (s/RMSE)² samples for the same error, where s² is the variance of one sample: σ² of the output for the mean.
 
 Points that several methods or budgets ask for are solved once, and charged to each as if it had solved them itself.
-
-Sharing points, charging costs and judging claims all refer to the same runs, hence one file.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
 
-from forward.model import Finding, FloatArray, Severity, SolveError
+from forward.model import Finding, FloatArray, Severity
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
-from uq.estimators.moments import ESTIMATES, half_width, ratio
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, OfEvaluate, Recorder, Request, merge
-from uq.findings import add, findings
+from uq.estimators.moments import ESTIMATES
+from uq.estimators.scores import rate, score
+from uq.evaluation.evaluate import OWN, Evaluate, Request
+from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.chaos import Chaos
 from uq.methods.method import SAMPLING, Method
 from uq.methods.stopping import Amount
+from uq.methods.trials import Memory, Trial, trial_of
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
@@ -45,9 +44,7 @@ _ALONE = {kind: where for kind, where in SAMPLING.items() if kind != "multifidel
 REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **_ALONE}, Method)
 ESTIMATED = ("mean", "std")
 TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # results that a restart does not reproduce
-RESOLVED = 2.0  # an error counts as measured if it is this many times the reference's own
 ROUNDING = 16 * np.finfo(float).eps  # smallest relative error assumed for a reference
-UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
 TIGHT, TEXTBOOK, REFINED = "tight", "textbook", "refined"  # names of the models beside the study's own
 TIGHTER = 1e-3  # tolerances of the solver that makes the reference, relative to those of the study
 # Severity of a finding of a comparison, and those of the methods' own that it repeats.
@@ -315,16 +312,16 @@ class Compare(Method):
         objection = self.objection(inputs)
         if objection is not None:
             raise ValueError(objection)
-        memory = _Memory(evaluate)
+        memory = Memory(evaluate)
         centre = linearise(inputs, memory)
         floors = self._floors(inputs, evaluate, memory, centre)
         reference = self._find_reference(inputs, evaluate)
         rows = [(entry, budget) for entry in self.methods for budget in sorted(entry.budgets)]
-        trials: list[list[_Trial]] = [[] for _ in rows]
+        trials: list[list[Trial]] = [[] for _ in rows]
         for r in range(self.repeats):
             # The largest budget first: its one request includes the points of the others.
             for i, (entry, budget) in reversed(list(enumerate(rows))):
-                trials[i].append(_try(entry.at(budget, _seed(self.seed, r)), inputs, memory))
+                trials[i].append(trial_of(entry.at(budget, _seed(self.seed, r)), inputs, memory))
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
         dataset = dataset.assign(_compared(rows, trials, reference, floors))
         names = list(dict.fromkeys(dataset["row_method"].to_numpy().tolist()))
@@ -376,53 +373,7 @@ def _seed(seed: int, repeat: int) -> int:
     return int(np.random.SeedSequence([seed, repeat]).generate_state(1)[0])
 
 
-# --- one run of a method ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """The results of one run of a method, and its cost.
-
-    Attributes
-    ----------
-    estimates
-        `ESTIMATES` by output (m,); NaN where there are none.
-    half_width
-        Standard errors on either side of a claimed 95 % interval.
-    solves
-        Number of points that were requested.
-    seconds, own_seconds
-        Processor time (s) of their solves, and of everything else that the method did.
-    reason
-        Why there is no estimate.
-    doubts
-        The method's findings about its own numbers.
-    """
-
-    estimates: dict[str, FloatArray]
-    half_width: float
-    solves: int
-    seconds: float
-    own_seconds: float
-    reason: str | None = None
-    doubts: tuple[Finding, ...] = ()
-
-
-def _try(method: Amount, inputs: Inputs, memory: _Memory) -> _Trial:
-    recorder = Recorder(memory)
-    begin, before = time.process_time(), memory.clock.seconds
-    try:
-        found = method.run(inputs, recorder)
-    except SolveError as error:
-        nothing = np.full(len(memory.outputs), np.nan)
-        return _Trial(dict.fromkeys(ESTIMATES, nothing), 0.0, recorder.solves, recorder.seconds, 0.0, str(error))
-    own = time.process_time() - begin - (memory.clock.seconds - before)
-    estimates = {name: found[name].to_numpy() for name in ESTIMATES}
-    doubts = tuple(findings(found))
-    return _Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0), doubts=doubts)
-
-
-def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]]) -> Iterator[Finding]:
+def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[Trial]]) -> Iterator[Finding]:
     """Collect each method's findings about its own numbers, at which budgets and how often: a line for each severity.
 
     Errors become warnings here, since the numbers are compared with the reference.
@@ -443,164 +394,15 @@ def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]
                 yield Finding(severity, f"{who}: {told[0][1]}")
 
 
-@dataclass
-class _Clock:
-    """Processor time (s) that evaluations took on this rank."""
-
-    seconds: float = 0.0
-
-
-class _Memory(OfEvaluate):
-    """An evaluation that solves each point once, and returns the result, with its time, as often as requested.
-
-    Sums of fields over several points are not remembered.
-    """
-
-    def __init__(self, evaluate: Evaluate, clock: _Clock | None = None) -> None:
-        self._evaluate = evaluate
-        self._others: dict[str, _Memory] = {}
-        self._known: dict[tuple[bytes, bytes], Evaluations] = {}
-        self.clock = clock or _Clock()
-
-    def on(self, model: str) -> _Memory:
-        """Return the evaluation of another of the models, with its own memory."""
-        if model not in self._others:
-            self._others[model] = _Memory(self._evaluate.on(model), self.clock)
-        return self._others[model]
-
-    def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request, solving those that are new."""
-        begin = time.process_time()
-        try:
-            if request.fields is not None and len(request.points) > 1:
-                return self._evaluate(request)
-            return self._remembered(request)
-        finally:
-            self.clock.seconds += time.process_time() - begin
-
-    def _remembered(self, request: Request) -> Evaluations:
-        from uq.evaluation.checkpoint import digest
-
-        asked = digest(replace(request, points=request.points[:0]))
-        keys = [(asked, point.tobytes()) for point in request.points]
-        new = {key: i for i, key in enumerate(keys) if key not in self._known}
-        if new:
-            found = self._evaluate(replace(request, points=request.points[list(new.values())]))
-            self._known |= dict(zip(new, _one_by_one(found), strict=True))
-        return merge([self._known[key] for key in keys])
-
-
-def _one_by_one(found: Evaluations) -> list[Evaluations]:
-    """Split evaluations of n points into n; fields are kept only for single points."""
-    n = len(found.points)
-    if n == 1:
-        return [found]
-    failures = {failure.index: replace(failure, index=0) for failure in found.failures}
-    columns = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "fields"}
-    arrays = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
-    return [
-        replace(
-            found,
-            failures=(failures[i],) if i in failures else (),
-            fields=np.zeros((0, 0)),
-            **{name: column[i : i + 1] for name, column in arrays.items()},
-        )
-        for i in range(n)
-    ]
-
-
-# --- comparison ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Score:
-    """Errors of repeats, by row and output (n, m).
-
-    Attributes
-    ----------
-    rmse, rmse_error
-        Root mean square error, and its standard error.
-    claimed
-        Root mean square of the standard errors that were claimed.
-    resolved
-        Whether the reference is good enough to measure this error.
-    coverage
-        Share of the claimed 95 % intervals that hold the reference, NaN where the error is not resolved.
-    understated
-        Whether so few would hold it once in a thousand times if the claims were honest.
-    """
-
-    rmse: FloatArray
-    rmse_error: FloatArray
-    claimed: FloatArray
-    resolved: FloatArray
-    coverage: FloatArray
-    understated: FloatArray
-
-
-def _score(errors: FloatArray, claims: FloatArray, halves: FloatArray, floor: FloatArray) -> _Score:
-    """Compare errors with claims (n, R, m).
-
-    Parameters
-    ----------
-    errors, claims
-        Estimates minus reference, and claimed standard errors; NaN where a repeat gave none.
-    halves
-        Claimed standard errors on either side of a 95 % interval (n, R).
-    floor
-        Standard error of the reference (m,).
-    """
-    from scipy.stats import binom
-
-    there = np.isfinite(errors)
-    R = np.maximum(there.sum(axis=1), 1)
-    squares = np.where(there, errors, 0.0) ** 2
-    mean = np.where(there.any(axis=1), squares.sum(axis=1) / R, np.nan)
-    spread = np.where(there, squares - mean[:, None], 0.0)
-    scatter = np.sqrt((spread**2).sum(axis=1) / np.maximum(R - 1, 1) / R)
-    rmse = np.sqrt(mean)
-    resolved = rmse > RESOLVED * floor
-    # The reference has an error too: intervals are widened by it.
-    within = there & (np.abs(errors) <= np.hypot(halves[..., None] * claims, 1.96 * floor))
-    hits = within.sum(axis=1)
-    return _Score(
-        rmse,
-        ratio(scatter, 2 * rmse),
-        np.sqrt((np.where(there, claims, 0.0) ** 2).sum(axis=1) / R),
-        resolved,
-        np.where(resolved, hits / R, np.nan),
-        resolved & (binom.cdf(hits, R, 0.95) < UNLIKELY),
-    )
-
-
-def _rate(solves: FloatArray, errors: FloatArray) -> tuple[float, float]:
-    """Slope of ln RMSE over ln solves (n,) of errors (n, R), with its error by the jackknife over the repeats.
-
-    Budgets of one repeat share points, so that their errors are not independent; the repeats are.
-    """
-    squares = errors[:, np.isfinite(errors).all(axis=0)] ** 2
-    n, R = squares.shape
-    if n < 2 or R < 3:
-        return np.nan, np.nan
-    total = squares.sum(axis=1)
-    without = (total[:, None] - squares) / (R - 1)
-    mean_squares = np.column_stack([total / R, without])
-    if not (mean_squares > 0).all():
-        return np.nan, np.nan
-    centred = np.log(solves) - np.log(solves).mean()
-    slopes = centred @ np.log(mean_squares) / 2 / (centred @ centred)
-    return float(slopes[0]), float(np.sqrt((R - 1) / R * ((slopes[1:] - slopes[1:].mean()) ** 2).sum()))
-
-
 def _compared(
     rows: Sequence[tuple[Entry, int]],
-    trials: Sequence[Sequence[_Trial]],
+    trials: Sequence[Sequence[Trial]],
     reference: dict[str, FloatArray],
     floors: dict[str, tuple[tuple[str, ...], Any]],
 ) -> dict[str, tuple[tuple[str, ...], Any]]:
     """Return reference, estimates, errors and costs as labelled arrays."""
 
-    def each(pick: Callable[[_Trial], Any]) -> FloatArray:
+    def each(pick: Callable[[Trial], Any]) -> FloatArray:
         return np.array([[pick(trial) for trial in row] for row in trials], dtype=float)
 
     names = [entry.label for entry, _ in rows]
@@ -631,48 +433,26 @@ def _compared(
             np.array([[trial.estimates[key] for trial in row] for row in trials]) for key in (name, f"{name}_error")
         )
         errors = estimates - value
-        score = _score(errors, claims, halves, np.maximum(error, rounding))
+        scored = score(errors, claims, halves, np.maximum(error, rounding))
         slopes = []
         for method in dict.fromkeys(labels):
             of_method = [shown[i] for i, label in enumerate(labels) if label == method]
-            used = [[i for i in of_method if good[i]] for good in score.resolved.T]
-            slopes.append([_rate(solves[i], errors[i, :, k]) for k, i in enumerate(used)])
+            used = [[i for i in of_method if good[i]] for good in scored.resolved.T]
+            slopes.append([rate(solves[i], errors[i, :, k]) for k, i in enumerate(used)])
         single = reference["std"]
         if name == "std":
             # The error of a standard deviation depends on the fourth moment, which plain Monte Carlo estimates.
             last = plain[-1] if plain else 0
-            single = score.claimed[last] * np.sqrt(rows[last][1]) if plain else np.full(value.shape, np.nan)
+            single = scored.claimed[last] * np.sqrt(rows[last][1]) if plain else np.full(value.shape, np.nan)
         rates = np.array(slopes)
         data |= {
             name: (by_output, value),
             f"{name}_error": (by_output, error),
             f"{name}_estimate": (by_repeat, estimates[shown]),
             f"{name}_estimate_error": (by_repeat, claims[shown]),
-            **{f"{name}_{f.name}": (by_row, getattr(score, f.name)[shown]) for f in fields(score)},
+            **{f"{name}_{f.name}": (by_row, getattr(scored, f.name)[shown]) for f in fields(scored)},
             f"{name}_single": (by_output, single),
             f"{name}_rate": (("estimator", "output"), rates[..., 0]),
             f"{name}_rate_error": (("estimator", "output"), rates[..., 1]),
         }
     return data
-
-
-def plain_samples(dataset: xr.Dataset, estimated: str) -> xr.DataArray:
-    """Return how many plain Monte Carlo samples give the same error, by row and output, for the mean or the std.
-
-    This is a lower bound if the error is not resolved.
-    """
-    return (dataset[f"{estimated}_rmse"] / dataset[f"{estimated}_single"]) ** -2
-
-
-def gains(dataset: xr.Dataset, estimated: str) -> dict[str, xr.DataArray]:
-    """Return the cost of plain Monte Carlo at equal error over that of a method, by row and output.
-
-    By number of "solves", by processor time ("cpu"), and by processor time with the textbook solver for plain Monte
-    Carlo ("textbook"); the last two are NaN if nothing was solved by the textbook.
-    """
-    plain, seconds = plain_samples(dataset, estimated), dataset["cpu_seconds"]
-    return {
-        "solves": plain / dataset["solves"],
-        "cpu": plain * dataset["plain_seconds"] / seconds,
-        "textbook": plain * dataset["textbook_seconds"] / seconds,
-    }

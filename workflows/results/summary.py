@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uq.estimators.moments import ESTIMATES
-from uq.methods.compare import ESTIMATED, gains
+from uq.estimators.scores import gains
+from uq.methods.compare import ESTIMATED
 
 if TYPE_CHECKING:
     import xarray as xr

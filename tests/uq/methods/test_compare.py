@@ -11,12 +11,13 @@ import xarray as xr
 
 from forward.model import FunctionModel, SolveError
 from tests.launch import ROOT, run
+from uq.estimators.scores import gains, plain_samples
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
-from uq.methods.compare import TIMES, Compare, gains, plain_samples
+from uq.methods.compare import TIMES, Compare
 from uq.methods.monte_carlo import MonteCarlo
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, dump, parse

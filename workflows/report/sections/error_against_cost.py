@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from forward.readable import size
 from forward.words import NONE, duration, number, with_error, with_unit
-from uq.methods.compare import gains, plain_samples
+from uq.estimators.scores import gains, plain_samples
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
