@@ -14,7 +14,8 @@ from mpi4py import MPI
 
 from forward.model import FloatArray
 from forward.reduced.model import ReducedModel
-from forward.reduced.reduction import Reduction, Sizes, Snapshots
+from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.snapshots import Snapshots
 from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise

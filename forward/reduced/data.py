@@ -77,10 +77,10 @@ class Output:
     Attributes
     ----------
     kind
-        "linear": `row` · c. "work": that of all forces on the test field number `which`. "integral": of a density, over
-        the points that a level has for integral number `which`, divided by `size`. "peak": the largest value of a
-        density over `points`. "largest": the largest displacement over the nodes along axis `which`, or its length if
-        that is 3.
+        "linear": `row` · c. "work": that of all forces on the test field number `which`. "integral": of a density,
+        divided by `size`, over `points`, or over those that a level has for integral number `which`. "peak": the
+        largest value of a density over `points`. "largest": the largest displacement over the nodes along axis
+        `which`, or its length if that is 3.
     """
 
     name: str

@@ -194,6 +194,12 @@ class Sampler:
         self._equations.set_state(state)
         return np.ascontiguousarray(self._state().T)
 
+    def inputs(self, components: FloatArray, points: Points, parameters: FloatArray) -> FloatArray:
+        """Return what the integrand takes at points (varying, n): components (m, n), and what is known there."""
+        fields = self._equations.fields
+        logs = [log + slopes @ parameters[fields[i].positions] for i, log, slopes in points.logs]
+        return np.ascontiguousarray(np.vstack([components, points.given, *logs]))
+
     def points(self, rows: FloatArray, chosen: NDArray[np.int64] | None = None) -> Points:
         """Return the points with the values of fields (N, U_local) there."""
         chosen = np.arange(self.count) if chosen is None else chosen

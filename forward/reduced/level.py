@@ -128,6 +128,12 @@ class Level:
         self._outputs = [_of_output(output, self, p) for output in outputs]
         self.free = slice(self.before, self.count)
 
+    @cached_property
+    def pressures(self) -> int:
+        """How many of the modes are pressures: they move no node."""
+        moved = self.data.fields[self.free, : self.data.places.size]
+        return int((~moved.any(axis=1)).sum())
+
     def coordinates(self, parameters: FloatArray, modes: FloatArray) -> FloatArray:
         """Return all coordinates (N,) from the parameters (d,) and those of the modes."""
         c = np.zeros(self.count)
@@ -379,12 +385,16 @@ def _of_output(output: Output, level: Level, numbers: int) -> _Output:
         case "largest":
             return _Largest(output, level)
         case "integral":
-            return _Integral(output, level, level.integrals[output.which], numbers)
+            points = level.integrals[output.which] if output.points is None else _all(output.points, level)
+            return _Integral(output, level, points, numbers)
         case "peak":
-            points = output.points
-            assert points is not None
-            every = np.arange(len(points.weights))
-            return _Peak(output, level, points.some(every, points.weights, level.count), numbers)
+            assert output.points is not None
+            return _Peak(output, level, _all(output.points, level), numbers)
         case _:
             message = f"the file has an output of the unknown kind '{output.kind}'"
             raise ValueError(message)
+
+
+def _all(points: Points, level: Level) -> Points:
+    """Return all points, with the coordinates of a level."""
+    return points.some(np.arange(len(points.weights)), points.weights, level.count)

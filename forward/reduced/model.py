@@ -340,14 +340,16 @@ class ReducedSolution:
             array.flags.writeable = False
 
     def _stability(self) -> Stability:
-        """Test the symmetric part of the stiffness: where it is indefinite, so is that of all unknowns."""
+        """Test the symmetric part of the stiffness: where it is indefinite, so is that of all unknowns.
+
+        In the mixed form every pressure is one negative eigenvalue of an equilibrium that is stable. There the body may
+        be stabler than the few pressures say.
+        """
         free = self._model.level.free
         if not self._model.tested:
             return Stability.NOT_TESTED
         K = self.stiffness[free, free]
-        try:
-            np.linalg.cholesky((K + K.T) / 2)
-        except np.linalg.LinAlgError:
+        if not stable((K + K.T) / 2, self._model.level.pressures):
             message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
             raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
         return Stability.SCREENED
@@ -461,3 +463,14 @@ def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:
             slopes[k, number] = 1.0
     slopes[level.free] = -np.linalg.solve(K[level.free, level.free], F[level.free])
     return slopes
+
+
+def stable(K: FloatArray, pressures: int) -> bool:
+    """Whether a symmetric stiffness (n, n) has no negative eigenvalues beyond those of pressures."""
+    if pressures:
+        return int((np.linalg.eigvalsh(K) < 0).sum()) <= pressures
+    try:
+        np.linalg.cholesky(K)
+    except np.linalg.LinAlgError:
+        return False
+    return True

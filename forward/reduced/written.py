@@ -68,7 +68,7 @@ class Reader:
             case "Product":
                 return graph.mul(*(self._component(one, (), at) for one in own))
             case "Conditional":
-                return self._choice(own, at)
+                return self._choice(own, component, at)
             case "MaxValue" | "MinValue":
                 a, b = (self._component(one, (), at) for one in own)
                 return graph.apply(SELECT, a, b, *((b, a) if kind == "MaxValue" else (a, b)))
@@ -95,10 +95,10 @@ class Reader:
             case _:  # that of a variable, or of a real number that is written as complex
                 return self._component(own[0], component, at)
 
-    def _choice(self, operands: tuple[Any, ...], at: dict[int, int]) -> Node:
+    def _choice(self, operands: tuple[Any, ...], component: tuple[int, ...], at: dict[int, int]) -> Node:
         condition, true, false = operands
         a, b = (self._component(one, (), at) for one in condition.ufl_operands)
-        yes, no = (self._component(one, (), at) for one in (true, false))
+        yes, no = (self._component(one, component, at) for one in (true, false))
         kind = type(condition).__name__
         if kind in {"LT", "LE"}:
             return self._graph.apply(SELECT, a, b, yes, no)

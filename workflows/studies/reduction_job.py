@@ -14,7 +14,8 @@ import xarray as xr
 from forward.model import Finding, SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
-from forward.reduced.reduction import Reduction, Sizes, Snapshots, adjoint_states, directions
+from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from uq.evaluation.evaluate import Evaluate, Recorder, Request
 from uq.findings import add
 from uq.inputs.sampling import random_points, sobol_points

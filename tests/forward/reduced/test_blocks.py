@@ -8,7 +8,8 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.reduced import blocks
 from forward.reduced.model import ReducedModel
-from forward.reduced.reduction import Reduction, Sizes, Snapshots
+from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.snapshots import Snapshots
 
 pytestmark = pytest.mark.fem
 

@@ -17,7 +17,8 @@ from forward.reduced.enrichment import enriched
 from forward.reduced.integrands import of_density, of_form
 from forward.reduced.limits import mistakes
 from forward.reduced.model import ReducedModel, outside_of
-from forward.reduced.reduction import Reduction, Sizes, Snapshots, adjoint_states, directions
+from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 
 pytestmark = pytest.mark.fem
 
@@ -196,9 +197,10 @@ def test_what_it_is_not_for_is_said(full, small):
         model.solve(np.array([-3, *NOMINAL[1:]]))
     assert "loads.pressure.size = 900 (trained from" in outside_of(small, np.array([1e3, 1e3, 900, 0.05, 0.004, 0, 0]))
     assert not outside_of(small, small.snapshots.mean(axis=0))
-    mixed = BODY | {"formulation": "mixed", "body": BODY["body"] | {"degree": 2}}
-    mixed = BODY | {"formulation": "mixed", "body": BODY["body"] | {"degree": 2}}
-    assert "mixed form" in "".join(mistakes(Hyperelastic.model_validate(mixed)))
+    tool = {"kind": "indenter", "shape": "sphere", "on": "z-max", "at": [0.05, 0.03, 0.03], "direction": [0, 0, -1]}
+    tool |= {"depth": 1e-3, "radius": 0.01, "friction": 0.3}
+    rubbing = Hyperelastic.model_validate(BODY | {"loads": [tool]})
+    assert "no friction" in "".join(mistakes(rubbing))
 
 
 def test_the_full_model_is_asked_where_the_estimate_is_too_large(full, small):
@@ -294,7 +296,7 @@ def test_the_stress_that_is_read_is_the_derivative_of_the_energy_that_is_read(ki
 
 
 def test_of_many_points_a_part_are_candidates_for_the_integrals_over_all(full, snapshots, reduction, monkeypatch):
-    monkeypatch.setattr("forward.reduced.reduction.CANDIDATES", 40)
+    monkeypatch.setattr("forward.reduced.rules.CANDIDATES", 40)
     data = reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-3))
     assert len(data.levels[0].works[0].weights) <= 40
     model, other = ReducedModel(data, full.parameters), reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-11))

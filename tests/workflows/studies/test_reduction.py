@@ -180,10 +180,12 @@ def test_another_file_under_the_same_name_is_refused(folder):
 
 
 def test_bodies_that_cannot_be_reduced_are_refused_in_one_line(tmp_path):
-    mixed = SAMPLED.replace('formulation = "displacement"', 'formulation = "mixed"').replace("degree = 1", "degree = 2")
-    (tmp_path / "mixed.toml").write_text(mixed)
-    with pytest.raises(StudyError, match="no mixed form yet"):
-        load(tmp_path / "mixed.toml", ["method={ kind = 'reduce' }"])
+    (tmp_path / "rubbed.toml").write_text(SAMPLED)
+    tool = "kind='indenter', shape='sphere', on='x-max', at=[0.1, 0.02, 0.01], direction=[-1, 0, 0], depth=1e-3"
+    rubbed = [f"model.loads=[{{ {tool}, radius=0.01, friction=0.3 }}]", "method={ kind = 'reduce' }"]
+    rubbed += ["parameters={ 'material.C1' = { kind = 'uniform', lower = 800, upper = 1200 } }"]
+    with pytest.raises(StudyError, match="no friction, which depends on the way"):
+        load(tmp_path / "rubbed.toml", rubbed)
 
 
 @pytest.mark.mpi

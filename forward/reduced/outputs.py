@@ -1,0 +1,128 @@
+"""Outputs of a body as those of its reduced model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.fem.model import HyperelasticModel
+from forward.model import FloatArray, ModelError
+from forward.observables.functionals import Integral, Linear
+from forward.observables.max_displacement import MaxDisplacement
+from forward.observables.max_von_mises import MaxVonMises
+from forward.observables.reaction import Reaction
+from forward.reduced.data import Output
+from forward.reduced.integrands import Sampler, of_density
+from forward.reduced.kernels import Kernel
+from forward.reduced.level import LENGTH
+
+NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
+
+
+class Outputs:
+    """The outputs of a body that is being reduced.
+
+    Parameters
+    ----------
+    model
+        The body.
+    names
+        Paths of the numbers that integrands take.
+
+    Attributes
+    ----------
+    tests
+        Fields (k, U_local) on which the work of all forces is an output.
+    densities
+        What is integrated over the body, and the functionals.
+    """
+
+    def __init__(self, model: HyperelasticModel, names: tuple[str, ...]) -> None:
+        self._model, self._names = model, names
+        self._equations = model.equations
+        self._numbers = np.array([model.parameters.index(name) for name in names], dtype=np.int64)
+        self.densities: list[tuple[Sampler, Integral]] = []
+        self._of_output: dict[str, Sampler] = {}  # those that are not integrated by the rule of the body
+        tests = []
+        for one, functional in self._pairs:
+            if isinstance(one, Reaction):
+                tests.append(functional.w)
+            elif isinstance(one, MaxVonMises):
+                self._of_output[one.name] = self._sampler(functional.stress, self._equations.dx)
+            elif isinstance(functional, Integral):
+                sampler = self._sampler(functional.density, functional.measure)
+                if sampler.integrand.boundary is None:
+                    self.densities.append((sampler, functional))
+                else:
+                    self._of_output[one.name] = sampler
+            elif not isinstance(one, MaxDisplacement) and not isinstance(functional, Linear):
+                message = f"the output '{one.name}' cannot be reduced"
+                raise ModelError(message)
+        self.tests = np.array(tests).reshape(-1, self._equations.size)
+
+    @property
+    def _pairs(self) -> Iterator[tuple[Any, Any]]:
+        return zip(self._model.spec.outputs, self._model.functionals, strict=True)
+
+    def _sampler(self, density: Any, measure: Any) -> Sampler:
+        return Sampler(self._equations, of_density(self._equations, density, measure, self._names))
+
+    def made(
+        self, rows: FloatArray, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
+    ) -> tuple[Output, ...]:
+        """Return them for coordinate fields (N, U_local).
+
+        Parameters
+        ----------
+        rows
+            The fields.
+        states, parameters
+            Snapshots (s, U_local), and where (s, d).
+        kept
+            Which cells are kept in full; None for none.
+        """
+        found: list[Output] = []
+        tests = integrals = 0
+        for one, functional in self._pairs:
+            name, unit = one.name, one.unit
+            if isinstance(one, Reaction):
+                found.append(Output(name, unit, "work", which=tests))
+                tests += 1
+            elif isinstance(one, MaxDisplacement):
+                axis = LENGTH if one.component == "magnitude" else "xyz".index(one.component)
+                found.append(Output(name, unit, "largest", which=axis))
+            elif isinstance(one, MaxVonMises):
+                sampler = self._of_output[name]
+                near = self._near_peak(sampler, states, parameters, kept)
+                density, points = sampler.integrand.written, sampler.points(rows, near)
+                found.append(Output(name, unit, "peak", density=density, points=points))
+            elif isinstance(functional, Linear):
+                found.append(Output(name, unit, "linear", row=rows @ functional.gradient()))
+            elif name in self._of_output:
+                sampler = self._of_output[name]
+                density, points = sampler.integrand.written, sampler.points(rows)
+                found.append(Output(name, unit, "integral", size=functional.size, density=density, points=points))
+            else:
+                density = self.densities[integrals][0].integrand.written
+                found.append(Output(name, unit, "integral", which=integrals, size=functional.size, density=density))
+                integrals += 1
+        return tuple(found)
+
+    def _near_peak(
+        self, sampler: Sampler, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
+    ) -> NDArray[np.int64]:
+        """Number the points that are near the largest value in any snapshot, and those in cells kept in full."""
+        near = np.zeros(sampler.count, dtype=bool)
+        if kept is not None:
+            near |= np.repeat(kept, sampler.count // len(kept))
+        everywhere = sampler.points(np.zeros((0, states.shape[1])))
+        tape = sampler.integrand.written.tape
+        kernel = Kernel(tape, tape.inputs - len(self._numbers))
+        for state, point in zip(states, parameters, strict=True):
+            inputs = sampler.inputs(sampler.components(state), everywhere, point)
+            values = kernel(inputs, point[self._numbers])[0]
+            near |= values >= NEAR_PEAK * values.max()
+        return np.flatnonzero(near)

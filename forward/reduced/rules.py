@@ -1,0 +1,201 @@
+"""Which points a reduced model has: rules trained on projected snapshots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.fem.equations import Discretisation
+from forward.model import FloatArray
+from forward.observables.functionals import Integral
+from forward.reduced import cubature
+from forward.reduced.data import LevelData, Points
+from forward.reduced.integrands import Integrand, Sampler
+from forward.reduced.kernels import Kernel
+
+CANDIDATES = 20_000  # points among which a rule is chosen, of more a random part
+KEPT_WHOLE = 600  # points of a boundary that are all kept
+SEED = 7
+FINER = 3.0  # how many times less the points of the larger model miss
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """What rules are trained on.
+
+    Attributes
+    ----------
+    rows
+        Coordinate fields (N, U_local).
+    coordinates, parameters
+        Coordinates (s, N) and parameters (s, d) of the snapshots.
+    before, tests
+        How many coordinates come before the modes, and how many of these are fields that only test.
+    """
+
+    rows: FloatArray
+    coordinates: FloatArray
+    parameters: FloatArray
+    before: int
+    tests: int
+
+    def tested(self, modes: int) -> NDArray[np.int64]:
+        """Return the coordinates on which works are tested: tests and the first modes."""
+        return np.arange(self.before - self.tests, self.before + modes)
+
+    def projected(self, sizes: Sequence[int]) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Return coordinates (N,) and parameters (d,) of the snapshots on the first modes, so many each time."""
+        for c, point in zip(self.coordinates, self.parameters, strict=True):
+            for size in sizes:
+                kept = np.zeros(len(self.rows))
+                kept[: self.before + size] = c[: self.before + size]
+                yield kept, point
+
+
+class Rules:
+    """The points of a body, and the choice among them.
+
+    Parameters
+    ----------
+    equations
+        The body, in one process.
+    works
+        Integrands of virtual works: first that of the energy.
+    whole
+        Which of them keep all their points.
+    densities
+        What else the rule of the energy integrates.
+    numbers
+        Which parameters (p,) integrands take.
+    """
+
+    def __init__(
+        self,
+        equations: Discretisation,
+        works: Sequence[Integrand],
+        whole: Sequence[bool],
+        densities: Sequence[tuple[Sampler, Integral]],
+        numbers: NDArray[np.int64],
+    ) -> None:
+        self._equations, self._densities, self._numbers = equations, densities, numbers
+        self._samplers = [Sampler(equations, one) for one in works]
+        self._whole = whole
+
+    def levels(
+        self, training: Training, counts: tuple[int, int], missed: float, kept: NDArray[np.bool_] | None
+    ) -> tuple[tuple[LevelData, ...], dict[str, Any]]:
+        """Choose the points of a model with so many modes and of the larger one, and say how many they are.
+
+        Parameters
+        ----------
+        training
+            What they are trained on.
+        counts
+            Numbers of modes.
+        missed
+            What they may miss of the forces, relative.
+        kept
+            Which cells are kept in full, with all their points; None for none.
+        """
+        rows, before = training.rows, training.before
+        levels: list[LevelData] = []
+        told: dict[str, Any] = {}
+        in_full = [np.zeros(sampler.count, dtype=bool) for sampler in self._samplers]
+        if kept is not None:
+            in_full[0] = np.repeat(kept, self._samplers[0].count // len(kept))
+        every = kept is not None and bool(kept.any())
+        candidates = [np.arange(sampler.count) for sampler in self._samplers]
+        candidates[0] = _candidates(self._samplers[0], in_full[0])
+        known = [sampler.points(rows, some) for sampler, some in zip(self._samplers, candidates, strict=True)]
+        of_densities = [sampler.points(rows, candidates[0]) for sampler, _ in self._densities]
+        for level, n in enumerate(counts):
+            works, integrals = [], []
+            for number, points in enumerate(known):
+                all_of_them = np.arange(len(points.weights))
+                if number > 0 and (self._whole[number] or len(all_of_them) <= KEPT_WHOLE or every):
+                    works.append(points.some(all_of_them, points.weights, before + n))
+                    continue
+                sizes = (counts[0],) if level == 0 else counts
+                fixed = in_full[number][candidates[number]]
+                least = missed / (1 if level == 0 else FINER)
+                beside = of_densities if number == 0 else []
+                rule = self._rule(number, points, beside, training, sizes, least, fixed)
+                works.append(points.some(rule.points, rule.weights, before + n))
+                if number == 0:
+                    integrals = [one.some(rule.points, rule.weights, before + n) for one in of_densities]
+                    kind = "points" if level == 0 else "points of the larger model"
+                    told |= {kind: len(rule.points), f"missed by the {kind}": rule.missed}
+            levels.append(LevelData(n, tuple(works), tuple(integrals)))
+        return tuple(levels), told
+
+    def _rule(
+        self,
+        number: int,
+        points: Points,
+        densities: list[Points],
+        training: Training,
+        sizes: tuple[int, ...],
+        missed: float,
+        fixed: NDArray[np.bool_],
+    ) -> cubature.Rule:
+        """Choose points and weights that integrate the works of projected snapshots, densities of outputs, and volume.
+
+        The works of each state are scaled to its forces, and mixed at random: a few hundred sums stand for all of them.
+        """
+        equations, numbers, sampler = self._equations, self._numbers, self._samplers[number]
+        kernel = self._kernel(sampler)
+        of_densities = [self._kernel(one) for one, _ in self._densities] if densities else []
+        tests, tested = training.tests, training.tested(sizes[-1])
+        whole = len(points.weights) == sampler.count
+        count = len(training.parameters) * len(sizes)
+        size = min(count * len(tested), 4 * len(tested) + 400)
+        mixture = cubature.Mixture(size, len(points.weights), SEED)
+        rows: list[FloatArray] = []
+        m, n = points.fields.shape[:2]
+        fields = points.fields[:, :, tested].transpose(0, 2, 1).copy()
+        for c, point in training.projected(sizes):
+            components = (points.fields.reshape(m * n, -1) @ c).reshape(m, n)
+            T = kernel(sampler.inputs(components, points, point), point[numbers])
+            values = T[0] * fields[0]
+            for k in range(1, m):
+                values += T[k] * fields[k]
+            targets = values @ points.weights
+            totals = []
+            for (of, _), there, kernel_of in zip(self._densities, densities, of_densities, strict=False):
+                density = kernel_of(of.inputs(there.fields @ c, there, point), point[numbers])[0]
+                rows.append(density)
+                totals.append(float(density @ there.weights))
+            if not whole:
+                equations.set_parameters(point)
+                equations.at_load(0.0)
+                equations.set_state(c @ training.rows)
+                targets = training.rows[tested] @ equations.imbalance()
+                totals = [functional.value() * functional.size for _, functional in self._densities]
+            for i, total in enumerate(totals):
+                rows[i - len(totals)] = rows[i - len(totals)] / (total or 1.0)
+            scale = np.full(len(tested), float(np.linalg.norm(targets[tests:])) or 1.0)
+            scale[:tests] = np.where(targets[:tests] == 0, scale[:tests], np.abs(targets[:tests]))
+            mixture.add(values / scale[:, None], targets / scale)
+        volume = np.ones((1, len(points.weights))) / sampler.weights.sum()
+        every = np.vstack([mixture.values, *rows, volume])
+        aims = np.concatenate([mixture.integrals, np.ones(len(rows) + 1)])
+        rule = cubature.beside(every, aims, missed, np.where(fixed, points.weights, 0.0))
+        if whole and rule.missed > missed:  # then all points are needed
+            return cubature.Rule(np.arange(len(points.weights)), points.weights, 0.0)
+        return rule
+
+    def _kernel(self, sampler: Sampler) -> Kernel:
+        tape = sampler.integrand.written.tape
+        return Kernel(tape, tape.inputs - len(self._numbers))
+
+
+def _candidates(sampler: Sampler, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number the points among which a rule is chosen, and those (n,) that are kept."""
+    if sampler.count <= CANDIDATES:
+        return np.arange(sampler.count)
+    some = np.random.default_rng(SEED).choice(sampler.count, CANDIDATES, replace=False)
+    return np.union1d(some, np.flatnonzero(kept))
