@@ -24,6 +24,8 @@ from forward.reduced.together import TOGETHER, equilibria
 ITERATIONS = 25
 TOLERANCE = 1e-12  # of the forces, relative to what they would be if they did not cancel
 ROUNDING = 1e-13  # changes of the coordinates, relative to them, below which nothing changes any more
+TOUCHING = 60  # iterations under tools
+SEARCHES = 12  # lengths of a step that are tried there
 STEPS = (1, 2, 4, 8, 16, 32)  # into which the way from the nearest snapshot is cut
 GROWTH = 2.0  # of the forces in a step of Newton's method, above which it is shortened
 
@@ -98,6 +100,7 @@ class ReducedModel(OneByOne):
         self.asked: list[FloatArray] = []  # all parameters (d,) at which the full model was asked
         self.tested = tested and not self.spec.solver.accept_unstable
         self._admission = Admission(self.spec, data.parameters)
+        self._touched = any(load.contact for load in self.spec.loads) and not self.level.pressures
         self._tolerance, self._full = tolerance, full
 
     @property
@@ -216,6 +219,8 @@ class ReducedModel(OneByOne):
         """Return the coordinates of the equilibrium and the stiffness there; None where there is no way."""
         level, free = self.level, self.level.free
         c = level.coordinates(whole, modes)
+        if self._touched:
+            return self._under_tools(whole, c, work)
         step, before, still = np.zeros(level.modes), np.inf, False
         for _ in range(ITERATIONS):
             R, K, scale = level.stiffness(c, whole)
@@ -243,6 +248,52 @@ class ReducedModel(OneByOne):
             c[free] += step
             still = bool(np.abs(step).max() <= ROUNDING * np.abs(c[free]).max())
         return None
+
+    def _under_tools(self, whole: FloatArray, c: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
+        """Minimise the energy from coordinates (N,): forces grow by orders where points begin to touch, energies fall.
+
+        Steps are as long as the work of the forces on them has fallen to a half, its sign included.
+        """
+        level, free = self.level, self.level.free
+        still = False
+        for _ in range(TOUCHING):
+            R, K, scale = level.stiffness(c, whole)
+            work.assemblies += 1
+            if not np.isfinite(K).all():
+                return None
+            if float(np.abs(R[free]).max(initial=0.0)) <= TOLERANCE * scale or still:
+                return c, K
+            try:
+                step = -np.linalg.solve(K[free, free], R[free])
+            except np.linalg.LinAlgError:
+                return None
+            work.factorisations += 1
+            work.back_substitutions += 1
+            step *= -np.sign(R[free] @ step) or 1.0
+            length = self._length(whole, c, step, float(R[free] @ step), work)
+            c[free] += length * step
+            still = bool(np.abs(length * step).max() <= ROUNDING * np.abs(c[free]).max())
+        return None
+
+    def _length(self, whole: FloatArray, c: FloatArray, step: FloatArray, first: float, work: Work) -> float:
+        """Return how much of a step to go, at most all, by the work of the forces on it, `first` < 0 at its begin."""
+        level, free = self.level, self.level.free
+        low, high, below, length = 0.0, 1.0, first, 1.0
+        for _ in range(SEARCHES):
+            moved = c.copy()
+            moved[free] += length * step
+            there = float(level.forces(moved, whole)[0][free] @ step)
+            work.residuals += 1
+            if there <= -0.5 * first and (there >= 0.5 * first or length == high == 1.0):
+                break
+            if there < 0:
+                low, below = length, there
+            else:
+                high = length
+            # Where the work is not finite or large, halves; else where it would vanish were it linear.
+            share = below / (below - there) if np.isfinite(there) and there > 0 else 0.5
+            length = low + (high - low) * min(max(share, 0.1), 0.5)
+        return length
 
     def _in_steps(self, whole: FloatArray, work: Work) -> tuple[FloatArray, FloatArray]:
         """Go from the nearest snapshot to the parameters, in more and more steps."""

@@ -1,5 +1,8 @@
 """Local modes of a body in blocks: continuous, orthogonal where they must be, exact where a block is kept in full."""
 
+from dataclasses import replace
+
+import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -10,6 +13,7 @@ from forward.reduced import blocks
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots
+from tests import meshes
 
 pytestmark = pytest.mark.fem
 
@@ -63,7 +67,7 @@ def reduction(full):
 @pytest.fixture(scope="module")
 def stiffness(reduction):
     """In the order of nodes of results, with its free unknowns."""
-    reduction._at_rest()
+    reduction._rest.set()
     equations = reduction.equations
     found = equations.sparse_stiffness()
     w = np.random.default_rng(0).standard_normal(equations.size)
@@ -151,3 +155,28 @@ def test_a_load_that_moves_is_read_though_no_load_is_proportional_to_a_number(fu
     np.testing.assert_allclose(
         ReducedModel(data, full.parameters).solve(point).outputs, snapshots.outputs[0], rtol=1e-6
     )
+
+
+def test_regions_are_blocks(tmp_path):
+    """Those of a mesh file that are halves of a box make the same model as a cut into halves; one is much stiffer."""
+    meshio.write(tmp_path / "box.msh", meshes.box(), file_format="gmsh22", binary=False)
+    body = {
+        "body": {"kind": "mesh", "file": str(tmp_path / "box.msh")},
+        "material": {"kind": "neo-hookean", "C1": 1e3, "D1": 3e3},
+        "formulation": "displacement",
+        "regions": {"right": {"contrast": 5.0}},
+        "clamp": ["x-min"],
+        "loads": [{"kind": "gravity", "density": 20, "direction": [0, 0, -1]}],
+        "outputs": [{"name": "u_max", "kind": "max-displacement"}],
+    }
+    paths = ("regions.right.contrast", "loads.gravity.density")
+    full = Hyperelastic.model_validate(body).build(MPI.COMM_SELF, paths)
+    nominal, spread = np.array([5.0, 20]), np.array([1.0, 4])
+    trained = snapshots_at(full, nominal + spread * np.random.default_rng(1).uniform(-1.7, 1.7, (6, 2)))
+    reduction = Reduction(full, nominal, spread)
+    sizes = Sizes(modes=8, cubature=1e-6, more=0, cut="regions")
+    found, halves = (reduction.reduced(trained, one) for one in (sizes, replace(sizes, cut=(2, 1, 1))))
+    assert len(np.unique(full.space.regions())) == 2
+    np.testing.assert_allclose(np.abs(found.fields), np.abs(halves.fields), atol=1e-9 * np.abs(found.fields).max())
+    point = nominal + spread * np.array([0.7, -1.1])
+    np.testing.assert_allclose(ReducedModel(found, paths).solve(point).outputs, full.solve(point).outputs, rtol=1e-3)
