@@ -40,6 +40,7 @@ from benchmarks import (
     predictions,
     realisation,
     reduced,
+    reduced_tools,
     saddle,
     scaling,
     selection,
@@ -59,6 +60,7 @@ from benchmarks import (
 ALL = {
     "realisation": realisation.main,
     "reduced": reduced.main,
+    "reduced_tools": reduced_tools.main,
     "live": live.main,
     "turning": turning.main,
     "bookkeeping": bookkeeping.main,
@@ -106,6 +108,7 @@ ALL = {
 }
 WITH_OPTIONS = {
     "reduced": reduced.main,
+    "reduced_tools": reduced_tools.main,
     "designs": designs.main,
     "intervals": intervals.main,
     "size": size.main,

@@ -19,15 +19,8 @@ from forward.materials.admissible import Admission
 from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, Work
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
+from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
 from forward.reduced.together import TOGETHER, equilibria
-
-ITERATIONS = 25
-TOLERANCE = 1e-12  # of the forces, relative to what they would be if they did not cancel
-ROUNDING = 1e-13  # changes of the coordinates, relative to them, below which nothing changes any more
-TOUCHING = 60  # iterations under tools
-SEARCHES = 12  # lengths of a step that are tried there
-STEPS = (1, 2, 4, 8, 16, 32)  # into which the way from the nearest snapshot is cut
-GROWTH = 2.0  # of the forces in a step of Newton's method, above which it is shortened
 
 
 class Estimate(NamedTuple):
@@ -100,13 +93,16 @@ class ReducedModel(OneByOne):
         self.asked: list[FloatArray] = []  # all parameters (d,) at which the full model was asked
         self.tested = tested and not self.spec.solver.accept_unstable
         self._admission = Admission(self.spec, data.parameters)
-        self._touched = any(load.contact for load in self.spec.loads) and not self.level.pressures
+        touched = any(load.contact for load in self.spec.loads)
+        # Energies of displacements and pressures have no minimum.
+        self.way: Way = under_tools if touched and not self.level.pressures else newton
+        self.touched = touched
         self._tolerance, self._full = tolerance, full
 
     @property
     def together(self) -> int:
-        """How many points are solved in lockstep; one where the stiffness at each is needed."""
-        return TOGETHER if not self.tested and self._tolerance is None else 1
+        """How many points are solved in lockstep; one where the stiffness at each is needed, as under tools."""
+        return TOGETHER if not self.tested and not self.touched and self._tolerance is None else 1
 
     def solve_many(
         self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
@@ -185,9 +181,10 @@ class ReducedModel(OneByOne):
         whole = self.whole(parameters)
         self._admission.require(whole)
         work = Work()
-        found = self._newton(whole, self.first(whole) if start is None else start, work)
+        begin = self.level.coordinates(whole, self.first(whole) if start is None else start)
+        found = self.way(self.level, whole, begin, work)
         if found is None:
-            found = self._in_steps(whole, work)
+            found = in_steps(self.way, self.level, self.data, whole, work)
         return ReducedSolution(self, parameters, whole, *found, work)
 
     def first(self, whole: FloatArray) -> FloatArray:
@@ -196,138 +193,7 @@ class ReducedModel(OneByOne):
 
     @cached_property
     def _predictor(self) -> Callable[[FloatArray], FloatArray]:
-        """Interpolate the snapshots by |r|³ and linear functions (M. D. Buhmann, Radial Basis Functions, 2003)."""
-        data = self.data
-        varied = data.spread > 0
-        scale = data.spread[varied]
-        x = (data.snapshots[:, varied] - data.nominal[varied]) / scale
-        y = data.coordinates[:, self.level.free]
-        distances = np.linalg.norm(x[:, None] - x[None], axis=2)
-        linear = np.column_stack([np.ones(len(x)), x])
-        k = linear.shape[1]
-        matrix = np.block([[distances**3, linear], [linear.T, np.zeros((k, k))]])
-        weights = np.linalg.lstsq(matrix, np.vstack([y, np.zeros((k, y.shape[1]))]), rcond=1e-10)[0]
-
-        def at(whole: FloatArray) -> FloatArray:
-            z = (whole[varied] - data.nominal[varied]) / scale
-            basis = np.concatenate([np.sqrt(((x - z) ** 2).sum(axis=1)) ** 3, [1.0], z])
-            return np.asarray(basis @ weights)
-
-        return at
-
-    def _newton(self, whole: FloatArray, modes: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
-        """Return the coordinates of the equilibrium and the stiffness there; None where there is no way."""
-        level, free = self.level, self.level.free
-        c = level.coordinates(whole, modes)
-        if self._touched:
-            return self._under_tools(whole, c, work)
-        step, before, still = np.zeros(level.modes), np.inf, False
-        for _ in range(ITERATIONS):
-            R, K, scale = level.stiffness(c, whole)
-            work.assemblies += 1
-            size = float(np.abs(R[free]).max(initial=0.0))
-            shortened = 0
-            while not np.isfinite(K).all() or not size <= GROWTH * before:
-                if shortened == 10 or not step.any():
-                    return None
-                step = step / 2
-                c[free] -= step
-                R, K, scale = level.stiffness(c, whole)
-                work.assemblies += 1
-                size = float(np.abs(R[free]).max(initial=0.0))
-                shortened += 1
-            if size <= TOLERANCE * scale or still:
-                return c, K
-            before = size
-            try:
-                step = -np.linalg.solve(K[free, free], R[free])
-            except np.linalg.LinAlgError:
-                return None
-            work.factorisations += 1
-            work.back_substitutions += 1
-            c[free] += step
-            still = bool(np.abs(step).max() <= ROUNDING * np.abs(c[free]).max())
-        return None
-
-    def _under_tools(self, whole: FloatArray, c: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
-        """Minimise the energy from coordinates (N,): forces grow by orders where points begin to touch, energies fall.
-
-        Steps are as long as the work of the forces on them has fallen to a half, its sign included.
-        """
-        level, free = self.level, self.level.free
-        still = False
-        for _ in range(TOUCHING):
-            R, K, scale = level.stiffness(c, whole)
-            work.assemblies += 1
-            if not np.isfinite(K).all():
-                return None
-            if float(np.abs(R[free]).max(initial=0.0)) <= TOLERANCE * scale or still:
-                return c, K
-            try:
-                step = -np.linalg.solve(K[free, free], R[free])
-            except np.linalg.LinAlgError:
-                return None
-            work.factorisations += 1
-            work.back_substitutions += 1
-            step *= -np.sign(R[free] @ step) or 1.0
-            length = self._length(whole, c, step, float(R[free] @ step), work)
-            c[free] += length * step
-            still = bool(np.abs(length * step).max() <= ROUNDING * np.abs(c[free]).max())
-        return None
-
-    def _length(self, whole: FloatArray, c: FloatArray, step: FloatArray, first: float, work: Work) -> float:
-        """Return how much of a step to go, at most all, by the work of the forces on it, `first` < 0 at its begin."""
-        level, free = self.level, self.level.free
-        low, high, below, length = 0.0, 1.0, first, 1.0
-        for _ in range(SEARCHES):
-            moved = c.copy()
-            moved[free] += length * step
-            there = float(level.forces(moved, whole)[0][free] @ step)
-            work.residuals += 1
-            if there <= -0.5 * first and (there >= 0.5 * first or length == high == 1.0):
-                break
-            if there < 0:
-                low, below = length, there
-            else:
-                high = length
-            # Where the work is not finite or large, halves; else where it would vanish were it linear.
-            share = below / (below - there) if np.isfinite(there) and there > 0 else 0.5
-            length = low + (high - low) * min(max(share, 0.1), 0.5)
-        return length
-
-    def _in_steps(self, whole: FloatArray, work: Work) -> tuple[FloatArray, FloatArray]:
-        """Go from the nearest snapshot to the parameters, in more and more steps."""
-        data = self.data
-        scale = np.where(data.spread > 0, data.spread, 1.0)
-        near = int(np.argmin((((data.snapshots - whole) / scale) ** 2).sum(axis=1)))
-        for steps in STEPS:
-            modes = data.coordinates[near, self.level.free]
-            for k in range(1, steps + 1):
-                at = data.snapshots[near] + k / steps * (whole - data.snapshots[near])
-                found = self._newton(at, modes, work)
-                if found is None:
-                    break
-                work.load_steps += 1
-                modes = found[0][self.level.free]
-            else:
-                assert found is not None
-                return found
-        outside = outside_of(data, whole)
-        hint = f"; {outside}" if outside else ""
-        message = f"the reduced model finds no equilibrium, though it went there in {STEPS[-1]} steps{hint}"
-        raise SolveError(message, work=work)
-
-
-def outside_of(data: ReducedData, whole: FloatArray) -> str:
-    """Say which parameters (d,) lie outside the snapshots; empty if none does."""
-    if (whole >= data.lower).all() and (whole <= data.upper).all():
-        return ""
-    found = [
-        f"{path} = {value:.4g} (trained from {low:.4g} to {high:.4g})"
-        for path, value, low, high in zip(data.parameters, whole, data.lower, data.upper, strict=True)
-        if value < low - 1e-9 * abs(low) or value > high + 1e-9 * abs(high)
-    ]
-    return f"outside the trained range: {', '.join(found[:3])}" if found else ""
+        return predictor(self.data, self.level)
 
 
 class ReducedSpace:
@@ -457,6 +323,8 @@ class ReducedSolution:
     def estimate(self) -> Estimate:
         """Estimate the errors of outputs and state by one step of Newton's method in the nested larger model.
 
+        Under tools by its equilibrium.
+
         Of an output that is the dual-weighted residual −zᵀR with the adjoint z in the larger model, Kᵀz = ∂ψ/∂u, which
         holds a basis of adjoints; the output is evaluated whole, so that curved ones are corrected too (R. Becker,
         R. Rannacher, Acta Numerica 10 (2001) 1–102).
@@ -470,13 +338,19 @@ class ReducedSolution:
 
     @cached_property
     def _larger(self) -> tuple[FloatArray, FloatArray] | None:
-        """Coordinates in the larger model after a step of Newton's method, and the step; None where there is none."""
+        """Coordinates in the larger model after a step of Newton's method, and the step; None where there is none.
+
+        Under tools, where a step says little of what will touch, those of its equilibrium.
+        """
         model, larger = self._model, self._model.larger
         if model.alone:
             return None
         modes = np.zeros(larger.modes)
         modes[: model.level.modes] = self.c[model.level.free]
         c = larger.coordinates(self._whole, modes)
+        if model.touched:
+            found = model.way(larger, self._whole, c, Work())
+            return None if found is None else (found[0], (found[0] - c)[larger.free])
         R, K, _ = larger.stiffness(c, self._whole)
         try:
             change = -np.linalg.solve(K[larger.free, larger.free], R[larger.free])
@@ -514,14 +388,3 @@ def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:
             slopes[k, number] = 1.0
     slopes[level.free] = -np.linalg.solve(K[level.free, level.free], F[level.free])
     return slopes
-
-
-def stable(K: FloatArray, pressures: int) -> bool:
-    """Whether a symmetric stiffness (n, n) has no negative eigenvalues beyond those of pressures."""
-    if pressures:
-        return int((np.linalg.eigvalsh(K) < 0).sum()) <= pressures
-    try:
-        np.linalg.cholesky(K)
-    except np.linalg.LinAlgError:
-        return False
-    return True

@@ -36,7 +36,8 @@ import numpy as np
 
 from forward.model import FloatArray, SolveError
 from forward.reduced.data import load
-from forward.reduced.model import ReducedModel, outside_of
+from forward.reduced.model import ReducedModel
+from forward.reduced.newton import outside_of
 from forward.reduced.stream import Local, Stream, local
 from workflows.live.mail import Mail, pair
 

@@ -8,7 +8,8 @@ from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.reduced.data import load, save
-from forward.reduced.model import ReducedModel, stable
+from forward.reduced.model import ReducedModel
+from forward.reduced.newton import stable
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import solved
 

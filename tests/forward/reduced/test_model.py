@@ -16,7 +16,8 @@ from forward.reduced.data import load, save
 from forward.reduced.enrichment import enriched
 from forward.reduced.integrands import of_density, of_form
 from forward.reduced.limits import mistakes
-from forward.reduced.model import ReducedModel, outside_of
+from forward.reduced.model import ReducedModel
+from forward.reduced.newton import outside_of
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 

@@ -1,0 +1,88 @@
+"""Reduced models of a block under a ball whose depth, radius and place are random: errors at unseen samples, times."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+
+from forward.hyperelastic import Hyperelastic
+from forward.model import SolveError
+from forward.reduced.model import ReducedModel
+from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.snapshots import solved
+
+BALL = {"kind": "indenter", "shape": "sphere", "on": "z-max", "at": [0.05, 0.03, 0.03], "direction": [0, 0, -1]}
+BODY = {
+    "body": {"kind": "box", "size": [0.1, 0.06, 0.03], "cells": [8, 5, 3], "cell": "hexahedron", "degree": 2},
+    "material": {"kind": "neo-hookean", "C1": 1e3, "D1": 5e3},
+    "formulation": "displacement",
+    "clamp": ["z-min"],
+    "loads": [BALL | {"depth": 0.004, "radius": 0.015}],
+    "outputs": [
+        {"name": "force", "kind": "force"},
+        {"name": "area", "kind": "contact-area"},
+        {"name": "beside", "kind": "displacement", "at": [0.05, 0.048, 0.03], "component": "z"},
+        {"name": "energy", "kind": "strain-energy"},
+        {"name": "stress", "kind": "max-von-mises"},
+    ],
+}
+MEANS = {"material.C1": 1e3, "material.D1": 5e3, "loads.indenter.depth": 0.004, "loads.indenter.radius": 0.015}
+SPREADS = {"material.C1": 100, "material.D1": 1e3, "loads.indenter.depth": 1e-3, "loads.indenter.radius": 2e-3}
+REACH, UNSEEN = 1.7, 1.5  # deviations up to which snapshots and unseen samples go
+PLACE = 0.05  # m, of the ball along x
+
+
+def main(options: Sequence[str] = ()) -> None:
+    """Print a row for each number of modes and output."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks reduced_tools")
+    parser.add_argument("--snapshots", type=int, default=24)
+    parser.add_argument("--unseen", type=int, default=24)
+    parser.add_argument("--modes", type=int, nargs="+", default=[20, 40])
+    parser.add_argument("--moving", type=float, default=0.0, help="standard deviation (m) of the place of the ball")
+    given = parser.parse_args(options)
+    names, nominal, spread = tuple(MEANS), [*MEANS.values()], [*SPREADS.values()]
+    if given.moving:
+        names, nominal, spread = (*names, "loads.indenter.x"), [*nominal, PLACE], [*spread, given.moving]
+    mean, deviation, rng = np.array(nominal), np.array(spread), np.random.default_rng(1)
+    full = Hyperelastic.model_validate(BODY).build(MPI.COMM_SELF, names)
+    begin = time.process_time()
+    snapshots = solved(full, mean + deviation * rng.uniform(-REACH, REACH, (given.snapshots, len(names))), deviation)
+    taken = time.process_time() - begin
+    points = mean + deviation * rng.uniform(-UNSEEN, UNSEEN, (given.unseen, len(names)))
+    begin = time.process_time()
+    truth = np.array([full.solve(point).outputs for point in points])
+    alone = (time.process_time() - begin) / len(points)
+    print(
+        f"{full.equations.size:,} unknowns, {given.snapshots} snapshots in {taken:.0f} s; a solve {alone:.2g} s; "
+        f"errors in % of the spread at {given.unseen} unseen samples\n"
+    )
+    print("| modes, points of the body | output | error | after correction | effectivity | a solve (ms) | truncation |")
+    print("|---|---|---|---|---|---|---|")
+    reduction = Reduction(full, mean, deviation)
+    for modes in given.modes:
+        data = reduction.reduced(snapshots, Sizes(modes=modes, cubature=1e-3))
+        model = ReducedModel(data, names)
+        found, good = [], []
+        begin = time.process_time()
+        for i, point in enumerate(points):
+            try:
+                found.append(model.solve(point))
+                good.append(i)
+            except SolveError as error:
+                print(error)
+        each = 1e3 * (time.process_time() - begin) / len(points)
+        e = truth[good] - np.array([one.outputs for one in found])
+        x = np.array([one.estimate.outputs for one in found])
+        errors, left = (100 * np.sqrt((one**2).mean(axis=0)) / truth.std(axis=0) for one in (e, e - x))
+        effectivity = (e * x).sum(axis=0) / (e**2).sum(axis=0)
+        size = f"{data.about['modes']}, {data.about['points']}"
+        for name, one, after, share in zip(model.outputs, errors, left, effectivity, strict=True):
+            print(
+                f"| {size} | {name} | {one:.2g} | {after:.2g} | {share:.2f} | {each:.2g} | "
+                f"{data.about['truncation']:.1e} |",
+                flush=True,
+            )
