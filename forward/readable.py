@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from forward.words import NONE, number, with_error
+from forward import words
+from forward.words import NONE, number, rounded, with_error
 
 # From large to small: what one of it is in the SI unit, and its name. The first that a value reaches is taken.
 SIZES: dict[str, tuple[tuple[float, str], ...]] = {
@@ -20,7 +21,6 @@ SIZES: dict[str, tuple[tuple[float, str], ...]] = {
 }
 LEAD = ("loads", "material", "inclusions", "regions", "fields", "model")  # of paths, not said
 ROUNDING = 1e-9  # of the largest coordinate of a place
-MOST = 6  # digits of a number without an error
 
 
 def scale(value: float, unit: str) -> tuple[float, str]:
@@ -38,33 +38,14 @@ def scale(value: float, unit: str) -> tuple[float, str]:
     return (smallest, sizes[-1][1]) if abs(value) > 1e-3 * smallest else (1.0, unit)
 
 
-def _decimals(error: float, digits: int) -> int:
-    return digits - 1 - math.floor(math.log10(error))
-
-
-def rounded(value: float, error: float, digits: int = 1) -> str:
-    """Write a number, rounded to so many digits of its error; to six digits if it has none."""
-    if not math.isfinite(value):
-        return number(value)
-    if not (math.isfinite(error) and error > 0):
-        return number(value, 4)
-    size = max(abs(value), error)
-    if not 1e-4 <= size < 1e7:
-        kept = max(1, min(MOST, _decimals(error, digits) + 1 + math.floor(math.log10(size))))
-        return number(value, kept)
-    most = MOST - 1 - math.floor(math.log10(size))
-    places = min(_decimals(error, digits), most)
-    return f"{round(value, places):,.{max(places, 0)}f}".replace("-", "−")
-
-
 def quantity(value: float, error: float, unit: str) -> str:
-    """Write a value to the first digit of its error in a fitting unit: 12.28 cm."""
+    """Write a value to the place of its error (`words.places`) in a fitting unit: 12.28 cm."""
     one, name = scale(value, unit)
     return _with(rounded(value / one, error / one), name)
 
 
 def size(value: float, unit: str, digits: int = 2, like: float | None = None) -> str:
-    """Write a number without an error in a fitting unit, as an error itself is: 0.33 mm; or in that of `like`."""
+    """Write a number without an error in a fitting unit: 0.33 mm; or in that of `like`."""
     one, name = scale(value if like is None else like, unit)
     return _with(number(value / one, digits), name)
 
@@ -74,14 +55,14 @@ def told(value: float, unit: str, digits: int = 2) -> str:
     return size(value, unit, digits).replace("\u00a0", " ")
 
 
+def margin(error: float, unit: str, like: float | None = None) -> str:
+    """Write an error alone in a fitting unit: 0.33 mm; or in that of `like`."""
+    one, name = scale(error if like is None else like, unit)
+    return _with(words.margin(error / one), name)
+
+
 def and_error(value: float, error: float, unit: str) -> str:
-    """Write a value and its error in one unit: 12.311 ± 0.009 cm."""
-    one, name = scale(value, unit)
-    return _with(f"{rounded(value / one, error / one)} ± {rounded(error / one, error / one)}", name)
-
-
-def precise(value: float, error: float, unit: str) -> str:
-    """Write a value and its error, which has two digits, in a fitting unit: 12.311 ± 0.0088 cm."""
+    """Write a value and its error in a fitting unit: 12.311 ± 0.009 cm."""
     one, name = scale(max(abs(value), error) if math.isfinite(error) else value, unit)
     return _with(with_error(value / one, error / one), name)
 
@@ -105,7 +86,8 @@ def interval(lower: float, upper: float, unit: str, at: float) -> str:
         return NONE
     one, name = scale(at, unit)
     width = (upper - lower) / one
-    ends = [rounded(end / one, width / 10 if width > 0 else 0.0) for end in (lower, upper)]
+    last = 5 * 10.0 ** (math.floor(math.log10(width)) - 1) if width > 0 else 0.0
+    ends = [rounded(end / one, last) for end in (lower, upper)]
     return _with((" to " if min(lower, upper) < 0 else "–").join(ends), name)
 
 

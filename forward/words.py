@@ -7,6 +7,8 @@ from typing import Any
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DIGITS = 15  # that a number has
+MOST = 6  # of a number without its error
+TWO = 3.55  # first digits of an error below which a second one is written
 NONE = "–"  # shown for a missing number
 
 
@@ -22,20 +24,48 @@ def number(value: float | None, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):,.10g}".replace("-", "−")
 
 
+def places(error: float) -> int:
+    """Return to how many decimal places an error is written, by the rule of the Particle Data Group.
+
+    Errors that begin with 10 to 35 have two digits, those with 36 to 94 one, and larger ones are rounded up to 10.
+    """
+    power = math.floor(math.log10(error))
+    return (1 if error < TWO * 10.0**power else 0) - power
+
+
+def margin(error: float) -> str:
+    """Write an error alone, as `with_error` does: 0.012, 0.04."""
+    found = _rounded([error], error, error, DIGITS)
+    return number(error, 2) if found is None else found
+
+
 def with_error(value: float, error: float) -> str:
-    """Write a value and its standard error, which has two significant digits: 0.12279 ± 0.00015."""
+    """Write a value and its error to the same place, that of `places`: 0.12279 ± 0.00015, 12.311 ± 0.009."""
+    found = _rounded([value, error], value, error, DIGITS)
+    return f"{number(value, 6)} ± {number(error, 2)}" if found is None else found
+
+
+def rounded(value: float, error: float) -> str:
+    """Write a value as `with_error` does, alone and to six digits at most; to four if it has no error."""
+    found = _rounded([value], value, error, MOST)
+    return number(value, 4) if found is None else found
+
+
+def _rounded(numbers: list[float], value: float, error: float, most: int) -> str | None:
+    """Write a value, or it and its error; None for those that have none to be rounded to."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
-        return f"{number(value, 6)} ± {number(error, 2)}"
-    decimals = 1 - math.floor(math.log10(error))
+        return None
+    decimals = places(error)
     if value:
         # Numbers have fifteen digits: an error below them is one of the last.
-        decimals = min(decimals, DIGITS - 1 - math.floor(math.log10(abs(value))))
-        error = max(error, 10.0**-decimals)
+        decimals = min(decimals, most - 1 - math.floor(math.log10(abs(value))))
+        numbers = [numbers[0], *(max(one, 10.0**-decimals) for one in numbers[1:])]
     power = _power(max(abs(value), error))
-    places = max(decimals + power, 0)
-    rounded = [round(x, decimals) / 10.0**power for x in (value, error)]
-    text = " ± ".join(f"{x:,.{places}f}" for x in rounded)
-    return _scaled(f"({text})", power) if power else text.replace("-", "−")
+    after = max(decimals + power, 0)
+    text = " ± ".join(f"{round(one, decimals) / 10.0**power:,.{after}f}" for one in numbers)
+    if not power:
+        return text.replace("-", "−")
+    return _scaled(f"({text})" if len(numbers) > 1 else text, power)
 
 
 def duration(seconds: float) -> str:

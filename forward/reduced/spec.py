@@ -187,6 +187,13 @@ class Reduced(ModelSpec):
                     f"{high:.4g}: beyond, it is an extrapolation; reduce the body over the range that is needed.",
                 )
 
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """Root mean square errors of the outputs on samples that it was not made of, in their units."""
+        about = self._about
+        spread = dict(zip((output.name for output in self.outputs), about.told["spread"], strict=True))
+        return {name: error * spread[name] for name, error in about.told.get("errors", {}).items()}
+
     def _of_errors(self) -> Iterator[Finding]:
         errors = self._about.told.get("errors", {})
         large = [f"{name} {100 * error:.2g} %" for name, error in errors.items() if error > DOUBTFUL]

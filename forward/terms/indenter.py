@@ -458,15 +458,17 @@ class Indenter(Term):
             away = extent if inside <= tolerance(body) and _behind(body, tip, d, extent) else 0.0
             where = ", ".join(f"{name} = {value:.3g}" for name, value in zip(own, ends, strict=True))
             for what, size, least in (
-                ("starts {:.3g} m inside the body, which counts as a deeper push", inside, self.depth),
-                ("stays {:.3g} m off the body, and its force is 0", left, 0.0),
-                ("goes {:.3g} m through the body, for which there is no answer", far, 0.0),
+                ("starts {} inside the body, which counts as a deeper push", inside, self.depth),
+                ("stays {} off the body, and its force is 0", left, 0.0),
+                ("goes {} through the body, for which there is no answer", far, 0.0),
                 ("points away from the body, in which it starts", away, 0.0),
             ):
                 if size > max(least + tolerance(body), found.get(what, (0.0, ""))[0]):
                     found[what] = size, where
         for what, (size, where) in found.items():
-            yield Finding("warning", f"In some samples loads.{self.label} {what.format(size)}: at {where}.")
+            yield Finding(
+                "warning", f"In some samples loads.{self.label} {what.format(told(size, 'm', 3))}: at {where}."
+            )
 
     def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
         """Return where it holds the body along its direction: a plane all of its boundary, others at their tip."""

@@ -6,11 +6,13 @@ Each function returns doubts: findings with a few words for the verdict. None of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from forward.model import FloatArray, Severity
+from forward.readable import place, told
 from uq.inputs.distributions import Distribution
 
 FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
@@ -48,7 +50,12 @@ def scores(distribution: Distribution, values: FloatArray) -> FloatArray:
 
 
 def far_from_prior(
-    priors: Mapping[str, Distribution], mode: FloatArray, mean: FloatArray, square: float, degrees: float
+    priors: Mapping[str, Distribution],
+    mode: FloatArray,
+    mean: FloatArray,
+    square: float,
+    degrees: float,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Doubt]:
     """Doubt parameters whose mode or mean is far from the prior, each by name, and all of them together.
 
@@ -61,6 +68,8 @@ def far_from_prior(
     square, degrees
         Squared distance of the mode from the centre in the directions that the data determine, over its expectation,
         and their number: χ² distributed if the truth is drawn from the prior.
+    units
+        SI units by name, of those that have one.
     """
     from scipy.special import chdtrc
 
@@ -74,8 +83,9 @@ def far_from_prior(
             centre = float(prior.from_normal(np.zeros(1))[0][0])
             value = float((mode, mean)[int(np.abs(distances).argmax())][k])
             text = (
-                f"the posterior of {name} ({value:.4g}) lies {abs(distance):.1f} prior deviations from the prior "
-                f"({centre:.4g}): the prior, the data or the model is wrong"
+                f"the posterior of {name} ({told(value, units.get(name, '1'), 4)}) lies {abs(distance):.1f} prior "
+                f"deviations from the prior ({told(centre, units.get(name, '1'), 4)}): the prior, the data or the "
+                "model is wrong"
             )
             short = f"{name} is {abs(distance):.1f} prior deviations from its prior"
             found.append(Doubt("error" if abs(distance) > FARTHER else "warning", text, short))
@@ -95,7 +105,7 @@ def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> l
     share = float((left > UNSEEN).mean())
     if share < SOME:
         return []
-    best, least = (f"{left[k]:.2g} of it at ({', '.join(f'{x:.3g}' for x in places[k])}) m" for k in _ends(left))
+    best, least = (f"{left[k]:.2g} of it at {_at(places[k])}" for k in _ends(left))
     text = (
         f"at {100 * share:.0f} % of the vertices the data say next to nothing: there the standard deviation is above "
         f"{UNSEEN:g} of the prior's, and the value follows from prior and neighbours (smallest: {best}; largest: "
@@ -104,12 +114,25 @@ def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> l
     return [Doubt("note", text, "")]
 
 
+def _at(where: FloatArray) -> str:
+    numbers, _, unit = place(where.tolist()).rpartition("\u00a0")
+    return f"({numbers}) {unit}"
+
+
 def _ends(values: FloatArray) -> tuple[int, int]:
     return int(values.argmin()), int(values.argmax())
 
 
-def at_an_end(priors: Mapping[str, Distribution], mode: FloatArray, draws: FloatArray) -> list[Doubt]:
-    """Doubt parameters at an end of a bounded range, by name, from the mode (d,) or draws (n, d) of the posterior."""
+def at_an_end(
+    priors: Mapping[str, Distribution],
+    mode: FloatArray,
+    draws: FloatArray,
+    units: Mapping[str, str] = MappingProxyType({}),
+) -> list[Doubt]:
+    """Doubt parameters at an end of a bounded range, by name, from the mode (d,) or draws (n, d) of the posterior.
+
+    Their SI units are given by name too, for the words.
+    """
     from scipy.special import ndtr
 
     found = []
@@ -121,8 +144,8 @@ def at_an_end(priors: Mapping[str, Distribution], mode: FloatArray, draws: Float
             if (share[:-1] < END).mean() > CROWDED * END or share[-1] < END / 4:
                 value = prior.support[end == "upper"]
                 text = (
-                    f"{name} is at the {end} end of its range ({value:.4g}): the data want it beyond, and its "
-                    "interval is cut off there; widen the range, or explain it"
+                    f"{name} is at the {end} end of its range ({told(value, units.get(name, '1'), 4)}): the data want "
+                    "it beyond, and its interval is cut off there; widen the range, or explain it"
                 )
                 found.append(Doubt("warning", text, f"{name} is at the {end} end of its range"))
     return found
@@ -192,13 +215,14 @@ def strangers(
     if not len(which):
         return []
     first = which[np.argsort(-np.abs(z[which]), kind="stable")][:LISTED]
-    listed = "; ".join(f"{labels[i]}: {z[i]:+.1f}" for i in first)
+    listed = "; ".join(f"{labels[i]}: {z[i]:+.1f}".replace("-", "−") for i in first)
     more = f"; and {len(which) - len(first)} more" if len(which) > len(first) else ""
     data = "1 datum does" if len(which) == 1 else f"{len(which)} data do"
     text = f"{data} not belong to the other {len(z) - len(which)}, by residuals in standard deviations: {listed}{more}"
     if heavy:
         return [Doubt("note", text, "")]
-    text += f". Look at them{', ' if remedy else ''}{remedy}"
+    them = "it" if len(which) == 1 else "them"
+    text += f". Look at {them}{', ' if remedy else ''}{remedy}"
     return [Doubt("warning", text, f"{data} not belong to the others")]
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from forward.readable import told
 from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
@@ -170,7 +171,7 @@ class Observations:
             raise DataError(*mistakes)
         kept = replace(self, places=moved).of(~far)
         lost = np.flatnonzero(far)
-        return Placed(kept, distance[~far], tuple(f"{self.labels[i]} ({distance[i]:.3g} m)" for i in lost))
+        return Placed(kept, distance[~far], tuple(f"{self.labels[i]} ({told(distance[i], 'm', 3)})" for i in lost))
 
     def data_labels(self) -> list[str]:
         """Say for each of the `components` its location in the file, place, load case, and axis or output."""

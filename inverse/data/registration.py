@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray
+from forward.readable import told
 from forward.settings import Settings
 from inverse.data.errors import StudentErrors
 from inverse.data.table import DataError
@@ -258,10 +259,10 @@ class Registered:
         shift = ", ".join(f"{x + 0.0:.4g}" for x in np.round(self.motion.shift, 9))
         words = f"rotated by {angles}° about x, y and z, shifted by {shift} m"
         if self.kind != "given":
-            words += f"; {self.count:,} points, {self.rms:.2g} m off (root mean square)"
+            words += f"; {self.count:,} points, {told(self.rms, 'm')} off (root mean square)"
         if self.uncertain:
             turn, shift = np.degrees(self.std[:3]).max(), self.std[3:].max()
-            words += f"; ± {turn:.2g}°, {shift:.2g} m, among the errors of the data"
+            words += f"; ± {turn:.2g}°, {told(shift, 'm')}, among the errors of the data"
         return words
 
     @property
@@ -372,13 +373,13 @@ def _by_landmarks(how: Landmarks, unit: float, extent: float, name: str) -> Regi
     if sizes[2] > COLLINEAR * sizes[0] and sign < 0 and (mirrored**2).sum() < (gap**2).sum() / 4:
         less = np.sqrt((mirrored**2).sum(axis=1).mean())
         raise DataError(
-            f"{name}: registration: the landmarks fit a mirror image ({less:.3g} m against {rms:.3g} m): is an axis "
-            "reversed, or are two landmarks exchanged?"
+            f"{name}: registration: the landmarks fit a mirror image ({told(less, 'm', 3)} against "
+            f"{told(rms, 'm', 3)}): is an axis reversed, or are two landmarks exchanged?"
         )
     if rms > FAR * extent:
         raise DataError(
-            f"{name}: registration: the landmarks miss their places by {rms:.3g} m (root mean square) in a body of "
-            f"{extent:.3g} m: are they in the same order, and in the unit of the file?"
+            f"{name}: registration: the landmarks miss their places by {told(rms, 'm', 3)} (root mean square) in a "
+            f"body of {told(extent, 'm', 3)}: are they in the same order, and in the unit of the file?"
         )
     if how.sigma is None:
         sigma = np.full(n, np.sqrt((gap**2).sum() / max(3 * n - 6, 1)))

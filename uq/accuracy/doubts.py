@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray
+from forward.readable import told as in_words
 from uq.estimators.rounding import only_rounding
 from uq.evaluation.evaluate import Evaluations
 
@@ -69,7 +70,7 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[
     if decides.any():
         listed = _listed(
             [
-                f"{name} {_number(e, units.get(name, '1'))} against {_number(s, units.get(name, '1'))}"
+                f"{name} {in_words(e, units.get(name, '1'))} against {in_words(s, units.get(name, '1'))}"
                 for name, e, s in zip(names[decides], error[decides], sampling[decides], strict=True)
             ],
             "; ",
@@ -118,10 +119,6 @@ def _listed(words: Sequence[str], between: str) -> str:
     """Join words, the first of many."""
     rest = [f"and {len(words) - LISTED} more"] if len(words) > LISTED + 1 else []
     return between.join([*(words[:LISTED] if rest else words), *rest])
-
-
-def _number(value: float, unit: str) -> str:
-    return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
 
 
 def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDArray[np.bool_]) -> Iterator[Finding]:

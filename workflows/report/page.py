@@ -98,7 +98,8 @@ def _read(directory: Path) -> Results:
         raise FileNotFoundError(message)
     own_code.make_visible(directory)
     try:
-        return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"]), folder=directory))
+        study = parse(tomllib.loads(dataset.attrs["config"]), folder=directory)
+        return Results(dataset, summary, study, directory)
     except StudyError as error:
         made = dataset.attrs.get("tissuq", "unknown")
         message = f"{directory}: not a study of this version of tissuq, it was made by version {made} ({error.args[0]})"

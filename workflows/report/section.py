@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible
-from forward.readable import precise
+from forward.readable import and_error
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import NONE
@@ -44,11 +44,14 @@ class Results:
         summary.json.
     study
         The study, of any kind: a section that applies to the results knows which.
+    directory
+        Where they are; None for results in memory.
     """
 
     dataset: xr.Dataset
     summary: Mapping[str, Any]
     study: Any
+    directory: Path | None = None
 
     @property
     def outputs(self) -> list[str]:
@@ -77,14 +80,14 @@ class Results:
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
-        return precise(float(of_output[name]), float(of_output[f"{name}_error"]), self.unit(output))
+        return and_error(float(of_output[name]), float(of_output[f"{name}_error"]), self.unit(output))
 
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""
         if f"{name}_corrected" not in self.dataset:
             return []
         value, error = (float(self.dataset[f"{name}_corrected{end}"].sel(at)) for end in ("", "_error"))
-        return [NONE if np.isnan(value) else precise(value, error, unit)]
+        return [NONE if np.isnan(value) else and_error(value, error, unit)]
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.words import with_error
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
 from uq.methods.compare import ESTIMATED
@@ -45,7 +46,7 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
         if "failed" in found:
             lines.append(f"{name}: failed: {found['failed']}")
             continue
-        values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
+        values = [f"{path} {with_error(at['mode'], at['std'])}" for path, at in found["posterior"].items()]
         lines.append(f"{name}: {', '.join(values)}")
         lines += [_predicted(f"{name}: {goal}", at) for goal, at in found.get("predictions", {}).items()]
     if "data" in summary:
@@ -60,8 +61,8 @@ def _predicted(what: str, at: Mapping[str, Any]) -> str:
     if at["mean"] is None:
         return f"{what} is not predicted"
     mesh = "" if at["mesh_error"] is None else f", mesh {at['mesh_error']:+.2g}"
-    before = "" if at["prior_mean"] is None else f" (before the data {at['prior_mean']:.4g} ± {at['prior_std']:.2g})"
-    return f"{what} {at['mean']:.4g} ± {at['std']:.2g}{before}{mesh}"
+    before = "" if at["prior_mean"] is None else f" (before the data {with_error(at['prior_mean'], at['prior_std'])})"
+    return f"{what} {with_error(at['mean'], at['std'])}{before}{mesh}"
 
 
 def _inversion(dataset: xr.Dataset) -> Part:

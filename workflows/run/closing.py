@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from forward.words import NONE, named
+from forward.words import NONE, named, places, with_error
 from uq.estimators.rounding import only_rounding
 from workflows.report import words
 from workflows.results.summary import inverted
@@ -14,7 +14,8 @@ from workflows.results.summary import inverted
 if TYPE_CHECKING:
     import xarray as xr
 
-DIGITS = 2, 8  # significant digits of errors, and most of values
+MOST = 8  # significant digits of values
+SMALL = -5  # power of ten below which it is written
 PARAMETERS = 12  # of which derivatives are listed
 ESTIMATES = {"mean": "", "std": "std_"}  # first part of the names of their mesh and total errors
 WIDTH = 24  # letters of a bar
@@ -24,7 +25,7 @@ Row = Sequence[str]
 def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Summarise the results at the end of a run."""
     lines = [
-        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
+        f"{model}: ln Z {with_error(found['log_evidence'], found['log_evidence_error'])}, "
         f"probability {found['probability']:.3g}{_stacking(found)}"
         for model, found in summary.get("models", {}).items()
     ]
@@ -70,7 +71,7 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
             if error is not None and f"{name}_corrected" in values:
                 total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
                 doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
-                of_mesh = [_signed(error, doubt), _error(total), f"{_value(corrected, its)} ± {_error(its)}"]
+                of_mesh = [_signed(error, doubt), _error(total), _plus_minus(corrected, its)]
             elif (
                 error is not None
             ):  # of the finest of several meshes; comparisons look at one finer mesh, and add nothing
@@ -102,8 +103,8 @@ def _bars(summary: Mapping[str, Any]) -> list[str]:
 def _line(output: str, values: Mapping[str, Any], unit: str) -> str:
     """Moments of an output."""
     return (
-        f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
-        f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+        f"{output}: mean {_plus_minus(values['mean'], values['mean_error'])} {unit}, "
+        f"standard deviation {_plus_minus(values['std'], values['std_error'])} {unit}"
     )
 
 
@@ -144,15 +145,19 @@ def _spread(
 def _with_mesh(value: float, error: float | None, doubt: float | None) -> list[str]:
     if error is None or doubt is None:
         return [f"{value:.4g}"]
-    return [f"{value:.6g}", _signed(error, doubt), f"{_value(value + error, doubt)} ± {_error(doubt)}"]
+    return [f"{value:.6g}", _signed(error, doubt), _plus_minus(value + error, doubt)]
 
 
 def _unit(dataset: xr.Dataset, output: str) -> str:
     return str(dataset.unit.sel(output=output).item())
 
 
+def _plus_minus(value: float, error: float) -> str:
+    return f"{_value(value, error)} ± {_error(error)}"
+
+
 def _error(error: float) -> str:
-    return f"{error:#.{DIGITS[0]}g}".rstrip(".") if error else "0"
+    return _value(error, error) if error else "0"
 
 
 def _signed(value: float, doubt: float) -> str:
@@ -163,8 +168,11 @@ def _value(value: float, error: float) -> str:
     """Write a value with as many digits as its error leaves."""
     if not (math.isfinite(value) and value and error > 0):
         return NONE if math.isnan(value) else f"{value:.6g}"
-    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
-    return f"{value:#.{min(max(digits, DIGITS[0]), DIGITS[1])}g}".rstrip(".")
+    power = math.floor(math.log10(max(abs(value), error)))
+    after = min(places(error), MOST - 1 - power)
+    if SMALL <= power < MOST:
+        return f"{round(value, after):.{max(after, 0)}f}"
+    return f"{value:.{max(power + after, 0)}e}"
 
 
 def _table(rows: Sequence[Row]) -> Iterator[str]:

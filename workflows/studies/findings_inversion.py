@@ -77,7 +77,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     names = [str(name) for name in one.parameter.values]
     mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
     square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
-    d = len(names) - (study.method.noise is not None)
+    d, units = len(names) - (study.method.noise is not None), study.units_of("/")
     if study.field:
         centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
         priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
@@ -85,8 +85,8 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         found += criticism.little_seen(*stiffness)
     else:
         priors = dict(study.inputs.marginals)
-        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d])
-    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees)
+        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
+    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
     seen = np.isfinite(one["measured"].to_numpy())
     residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
     if study.method.noise is not None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from forward.external.derivatives import contradicted
 from forward.model import Finding
+from forward.readable import percent
 from forward.words import number, with_error
 
 if TYPE_CHECKING:
@@ -62,6 +63,10 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
     return said
 
 
+def _by(P: float) -> str:
+    return f"a probability of {percent(P)}".replace("\u00a0", " ").replace("of above", "above")
+
+
 def findings(dataset: xr.Dataset) -> list[Finding]:
     """Say which model the data support, by how much, how certain that is and what it depends on."""
     order = by_probability(dataset, dataset["log_evidence"])
@@ -71,7 +76,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     if len(order) > 1:
         ln_B, error = bayes_factor(dataset, best, order[1])
         support = (
-            f"{best} is the most probable of the candidates, with {number(100 * P, 4)} %; ln of the Bayes factor over "
+            f"{best} is the most probable of the candidates, with {_by(P)}; ln of the Bayes factor over "
             f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B) if ln_B >= 0 else AGAINST}."
         )
     else:

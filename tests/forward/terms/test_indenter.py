@@ -361,9 +361,9 @@ def test_a_tool_does_not_press_on_what_is_held(held):
 @pytest.mark.parametrize(
     ("name", "ends", "said"),
     [
-        ("x", (-0.05, 0.05), "stays 0.0452 m off the body, and its force is 0: at x = -0.05."),
-        ("z", (0.015, SIDE), "starts 0.005 m inside the body, which counts as a deeper push: at z = 0.015."),
-        ("depth", (1e-3, 0.03), "goes 0.01 m through the body, for which there is no answer: at depth = 0.03."),
+        ("x", (-0.05, 0.05), "stays 4.52 cm off the body, and its force is 0: at x = -0.05."),
+        ("z", (0.015, SIDE), "starts 5 mm inside the body, which counts as a deeper push: at z = 0.015."),
+        ("depth", (1e-3, 0.03), "goes 1 cm through the body, for which there is no answer: at depth = 0.03."),
         ("direction_z", (-1.0, 1.0), "points away from the body, in which it starts: at direction_z = 1."),
     ],
 )

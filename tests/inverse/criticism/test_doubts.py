@@ -34,7 +34,7 @@ def test_a_posterior_far_from_its_prior_is_named():
     mode, mean = np.array([3.4e3, 0.5]), np.array([3.3e3, 0.4])
     (doubt,) = far_from_prior(priors, mode, mean, 64.0, 2.0)
     assert doubt.severity == "error"
-    assert "mu (3400) lies 8.0 prior deviations from the prior (1000)" in doubt.text
+    assert "mu (3,400) lies 8.0 prior deviations from the prior (1,000)" in doubt.text
     assert "kappa" not in doubt.text
     assert not far_from_prior(priors, np.array([1500.0, 1.0]), np.array([1500.0, 1.0]), 3.0, 2.0)
     (doubt,) = far_from_prior(priors, np.array([1500.0, 0.0]), np.array([2000.0, 0.0]), 3.0, 2.0)  # the mean alone
@@ -101,7 +101,7 @@ def test_data_that_do_not_belong_are_listed():
     r[[7, 200]] = 9.0, -6.0
     (doubt,) = strangers(r, np.zeros(300), labels, heavy=False)
     assert "2 data do not belong" in doubt.text
-    assert "line 7: +9.0; line 200: -6.0" in doubt.text
+    assert "line 7: +9.0; line 200: −6.0" in doubt.text
     assert doubt.severity == "warning"
     assert strangers(r, np.zeros(300), labels, heavy=True)[0].severity == "note"
     assert not strangers(

@@ -129,7 +129,7 @@ def test_points_are_put_on_the_body(table):
     np.testing.assert_allclose(placed.observations.places[0], [0, 0.5, 0.5])
     np.testing.assert_allclose(placed.distances, [0.01, 0, 0])
     left = found.on(BODY.nearest, 1.0, 1e-3, leave_out=True)
-    assert left.left_out == ("data.csv: line 4 (0.01 m)",)
+    assert left.left_out == ("data.csv: line 4 (1 cm)",)
     assert left.observations.labels == found.labels[1:]
     with pytest.raises(DataError, match=r"a displacement of 400 m in a body of 1 m.*data\.unit"):
         read(table(TABLE.replace("0.4", "400")), CASES).on(BODY.nearest, 1.0, 0.0)

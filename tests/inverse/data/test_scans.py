@@ -342,7 +342,7 @@ def test_scans_of_another_body(tmp_path):
     placed, *_ = read_on(
         tmp_path / "scan.vtu", ("press",), other, Reading(**reading.model_dump() | {"beyond": "leave-out"})
     )
-    assert placed.left_out == ("scan.vtu: point 3 (0.001 m)", "scan.vtu: point 5 (0.001 m)")
+    assert placed.left_out == ("scan.vtu: point 3 (1 mm)", "scan.vtu: point 5 (1 mm)")
     assert len(placed.observations.places) == 4
 
 

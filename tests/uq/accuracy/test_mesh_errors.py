@@ -379,8 +379,8 @@ def test_a_tolerance_that_hides_the_mesh_is_told():
 def test_where_the_mesh_decides_and_where_it_is_coarse():
     _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.02 * p[0] / p[1], 0.2 * p[0] ** 2 / p[1]]))
     said = {one.severity: one.text for one in findings(found)}
-    assert "u 0.017 m against" in said["note"]
-    assert "v 0.22 Pa against" in said["note"]
+    assert "u 1.7 cm against" in said["note"]
+    assert "v 220 mPa against" in said["note"]
     assert "mean: v 20%" in said["warning"] or "standard deviation: v 20%" in said["warning"]
     assert "u" not in said["warning"].rpartition(":")[2]
     _, found = studied(MonteCarlo(samples=8), on_mesh(lambda p: [1e-6 * p[0], 1e-6]))

@@ -157,10 +157,10 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         "x-min clamped",
         "uniform: lower = 600, upper = 900",
         "kg/m³",
-        readable.precise(float(sag["mean"]), float(sag["mean_error"]), "m"),
-        readable.precise(float(sag["std"]), float(sag["std_error"]), "m"),
-        readable.precise(float(sag["plain_mean"]), float(sag["plain_mean_error"]), "m"),
-        readable.precise(float(sag["quantiles"][0]), float(sag["quantiles_error"][0]), "m"),
+        readable.and_error(float(sag["mean"]), float(sag["mean_error"]), "m"),
+        readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
+        readable.and_error(float(sag["plain_mean"]), float(sag["plain_mean_error"]), "m"),
+        readable.and_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0]), "m"),
         f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
         "2.6667 × 10⁻⁴ m/(kg/m³)",
         "root mean square of the derivative",
@@ -224,8 +224,8 @@ def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
         "scatter of 16 independent scrambles",
         "a 95 % interval is ± 2.13 of them",
         words_,
-        readable.precise(float(sag["mean"]), float(sag["mean_error"]), "m"),
-        readable.precise(float(sag["std"]), float(sag["std_error"]), "m"),
+        readable.and_error(float(sag["mean"]), float(sag["mean_error"]), "m"),
+        readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
         f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
     ):
         assert text in page, text
@@ -426,8 +426,8 @@ def test_comparison_puts_studies_side_by_side(tmp_path, sampled, undrawn):
     for dataset, name in ((sampled, "controlled"), (plain, "plain")):
         sag = dataset.sel(output="sag")
         assert f">{name}<" in page
-        assert readable.precise(float(sag["mean"]), float(sag["mean_error"]), "m") in page
-        assert readable.precise(float(sag["std"]), float(sag["std_error"]), "m") in page
+        assert readable.and_error(float(sag["mean"]), float(sag["mean_error"]), "m") in page
+        assert readable.and_error(float(sag["std"]), float(sag["std_error"]), "m") in page
     assert page.count("<figure>") == 2 * 2
     assert page.count("12 s") == 2
     assert "<i>" not in page
@@ -514,8 +514,10 @@ def test_two_samples_of_a_linear_model_are_drawn():
 @pytest.mark.parametrize(
     ("value", "error", "text"),
     [
-        (0.122790298, 4.92e-5, "0.122790 ± 0.000049"),
-        (0.5, 0.0996, "0.500 ± 0.100"),
+        (0.122790298, 4.92e-5, "0.12279 ± 0.00005"),
+        (0.5, 0.0996, "0.50 ± 0.10"),
+        (0.827, 0.119, "0.83 ± 0.12"),
+        (0.827, 0.367, "0.8 ± 0.4"),
         (-24059.7, 351.2, "−24,060 ± 350"),
         (1.23456e-7, 2.3e-9, "(1.235 ± 0.023) × 10⁻⁷"),
         (7.6543e8, 1.2e6, "(7.654 ± 0.012) × 10⁸"),

@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 from forward.reduced.data import load as load_model
+from forward.reduced.model import ReducedModel
 from tests import launch
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
@@ -93,6 +94,32 @@ def test_a_study_of_it_gives_what_the_body_gives(folder, looked_at):
     np.testing.assert_allclose(found.field_mean, body.field_mean, atol=5e-3 * float(np.abs(body.field_mean).max()))
     assert (folder / "used" / "report.html").exists()
     looked_at(folder / "used")
+
+
+@pytest.mark.parametrize("where", ["made", "used"])
+def test_sliders_give_what_the_reduced_model_gives(folder, chromium, where):
+    """Outputs and displacements at parameters of its own, to a few of the errors that are printed beside them."""
+    if chromium is None:
+        pytest.skip("no Chromium is installed")
+    data = load_model(folder / "model.npz")
+    model = ReducedModel(data, data.parameters)
+    chromium.open(folder / where / "report.html")
+    assert "solves of the reduced model, which itself errs by" in chromium.run(
+        "document.querySelector('.sliders').textContent"
+    )
+    expansion = "document.querySelector('.viewer').viewer.expansion"
+    error = chromium.run(f"{expansion}.wanted.map((o) => o.error)")
+    rounding, loo = chromium.run(f"[{expansion}.field.rounding, {expansion}.field.loo]")
+    spread = float(np.sqrt((data.snapshots.std(axis=0) / data.nominal).max()))  # of displacements, roughly
+    for point in ([850.0, 1050.0], [1150.0, 920.0], [1010.0, 1000.0]):
+        solution = model.solve(np.array(point))
+        at = json.dumps(dict(zip(data.parameters, point, strict=True)))
+        found = chromium.run(f"document.querySelector('.viewer').viewer.at({at})")["outputs"]
+        assert [one["name"] for one in found] == list(model.outputs)
+        off = np.abs(np.array([one["mean"] for one in found]) - solution.outputs)
+        assert (off < 3 * np.array(error)).all()
+        moved = np.array(chromium.run("Array.from(document.querySelector('.viewer').viewer.motion)"))
+        assert np.abs(moved - solution.state).max() < rounding + 4 * loo * spread * np.abs(solution.state).max()
 
 
 def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):

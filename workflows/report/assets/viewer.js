@@ -47,6 +47,12 @@ function digits(value, count = 4) {
   if (power < -4 || power > 6) return value.toExponential(count - 1).replace("-", "−").replace(/e(.*)/, " × 10^$1").replace("+", "");
   return value.toFixed(Math.max(0, count - 1 - power)).replace("-", "−");
 }
+// A value to the place of its error: that of its second digit from 10 to 35, else of its first.
+function rounded(value, error) {
+  const power = error > 0 && isFinite(error) ? Math.floor(Math.log10(error)) : NaN, places = (error < 3.55 * 10 ** power ? 1 : 0) - power;
+  if (isNaN(power) || places > 12 || !isFinite(value)) return digits(value, 4);
+  return (places > 0 ? value.toFixed(places) : String(Math.round(value * 10 ** places) / 10 ** places)).replace("-", "−");
+}
 const withUnit = (text, unit) => (unit === "1" ? text : `${text}\u00a0${unit}`);
 const said = (value, unit, count) => { const [one, name] = fitting(value, unit); return withUnit(digits(value / one, count), name); };
 
@@ -713,8 +719,9 @@ class Viewer {
       const outputs = x.outputs(), outside = x.outside(), fixed = x.fixed.some(Boolean);
       table.replaceChildren(...outputs.map((o, k) => {
         const [one, name] = fitting(o.mean, o.unit), of = (v) => digits(v / one, 4), rest = x.fixed.every(Boolean);
-        const words = rest ? `± ${digits(o.error / one, 2)} (of the expansion)` : `95 %: ${of(o.interval[0])} to ${of(o.interval[1])}`;
-        return make("div", { className: "output" }, make("b", { textContent: o.name }), make("strong", { textContent: withUnit(of(o.mean), name) }), make("span", { textContent: words }), bars(o, this.all[k]));
+        const words = rest ? `± ${rounded(o.error / one, o.error / one)} (${whose})` : `95 %: ${of(o.interval[0])} to ${of(o.interval[1])}`;
+        const value = rest ? rounded(o.mean / one, o.error / one) : of(o.mean);
+        return make("div", { className: "output" }, make("b", { textContent: o.name }), make("strong", { textContent: withUnit(value, name) }), make("span", { textContent: words }), bars(o, this.all[k]));
       }));
       rows.forEach((row, i) => {
         row.line.classList.toggle("fixed", x.fixed[i]);
@@ -774,7 +781,8 @@ class Viewer {
     const many = 6, lines = rows.map((_, i) => i).sort((a, b) => weight(b) - weight(a) || a - b).map((i) => rows[i].line);
     const more = lines.length > many ? [make("details", {}, make("summary", { textContent: `${lines.length - many} more parameters` }), ...lines.slice(many))] : [];
     const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${x.field.loo !== null && isFinite(x.field.loo) ? `, whose leave-one-out error is ${digits(100 * x.field.loo, 2)} % of the standard deviation` : ""}.` : "";
-    panel.append(make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}` }),
+    const whose = this.told.sliders.source ? "of the expansion and the reduced model" : "of the expansion";
+    panel.append(make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}${this.told.sliders.source ? ` ${this.told.sliders.source}` : ""}` }),
       table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free);
     panel.hidden = false;
     shown();

@@ -191,7 +191,7 @@ def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
     if "field_mean_error" in of:
         yield Quantity("Sampling error of the mean displacement", _size(of["field_mean_error"]), "m", "plasma")
     names = of["parameter"].to_numpy() if "parameter" in of.coords else np.zeros(0, dtype=str)
-    if "field_derivative" in of:
+    if "field_derivative_rms" in of:
         effects = of["field_derivative_rms"] * of["parameter_std"]
         for parameter in names[np.argsort(-effects.to_numpy())][:DERIVATIVES_SHOWN]:
             values = of["field_derivative"].sel(parameter=parameter) * float(

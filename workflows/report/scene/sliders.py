@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray
+from forward.model import FloatArray, SolveError
 from forward.readable import spoken
-from forward.words import named
+from forward.registry import named
+from forward.words import named as with_its_unit
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.scene.pack import Packer
@@ -35,17 +37,37 @@ FARTHEST = 3.72  # standard normal deviations that a slider reaches where a dist
 
 @dataclass(frozen=True)
 class Sliders:
-    """An expansion, and what its parameters are."""
+    """An expansion, and what its parameters are.
+
+    Attributes
+    ----------
+    expansion
+        Of outputs and perhaps displacements.
+    given
+        Distributions of the parameters by their names; None for coefficients of random fields.
+    parameter_units, units
+        Of parameters by their paths, and of outputs by their names.
+    errors
+        Of the outputs (m,), one standard error.
+    drawn
+        The outputs that are shown.
+    field_loo
+        Leave-one-out error of the displacements, relative to their standard deviation; NaN without.
+    source
+        What the expansion is of, in a sentence, if not of the model itself.
+    samples
+        (n, d) of parameters that depend on each other.
+    """
 
     expansion: Expansion
     given: Mapping[str, Distribution | None]
     parameter_units: dict[str, str]
     units: dict[str, str]
-    loo: FloatArray
-    std: FloatArray
+    errors: FloatArray
     drawn: list[str]
     field_loo: float
-    samples: FloatArray | None = None  # (n, d) of parameters that depend on each other
+    source: str = ""
+    samples: FloatArray | None = None
 
     def packed(self, pack: Packer, nodes: IntArray) -> dict[str, Any]:
         """Put the modes of the field at some nodes among other arrays, and return the rest."""
@@ -58,11 +80,12 @@ class Sliders:
                     "name": name,
                     "unit": self.units[name],
                     "coefficients": of.coefficients[:, k].tolist(),
-                    "error": float(self.loo[k] * self.std[k]) if np.isfinite(self.loo[k]) else 0.0,
+                    "error": float(self.errors[k]) if np.isfinite(self.errors[k]) else 0.0,
                 }
                 for k, name in enumerate(of.output_names)
                 if name in self.drawn
             ],
+            "source": self.source,
         }
         if self.samples is not None:
             told["joint"] = self._joint(pack, self.samples)
@@ -129,7 +152,7 @@ class Sliders:
             degree = int(basis.joint.indices.max(initial=0))
         return {
             "path": name,
-            "name": named(spoken(name), self.parameter_units.get(name, "1")),
+            "name": with_its_unit(spoken(name), self.parameter_units.get(name, "1")),
             "low": low,
             "high": high,
             "fitted": [float(self.expansion.lower[i]), float(self.expansion.upper[i])],
@@ -178,13 +201,17 @@ class Sliders:
 def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
     """Return the sliders of a study; None without an expansion, or of too many parameters.
 
-    Of parameters that depend on each other by a copula there are none: expansions are not of these.
+    A reduced model is cheap enough to make an expansion of, where the study has none. Of parameters that depend on each
+    other by a copula there are no sliders: expansions are not of these.
     """
     given: Mapping[str, Distribution | None] | None = getattr(study, "given", None)
-    if "multi_index" not in dataset or given is None or dataset.sizes["parameter"] > MOST:
+    if given is None or dataset.sizes["parameter"] > MOST or bool(getattr(study, "correlations", False)):
         return None
-    if bool(getattr(study, "correlations", False)):
-        return None
+    if "multi_index" not in dataset:
+        of = of_reduced(study)
+        if of is None:
+            return None
+        dataset = of
     expansion, samples = Expansion.of(dataset), None
     if expansion.basis.joint is not None:
         inputs = study.inputs
@@ -199,12 +226,26 @@ def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
         {name: given.get(name) for name in expansion.parameters},
         dict(study.units_of("/")),
         {name: str(dataset["unit"].sel(output=name).item()) for name in outputs},
-        dataset["loo_error"].to_numpy(),
-        dataset["std"].to_numpy(),
+        np.hypot(dataset["loo_error"] * dataset["std"], np.nan_to_num(dataset.get("own_error", 0.0))),
         drawn,
         float(dataset["field_loo_error"]) if "field_loo_error" in dataset else float("nan"),
+        dataset.attrs.get("source", ""),
         samples,
     )
+
+
+def of_reduced(study: Any) -> xr.Dataset | None:
+    """Fit an expansion to the reduced model that a study samples; None if it samples another, or this cannot be."""
+    spec = getattr(study, "spec", None)
+    if getattr(spec, "kind", "") != "reduced":
+        return None
+    try:
+        found: xr.Dataset = named("workflows.report.scene.of_reduced:expanded")(
+            Path(spec.file), study, alone=spec.larger
+        )
+    except SolveError:
+        return None
+    return found
 
 
 def _heights(values: FloatArray, at: FloatArray) -> FloatArray:

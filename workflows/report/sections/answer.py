@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import and_error, interval, percent, precise, quantity, size, spoken
-from forward.words import duration, number
+from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
+from forward.words import duration, number, with_error
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
@@ -93,6 +93,9 @@ def forward(results: Results) -> Card:
         if not counts[output]:
             answers.append(Answer(output, "0", ("zero but for rounding",)))
             continue
+        itself = model_errors(results).get(output)
+        if itself is not None:
+            errors["reduced model"] = itself
         error = whole(errors)
         lines = [] if not sampled else [spread(one, unit, value)]
         lines += known(errors, unit, value)
@@ -111,6 +114,11 @@ def meshed(results: Results) -> bool:
     return bool(getattr(getattr(results.study, "spec", None), "meshed", False))
 
 
+def model_errors(results: Results) -> dict[str, float]:
+    """Return errors of the model itself by output, if it is a reduced one: what a mean may be off by at most."""
+    return dict(getattr(getattr(results.study, "spec", None), "errors", {}))
+
+
 def whole(errors: dict[str, float]) -> float:
     """Return the total of errors by source: as estimated, otherwise the square root of the sum of squares."""
     total = errors.get("total", np.nan)
@@ -122,12 +130,12 @@ def known(errors: dict[str, float], unit: str, value: float) -> Iterator[str]:
     """Say how well a number is known, and the parts of its error."""
     total = whole(errors)
     parts = [
-        f"{source} {size(e, unit, like=value)}"
+        f"{source} {margin(e, unit, like=value)}"
         for source, e in errors.items()
         if source != "total" and np.isfinite(e) and e >= UNSEEN * total
     ]
     if total > 0:
-        yield f"known to ± {size(total, unit, like=value)}" + (f": {', '.join(parts)}" if parts else "")
+        yield f"known to ± {margin(total, unit, like=value)}" + (f": {', '.join(parts)}" if parts else "")
     if "sampling" in errors and "mesh" in errors and not np.isfinite(errors["mesh"]):
         yield "the error of its mesh is not known"
 
@@ -264,7 +272,7 @@ def _over_sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
         unit, middle_ = units.get(str(name), "1"), float(np.median(mean))
         lines = [
             f"specimens from {interval(float(mean.min()), float(mean.max()), unit, middle_)}",
-            f"each known to ± {size(float(np.median(std)), unit, like=middle_)} (median)",
+            f"each known to ± {margin(float(np.median(std)), unit, like=middle_)} (median)",
         ]
         yield Answer(f"{spoken(str(name))}, median", quantity(middle_, float(np.median(std)), unit), lines)
 
@@ -274,8 +282,8 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     before, wide = float(one["prior_mean"]), float(one["prior_std"])
     narrower = wide / std if std > 0 else np.inf
     lines = [
-        f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {size(std, unit, like=mean)}",
-        f"before the data {precise(before, wide, unit)}: "
+        f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}",
+        f"before the data {and_error(before, wide, unit)}: "
         + (f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"),
     ]
     if np.isfinite(one["true"]):
@@ -314,7 +322,7 @@ def selection(results: Results) -> Card:
     for rank, model in enumerate(order):
         one = of.sel(model=model)
         error = float(one["log_evidence_error"])
-        lines = [f"ln Z {number(float(one['log_evidence']), 6)} ± {number(error, 2)}"]
+        lines = [f"ln Z {with_error(float(one['log_evidence']), error)}"]
         if rank == 0 and len(order) > 1:
             ln_B, _ = bayes_factor(of, model, order[1])
             lines.append(f"{_odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.model import SolveError
 from forward.readable import size
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Text, Viewer
 from workflows.report.section import Results, Section
@@ -30,7 +32,9 @@ class Body(Section):
         """Whether one body was deformed, with or without a stored displacement, or specimens were inverted."""
         if "stiffness_mean" in results.dataset:
             return bool(results.dataset["ok"].any()) and "cell_nodes" in results.dataset
-        return "nominal" in results.dataset and bool(results.study.spec.meshed)
+        if _file(results) is not None:
+            return True
+        return "nominal" in results.dataset and (bool(results.study.spec.meshed) or "cell_nodes" in results.dataset)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The body, or why there is none."""
@@ -43,12 +47,30 @@ class Body(Section):
             yield specimen(one, results)
             return
         yield Heading("The deformed body")
+        reduced = _file(results)
+        if reduced is not None:
+            from workflows.report.scene.of_reduced import expanded
+
+            try:
+                dataset = expanded(reduced, results.study).assign_attrs(config=dataset.attrs["config"])
+            except SolveError as error:
+                yield Text(f"The reduced model has no answer: {error}.", "warning")
+                return
         if "cell_nodes" not in dataset:
             yield Text("This study stores no displacement field.")
             return
         scene = forward_scene(dataset, results.study)
+        by = f"{scene.motion_name}, {largest(dataset)}" + (", by the reduced model" if reduced is not None else "")
         yield turning(scene, f"The body, deformed by {scene.motion_name}", largest(dataset))
-        yield Text(f"Deformed by {scene.motion_name}, {largest(dataset)}, to scale. Drag to turn it.")
+        yield Text(f"Deformed by {by}, to scale. Drag to turn it.")
+
+
+def _file(results: Results) -> Path | None:
+    """Return the reduced model that was made, if it is still there."""
+    if "reduced" not in results.summary or results.directory is None:
+        return None
+    path = results.directory / results.summary["reduced"]["file"]
+    return path if path.exists() else None
 
 
 def specimen(one: xr.Dataset, results: Results) -> Viewer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.readable import precise
+from forward.readable import and_error
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -33,7 +33,7 @@ class AveragedCandidates(Section):
                 one = of.sel(candidate=name, output=output)
                 share = f"{100 * float(one['candidate_probability']):.3g} %"
                 cells = [
-                    precise(float(one[f"candidate_{m}"]), float(one[f"candidate_{m}_error"]), unit) for m in MOMENTS
+                    and_error(float(one[f"candidate_{m}"]), float(one[f"candidate_{m}_error"]), unit) for m in MOMENTS
                 ]
                 rows.append((name, share, *cells))
             rows.append(("all", "100 %", *(results.estimate(output, m) for m in MOMENTS)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import precise, size
+from forward.readable import and_error, margin, size
 from forward.words import NONE
 from uq.estimators.rounding import only_rounding
 from workflows.report import plots
@@ -140,10 +140,10 @@ def table(results: Results, names: list[str]) -> Table:
                 (
                     f"{ESTIMATES[name]} of {output}",
                     size(value, unit, 6),
-                    size(known(f"{name}_error"), unit, like=value),
-                    NONE if np.isnan(error) else precise(error, doubt, unit),
-                    size(total, unit, like=value),
-                    NONE if np.isnan(error) else precise(corrected, its_error, unit),
+                    margin(known(f"{name}_error"), unit, like=value),
+                    NONE if np.isnan(error) else and_error(error, doubt, unit),
+                    margin(total, unit, like=value),
+                    NONE if np.isnan(error) else and_error(corrected, its_error, unit),
                 )
             )
     head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")

@@ -66,7 +66,7 @@ def evidences(dataset: xr.Dataset) -> Table:
         ]
         if stacked:
             share, error = (100 * float(of_model[name]) for name in ("stacking", "stacking_error"))
-            row.append(f"{number(share, 3)} ± {number(error, 2)} %")
+            row.append(f"{with_error(share, error)} %")
         if nested:
             value = float(of_model["nested_log_evidence"].sum())
             row.append(with_error(value, float(np.sqrt((of_model["nested_log_evidence_error"] ** 2).sum()))))

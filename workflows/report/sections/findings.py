@@ -29,4 +29,5 @@ class Findings(Section):
         notes = [Text(one.text) for one in found if one.severity == "note"]
         yield from notes[:NOTES]
         if len(notes) > NOTES:
-            yield Folded(f"{len(notes) - NOTES} more notes", notes[NOTES:])
+            more = len(notes) - NOTES
+            yield Folded(f"{more} more note{'s' * (more > 1)}", notes[NOTES:])

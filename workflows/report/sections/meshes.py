@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.readable import precise
+from forward.readable import and_error
 from forward.words import duration, number
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
@@ -76,7 +76,7 @@ def differences(results: Results, output: str) -> Table:
     for level in results.dataset["level"].to_numpy():
         here = results.dataset.sel(output=output, level=level)
         unit = results.unit(output)
-        text = precise(float(here["difference_mean"]), float(here["difference_mean_error"]), unit)
+        text = and_error(float(here["difference_mean"]), float(here["difference_mean_error"]), unit)
         rest = (
             "mesh_variance",
             "difference_variance",

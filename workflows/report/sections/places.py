@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.readable import precise
+from forward.readable import and_error
 from forward.specimen import Specimen
 from forward.words import named, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
@@ -85,7 +85,7 @@ def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Ta
     for k, case, name, unit in _outputs(one, model):
         of = one.isel(datum=k)
         pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        shown = [precise(float(of[value]), float(of[error]), unit) for value, error in pairs]
+        shown = [and_error(float(of[value]), float(of[error]), unit) for value, error in pairs]
         told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
         rows.append((case, name, *shown, number(float(of["residual"]), 3), *told))
     head = ["load case", "output", "measured", "predicted", "residual over its error"]

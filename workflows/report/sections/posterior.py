@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.readable import precise, scale, size, spoken
+from forward.readable import and_error, scale, size, spoken
 from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
@@ -133,7 +133,7 @@ def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str
     yield "directions about which the data say more than the prior", f"{seen} of {directions:,}"
     yield "directions determined", number(float(one["determined"]), 3)
     if np.isfinite(one["log_evidence_error"]):
-        yield "ln Z", f"{number(float(one['log_evidence']), 7)} ± {number(float(one['log_evidence_error']), 2)}"
+        yield "ln Z", with_error(float(one["log_evidence"]), float(one["log_evidence_error"]))
     yield "ln Z by Laplace", number(float(one["laplace_log_evidence"]), 7)
     square, degrees = (number(float(one[f"residual_{name}"]), 4) for name in ("square", "degrees"))
     chance = number(float(one["residual_probability"]), 2)
@@ -276,7 +276,7 @@ def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
         of = one.isel(datum=k)
         pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
         output = str(one.case.values[int(of["datum_case"])])
-        shown = [precise(float(of[value]), float(of[error]), units.get(output, "1")) for value, error in pairs]
+        shown = [and_error(float(of[value]), float(of[error]), units.get(output, "1")) for value, error in pairs]
         rows.append((output, *shown, _shown(of["residual"], 3)))
     return Table(("output", "measured", "predicted", "residual over its error"), rows)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import between, precise, size
+from forward.readable import and_error, between, size
 from forward.words import NONE, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -60,9 +60,9 @@ def table(one: xr.Dataset) -> Table:
         rows.append(
             (
                 str(goal),
-                precise(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
+                and_error(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
                 between(lower, upper, unit),
-                precise(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
+                and_error(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
                 f"{number(100 * share, 3)} %" if np.isfinite(share) else NONE,
                 size(mesh, unit) if np.isfinite(mesh) else "not estimated",
             )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forward.readable import precise
+from forward.readable import and_error
 from workflows.report.blocks import Block, Heading, Table
 from workflows.report.section import Results, Section
 
@@ -30,9 +30,9 @@ def quantiles(results: Results) -> Table:
     for output in results.outputs:
         of_output = results.dataset.sel(output=output)
         pairs = zip(of_output["quantiles"].to_numpy(), of_output["quantiles_error"].to_numpy(), strict=True)
-        rows.append((output, *(precise(float(q), float(e), results.unit(output)) for q, e in pairs)))
+        rows.append((output, *(and_error(float(q), float(e), results.unit(output)) for q, e in pairs)))
         if "quantiles_corrected" in results.dataset and np.isfinite(of_output["quantiles_corrected"]).all():
             ends = (of_output[f"quantiles_corrected{end}"].to_numpy() for end in ("", "_error"))
-            corrected = [precise(float(q), float(e), results.unit(output)) for q, e in zip(*ends, strict=True)]
+            corrected = [and_error(float(q), float(e), results.unit(output)) for q, e in zip(*ends, strict=True)]
             rows.append((f"{output}, corrected for the mesh", *corrected))
     return Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)

@@ -75,9 +75,9 @@ def card(results: Results) -> Card:
         true, estimated = (results.dataset[f"reduced_{w}"].sel(output=name) for w in ("error", "estimate"))
         rms = float(((true - estimated) ** 2).mean() ** 0.5)
         lines = [
-            f"of its spread, or {size(rms, results.unit(name))}, after the correction",
-            f"before it {percent(error)}",
+            f"of its spread ({size(rms, results.unit(name))}), corrected by the residual",
+            f"{percent(error)} without the correction",
+            f"its own estimates of errors are {number(told['effectivity'][name], 2)} times the true ones",
         ]
-        effectivity = f"estimates are {number(told['effectivity'][name], 2)} times the errors"
-        answers.append(Answer(name, percent(left), [*lines, effectivity]))
+        answers.append(Answer(f"error of {name}", percent(left), lines))
     return Card("How well does a reduced model follow the body?", answers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.readable import precise
+from forward.readable import and_error
 from forward.words import number
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
@@ -41,7 +41,7 @@ class Tolerance(Section):
             [
                 (
                     f"{WORDS[estimate]} of {name}",
-                    precise(of["value"], of["error"], results.unit(name)),
+                    and_error(of["value"], of["error"], results.unit(name)),
                     *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
                 )
                 for name, estimates in told["outputs"].items()

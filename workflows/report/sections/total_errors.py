@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.readable import size
+from forward.readable import margin
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
 
@@ -30,6 +30,6 @@ def total_errors(results: Results) -> Table:
         of_output = results.dataset.sel(output=output)
         for word, first in (("mean", ""), ("standard deviation", "std_")):
             names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
-            errors = [size(float(of_output[name]), results.unit(output)) for name in names]
+            errors = [margin(float(of_output[name]), results.unit(output)) for name in names]
             rows.append((f"{word} of {output}", *errors))
     return Table(("estimate", "sampling", "mesh", "total"), rows)
