@@ -61,9 +61,10 @@ def margin(error: float, unit: str, like: float | None = None) -> str:
     return _with(words.margin(error / one), name)
 
 
-def and_error(value: float, error: float, unit: str) -> str:
-    """Write a value and its error in a fitting unit: 12.311 ± 0.009 cm."""
-    one, name = scale(max(abs(value), error) if math.isfinite(error) else value, unit)
+def and_error(value: float, error: float, unit: str, like: float | None = None) -> str:
+    """Write a value and its error in a fitting unit: 12.311 ± 0.009 cm; or in that of `like`."""
+    largest = max(abs(value), error) if math.isfinite(error) else value
+    one, name = scale(largest if like is None else like, unit)
     return _with(with_error(value / one, error / one), name)
 
 

@@ -387,4 +387,4 @@ def test_a_study_says_it_all(tmp_path):
         assert (data["stability"].to_numpy() == Stability.REFUSED).sum() == refused
         assert data["points"].to_numpy()[data["stability"].to_numpy() == Stability.REFUSED].min() > 120
     report = (tmp_path / "out" / "report.html").read_text()
-    assert "stability of the states" in report
+    assert "Stability of the states" in report

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.words import number
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, text_of
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
         drawn = np.where(values >= floor, values, left)
         ax.barh(at, drawn - left, left=left, height=0.9 * height, color=PART_COLOURS[name], label=name)
         for y, value, end in zip(at, values, drawn, strict=True):
-            text = f"{value:.1e}" if np.isfinite(value) else "not estimated"
+            text = f"{number(100 * value, 2)} %" if np.isfinite(value) else "not estimated"
             ax.annotate(
                 text if end > left else f"{name} {text}",
                 (end, y),
@@ -58,6 +59,7 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
             )
     ax.set_xscale("log")
     ax.set_xlim(left, 8 * largest)
+    ax.xaxis.set_major_formatter(lambda x, _: f"{number(100 * x, 1)} %")
     ax.set_yticks(places, [text_of(name) for name in names])
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlabel(f"error of the {of}, relative to it")

@@ -66,6 +66,10 @@ def in_fitting_units(figure: Any) -> None:
             continue
         axis.set_label_text(axis.get_label_text()[: found.start()] + f"({name})")
         axis.set_major_formatter(_ticks(one))
+        other = axis.axes.yaxis
+        if axis is axis.axes.xaxis and other.get_label_text().endswith(f"(1/{found[1]})"):  # a density over it
+            other.set_label_text(other.get_label_text().removesuffix(f"(1/{found[1]})") + f"(1/{name})")
+            other.set_major_formatter(_ticks(1 / one))
 
 
 def _ticks(one: float) -> Any:

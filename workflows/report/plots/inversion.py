@@ -357,7 +357,10 @@ def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     places = np.arange(len(names))
     degrees = one["misfit_degrees"].to_numpy()
     ax.bar(places, one["misfit"].to_numpy(), color=CONTROLLED, width=0.55)
-    ax.errorbar(places, degrees, yerr=2 * np.sqrt(2 * degrees), fmt="_", color=DARK, markersize=18, capsize=5)
+    reach = 2 * np.sqrt(2 * degrees)
+    ax.errorbar(
+        places, degrees, yerr=[np.minimum(reach, degrees), reach], fmt="_", color=DARK, markersize=18, capsize=5
+    )
     ax.set_xticks(places, names, rotation=45 if len(names) > len(COLOURS) else 0)
     ax.set_ylabel("|r|²")
     return ax

@@ -129,7 +129,7 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     ax.set_xlabel(quantity(dataset, output))
     unit = str(dataset["unit"].sel(output=output).item())
     ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
-    ax.legend(fontsize="small", framealpha=0.7)
+    ax.legend(fontsize="small", frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
     return ax
 
 

@@ -71,5 +71,5 @@ def averages(results: Results) -> Table:
             )
         )
     place = "at" if quantity == "stress" else "datum"
-    head = ("group", "test", place, "measured", "averaged prediction", "std within models", "std between models")
+    head = ("group", "test", place, "measured", "averaged prediction", "spread within models", "spread between models")
     return Table(head, rows, text=frozenset({0, 1}))

@@ -19,7 +19,10 @@ class Density(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """A picture of each output."""
         yield Heading("Distribution and convergence")
-        for output in results.drawn:
-            yield Heading(output, level=3)
-            caption = f"Density of {output} by the expansion, mean and quantiles."
-            yield Pictures([Picture.drawn(plots.histogram(results.dataset, output), caption)], small=True)
+        drawn = [
+            Picture.drawn(
+                plots.histogram(results.dataset, output), f"Density of {output} by the expansion, mean and quantiles."
+            )
+            for output in results.drawn
+        ]
+        yield Pictures(drawn, small=True)

@@ -69,6 +69,8 @@ def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
         found["sampling"] = dataset[f"{name}_error"].to_numpy()
     if f"{first}mesh_error" in dataset:
         found["mesh"] = np.abs(dataset[f"{first}mesh_error"].to_numpy())
+        if f"{first}mesh_error_doubt" in dataset:  # as it is in the total
+            found["mesh"] += dataset[f"{first}mesh_error_doubt"].to_numpy()
     tolerance = getattr(getattr(results.study.model, "solver", None), "tolerance", None)
     if tolerance is not None:
         found["solver"] = tolerance * np.abs(dataset[name].to_numpy())
@@ -141,7 +143,7 @@ def table(results: Results, names: list[str]) -> Table:
                     f"{ESTIMATES[name]} of {output}",
                     size(value, unit, 6),
                     margin(known(f"{name}_error"), unit, like=value),
-                    NONE if np.isnan(error) else and_error(error, doubt, unit),
+                    NONE if np.isnan(error) else and_error(error, doubt, unit, like=value),
                     margin(total, unit, like=value),
                     NONE if np.isnan(error) else and_error(corrected, its_error, unit),
                 )

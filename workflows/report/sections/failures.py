@@ -9,7 +9,7 @@ from forward.readable import size
 from forward.words import NONE
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import counted
+from workflows.report.words import counted, stability
 
 
 class Failures(Section):
@@ -23,6 +23,8 @@ class Failures(Section):
         """How many failed, at which parameters, and why."""
         failed, listed = results.summary["failed"], len(results.summary["failures"])
         yield Heading("Failed solves")
+        if "stability" in results.summary:
+            yield Text(f"{stability(results.summary['stability']).capitalize()}.")
         if not listed:
             yield Text("None failed.")
             return

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from workflows.report.blocks import Block, Heading, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import counted, stability
+from workflows.report.words import counted
 
 
 class Header(Section):
@@ -17,7 +17,7 @@ class Header(Section):
         return True
 
     def content(self, results: Results) -> Iterator[Block]:
-        """Title, method, number of solves, and how stability was tested."""
+        """Title, method and number of solves."""
         summary = results.summary
         yield Heading(f"Study {summary['study']}", level=1)
         yield Text(str(type(results.study.method).__doc__).partition("\n")[0], "lead")
@@ -26,5 +26,3 @@ class Header(Section):
             yield Text(f"{sets} data sets, {failed}; {counted(results.solves)}")
         else:
             yield Text(f"{summary['stopped']}; {counted(results.solves)}, {failed}")
-        if "stability" in summary:
-            yield Text(stability(summary["stability"]))

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.readable import and_error, scale, size, spoken
-from forward.words import named, number, with_error
+from forward.readable import and_error, interval, scale, size, spoken
+from forward.words import margin, named, number, rounded, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
@@ -88,7 +88,7 @@ class Posterior(Section):
 
 def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tuple[list[str], list[list[str]]]:
     """Return heads and rows of posterior widths: by each load case alone, then by all; a column in one unit."""
-    sizes = {name: scale(float(one["together_std"].sel(parameter=name)), units.get(name, "1")) for name in names}
+    sizes = {name: scale(float(one["alone_std"].sel(parameter=name).median()), units.get(name, "1")) for name in names}
     rows = [[of["alone_std"].sel(parameter=name) for name in names] for of in each_case(one)]
     rows.append([one["together_std"].sel(parameter=name) for name in names])
     heads = [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()]
@@ -182,17 +182,15 @@ def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[s
     """Name, prior, mode, posterior, interval; width by Laplace if there is one, truth if known; in one unit."""
     one, unit = scale(float(of["mean"]), unit)
 
-    def said(which: str, digits: int = 4) -> str:
-        return number(float(of[which]) / one, digits)
-
     row = [named(name, unit), with_error(float(of["prior_mean"]) / one, float(of["prior_std"]) / one)]
-    row += [said("mode"), with_error(float(of["mean"]) / one, float(of["std"]) / one)]
-    row.append(f"{said('lower')} to {said('upper')}")
+    std = float(of["std"]) / one
+    row += [rounded(float(of["mode"]) / one, std), with_error(float(of["mean"]) / one, std)]
+    row.append(interval(float(of["lower"]) / one, float(of["upper"]) / one, "1", 1.0))
     if laplace:
-        row.append(said("laplace_std", 2) if "laplace_std" in of else "")
+        row.append(margin(float(of["laplace_std"]) / one) if "laplace_std" in of else "")
     if known:
         inside = float(of["lower"]) <= float(of["true"]) <= float(of["upper"])
-        row += [said("true"), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
+        row += [number(float(of["true"]) / one, 4), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
     return row
 
 
