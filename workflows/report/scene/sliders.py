@@ -236,7 +236,7 @@ def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
 
 def of_reduced(study: Any) -> xr.Dataset | None:
     """Fit an expansion to the reduced model that a study samples; None if it samples another, or this cannot be."""
-    spec = getattr(study, "spec", None)
+    spec: Any = getattr(study, "spec", None)
     if getattr(spec, "kind", "") != "reduced":
         return None
     try:
