@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 File = h5py.File
 OTHER = "_nc4_non_coord_"  # before the name of a variable that has the name of a dimension
+OF_FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_FillValue"}
+ENCODED = {"scale_factor", "add_offset", "missing_value", "calendar"}  # attributes of numbers that are not as written
 
 
 def in_memory(creation: Any = None) -> h5py.File:
@@ -91,10 +93,11 @@ def holds(path: Path, group: str) -> bool:
 
 
 class Variable(NamedTuple):
-    """A variable of a netCDF file: numbers or texts, and the names of their dimensions."""
+    """A variable of a netCDF file: numbers or texts, the names of their dimensions, and what is said about them."""
 
     values: Any
     dims: tuple[str, ...]
+    attributes: Mapping[str, Any] = {}
 
 
 def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dict[str, Any]]:
@@ -108,17 +111,54 @@ def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dic
         If it is no HDF5 file.
     """
     with h5py.File(io.BytesIO(content), "r") as file:
-        part = file[group] if group and isinstance(file.get(group), h5py.Group) else file
-        found = {}
-        for name, one in part.items():
-            if not isinstance(one, h5py.Dataset) or b"not a netCDF variable" in bytes(one.attrs.get("NAME", b"")):
-                continue
-            dims = tuple(Path(dim[0].name).name if len(dim) else "" for dim in one.dims)
-            texts = h5py.check_string_dtype(one.dtype) is not None
-            values = one.asstr()[()] if texts else one[()]
-            coordinate = h5py.h5ds.is_scale(one.id) and np.ndim(values) == 1  # its own dimension
-            found[name.removeprefix(OTHER)] = Variable(values, (name,) if coordinate else dims)
-        return found, dict(part.attrs)
+        part = file[group] if group and isinstance(file.get(group), h5py.Group) else file["/"]
+        return _variables(part), dict(part.attrs)
+
+
+def _variables(part: Any) -> dict[str, Variable]:
+    """Variables of a group, in the order in which they were made where that is kept."""
+    found = {}
+    for name, one in part.items():
+        if not isinstance(one, h5py.Dataset):
+            continue
+        attributes = dict(one.attrs)
+        if b"not a netCDF variable" in bytes(attributes.get("NAME", b"")):
+            continue
+        dims = tuple(Path(dim[0].name).name if len(dim) else "" for dim in one.dims)
+        texts = h5py.check_string_dtype(one.dtype) is not None
+        values = one.asstr()[()] if texts else one[()]
+        coordinate = h5py.h5ds.is_scale(one.id) and np.ndim(values) == 1  # its own dimension
+        about = {key: _plain(value) for key, value in attributes.items() if key not in OF_FORMAT}
+        found[name.removeprefix(OTHER)] = Variable(values, (name,) if coordinate else dims, about)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    return value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
+
+
+def stored_dataset(path: Path) -> xr.Dataset:
+    """Return the variables of a netCDF-4 file outside its groups, like ``xarray.load_dataset``, five times as fast.
+
+    Raises
+    ------
+    OSError
+        If it is no HDF5 file.
+    """
+    import xarray as xr
+
+    with h5py.File(path, "r") as file:
+        found, about = _variables(file["/"]), {key: _plain(value) for key, value in file.attrs.items()}
+    if any(ENCODED & one.attributes.keys() for one in found.values()):  # by another program
+        return xr.load_dataset(path, engine="h5netcdf")
+    made, coordinates = {}, set()
+    for name, (values, dims, said) in found.items():
+        coordinates |= {name} if dims == (name,) else set(said.get("coordinates", "").split())
+        texts = isinstance(values, str) or values.dtype == object
+        kind = np.str_ if texts else bool if said.get("dtype") == "bool" else None
+        about_it = {key: value for key, value in said.items() if key not in ("dtype", "coordinates")}
+        made[name] = (dims, np.asarray(values, dtype=kind), about_it)
+    return xr.Dataset(made, attrs=about).set_coords([name for name in made if name in coordinates])
 
 
 def stored_array(path: Path, place: str) -> FloatArray:

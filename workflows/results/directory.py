@@ -51,7 +51,7 @@ def read_dataset(directory: Path) -> xr.Dataset:
     FileNotFoundError
         If the directory holds no results of a study.
     """
-    import xarray as xr
+    from uq.evaluation.hdf5 import stored_dataset
 
     path = directory / "results.nc"
     again = "`tissuq run` with the same study and --out makes it again"
@@ -62,7 +62,7 @@ def read_dataset(directory: Path) -> xr.Dataset:
             message = f"{directory}: results.nc is missing, although the study is finished; {again}"
         raise FileNotFoundError(message)
     try:
-        found = xr.load_dataset(path, engine="h5netcdf")
+        found = stored_dataset(path)
     except (MemoryError, PermissionError):
         raise
     except Exception as error:  # HDF5 says in many ways that a file is damaged

@@ -303,6 +303,7 @@ ON_A_SMALL_DISK = """
 import resource, sys
 from mpi4py import MPI  # whose own files may be large
 from workflows.__main__ import main
+sys.dont_write_bytecode = True  # Python keeps what it could write of a module, and stumbles over it later
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 sys.exit(main(["run", *sys.argv[2:]]))
 """

@@ -14,6 +14,7 @@ from forward.readable import SIZES, is_path, scale, spoken
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
 LOW, HIGH = "#0b6bb8", "#d1622b"
@@ -23,21 +24,33 @@ COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1
 
 def png(ax: Axes) -> bytes:
     """Return the whole figure of axes as a PNG file."""
-    file = io.BytesIO()
     whole = ax.get_figure(root=True)
     assert whole is not None
     in_fitting_units(whole)
-    whole.savefig(file, format="png", dpi=130)
+    return png_of(whole, dpi=130)
+
+
+def png_of(figure: Figure, dpi: float) -> bytes:
+    """Return a figure as a PNG file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    _lay_out(figure, dpi)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
     return file.getvalue()
 
 
 def svg(ax: Axes) -> bytes:
     """Return the whole figure of axes as an SVG file; what has thousands of points is a picture within."""
     import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     whole = ax.get_figure(root=True)
     assert whole is not None
     in_fitting_units(whole)
+    FigureCanvasSVG(whole)
+    _lay_out(whole, FigureCanvasSVG.fixed_dpi)
     for each in whole.axes:
         for artist in (*each.collections, *each.lines):
             artist.set_rasterized(_points(artist) > MANY_POINTS)
@@ -46,6 +59,15 @@ def svg(ax: Axes) -> bytes:
     with mpl.rc_context({"svg.hashsalt": "tissuq", "svg.fonttype": "path"}):
         whole.savefig(file, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     return file.getvalue()
+
+
+def _lay_out(figure: Figure, dpi: float) -> None:
+    """Place all parts of a figure once and for all: to save one whose layout is open draws everything twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(dpi)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def in_fitting_units(figure: Any) -> None:

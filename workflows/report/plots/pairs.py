@@ -52,16 +52,15 @@ def pairs(
     figure.set_layout_engine(None)
     wide, high = figure.get_size_inches()
     figure.subplots_adjust(0.75 / wide, 0.55 / high, 1 - 0.1 / wide, 1 - 0.1 / high, 0.12, 0.12)
-    grid = figure.subplots(n, n, squeeze=False, sharex="col")
+    places = figure.add_gridspec(n, n)
+    tops: list[Axes] = []  # of the columns, which share their axis
     used = weights > 1e-6 * weights.max()
     shares = weights[used] / weights[used].sum()
     draws = [np.asarray(columns[name])[used] for name in names]
     ends = [_wide(span(x, shares), truth) for x, truth in zip(draws, [*truths, *[np.nan] * n], strict=False)]
-    for i, j in np.ndindex(n, n):
-        ax: Axes = grid[i, j]
-        if j > i:
-            ax.remove()
-            continue
+    for i, j in [(row, column) for row in range(n) for column in range(row + 1)]:
+        ax = figure.add_subplot(places[i, j], sharex=tops[j] if j < i else None)
+        tops += [ax] * (i == j)
         if i == j:
             at = np.linspace(*ends[i], CURVE)
             ax.fill_between(
@@ -80,7 +79,7 @@ def pairs(
                     ax.axhline(values[i], linewidth=0.9, color=line)
         ax.set_xlim(ends[j])
         ax.locator_params(axis="x", nbins=3)
-        ax.tick_params(labelsize="x-small")
+        ax.tick_params(labelsize="x-small", labelbottom=i == n - 1)
         ax.spines[["top", "right"]].set_visible(False)
         if i == n - 1:
             ax.set_xlabel(names[j], fontsize="small")
@@ -88,8 +87,7 @@ def pairs(
             ax.set_ylabel(names[i], fontsize="small")
         elif j > 0:
             ax.tick_params(labelleft=False)
-    corner: Axes = grid[0, 0]
-    return corner
+    return tops[0]
 
 
 def density(draws: FloatArray, shares: FloatArray, at: FloatArray, worth: float | None = None) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.readable import scale
+from workflows.report.plots.figure import png_of
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
 from workflows.results.level import IntArray
 
@@ -25,12 +25,10 @@ TRANSPARENT = 0.28
 def still(scene: Scene, quantity: Quantity) -> bytes:
     """Draw a body, deformed and coloured, as a PNG: triangles from far to near."""
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=SIZE, layout="constrained")
-    FigureCanvasAgg(figure)
     ax = figure.add_subplot()
     view, skin = looking(scene.up), scene.skin
     one, unit = scale(float(np.nanmax(np.abs(quantity.values), initial=0.0)), quantity.unit)
@@ -76,9 +74,7 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
     bar.ax.tick_params(labelsize=8)
     if quantity.names:
         bar.set_ticks(range(-1, len(quantity.names)), labels=["–", *(n.replace("$", r"\$") for n in quantity.names)])
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
-    return file.getvalue()
+    return png_of(figure, DPI)
 
 
 def _rgb(colour: str) -> FloatArray:
