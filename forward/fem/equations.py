@@ -250,11 +250,13 @@ class Discretisation(Linearisation):
 
         They are differences from the `imbalance` at u (that of a `Residual`).
         """
-        largest = np.abs(rows[:, : 3 * self.nodes_owned]).max(axis=1, initial=0.0)
         products = np.empty_like(rows)
-        for row, product, size in zip(rows, products, largest, strict=True):
-            step = self._nudge / max(-ranks.smallest(self.comm, -float(size)), float(np.finfo(float).tiny))
-            product[:] = (self._imbalance(u + step * row) - imbalance) / step
+        for i, row in enumerate(rows):
+            moved = row[: 3 * self.nodes_owned]
+            size = -ranks.smallest(self.comm, min(float(moved.min(initial=0.0)), -float(moved.max(initial=0.0))))
+            step = self._nudge / max(size, float(np.finfo(float).tiny))
+            np.subtract(self._imbalance(u + step * row), imbalance, out=products[i])
+            products[i] /= step
         products[:, self.fixed] = 0
         return products
 

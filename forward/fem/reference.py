@@ -150,7 +150,7 @@ class ReferenceFactor:
                     equations.set_parameters(parameters)
                     equations.at_load(1.0)
                     products = equations.stiffness_near(state, imbalance, along)
-                    total += turn(products, R.swapaxes(0, 1)) / (2 * step)
+                    total += turn(products, R, back=True) / (2 * step)
                 total[:, equations.fixed] = 0
                 return total
 
@@ -198,7 +198,7 @@ class ReferenceFactor:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
         equations = self._equations
         equations.set_state(u)
-        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(equations.gradients()), self._rotations))
+        return rotations(equations.gradients(), self._rotations)
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""

@@ -7,23 +7,14 @@ of its source, in the folder of compiled forms.
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from forward.machine import compiled_forms
 from forward.model import FloatArray
+from forward.native import library
 from forward.reduced.graph import CODES, SELECT, Tape
 
-# NaN and infinity keep their meaning, unlike with -ffast-math.
-_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fPIC", "-shared")
 _INFIX = {"add": "+", "mul": "*", "div": "/"}
 _NAMES = {"ln": "log", "abs": "fabs"}
 
@@ -130,31 +121,11 @@ def _source(tape: Tape, varying: int) -> str:
 
 
 def _compiled(source: str, name: str) -> Any | None:
-    """Return a function of C, compiled or as it was kept; None without a compiler, or if it fails."""
-    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc")
-    processor = ""
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        processor = next(line for line in lines if line.startswith("flags"))
-    key = hashlib.sha256("\n".join([source, processor, *_FLAGS]).encode()).hexdigest()[:24]
-    folder = compiled_forms() / "kernels"
-    kept = folder / f"{key}.so"
-    if not kept.exists():
-        if compiler is None:
-            return None
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as place:
-                (Path(place) / "kernel.c").write_text(source, encoding="ascii")
-                command = [*compiler.split(), *_FLAGS, "-o", f"{place}/kernel.so", f"{place}/kernel.c", "-lm"]
-                subprocess.run(command, check=True, capture_output=True)
-                (Path(place) / "kernel.so").rename(kept)
-        except (OSError, subprocess.CalledProcessError):
-            return None
-    try:
-        function = getattr(ctypes.CDLL(str(kept)), name)
-    except OSError:
+    """Return a function of C; None without a compiler, or if it fails."""
+    found = library(source)
+    if found is None:
         return None
+    function = getattr(found, name)
     longs = 4 if name == "spread" else 1
     function.argtypes = [ctypes.c_long] * longs + [ctypes.c_void_p] * 3
     function.restype = None

@@ -4,59 +4,59 @@ Between two states of a slender body it is mostly the orientation of its parts t
 is turned along with them: K(u)⁻¹ ≈ R K̄⁻¹ Rᵀ, where R holds at each node the rotation from the reference state to u. On
 the published beam this halves the number of corrections (docs/decisions/0004-turned-reference.md). The rotations are
 those of the polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. Stat. Comput. 7 (1986)
-1160–1174, scaled by determinants: R. Byers, H. Xu, SIAM J. Matrix Anal. Appl. 30 (2008) 822–843.
+1160–1174, scaled by norms: A. A. Dubrulle, ETNA 8 (1999) 21–25. Both are in C (`rotations.c`): with many samples in
+lockstep nothing of them stays in the cache, and each pass of NumPy reads it again.
 """
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.machine import StopError
 from forward.model import FloatArray
+from forward.native import library
 from forward.solvers.anderson import Inverse
 from forward.solvers.steps import Steps
 
 
-def rotations(F: FloatArray) -> FloatArray:
-    """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n); the identity where det F is negative."""
-    good = _determinant(_cofactors(F), F) > 0
-    X = np.where(good, F, np.eye(3)[:, :, None])
-    for _ in range(30):
-        cofactors = _cofactors(X)
-        determinant = _determinant(cofactors, X)
-        scale = np.cbrt(determinant)
-        before, X = X, X * (0.5 / scale)
-        cofactors *= 0.5 * scale / determinant  # over the determinant, they are the transposed inverse
-        X += cofactors
-        if np.abs(X - before).max(initial=0.0) < 1e-4:  # the error is its square
-            break
-    return X
+def rotations(F: FloatArray, since: FloatArray | None = None) -> FloatArray:
+    """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n), perhaps from those of an earlier state.
+
+    Where det F is negative, the identity is taken for the rotation in F.
+    """
+    F = np.ascontiguousarray(F)
+    found = np.empty_like(F)
+    n = F.shape[2]
+    _compiled().rotations(n, F.ctypes.data, None if since is None else since.ctypes.data, found.ctypes.data)
+    return found
 
 
-def _cofactors(F: FloatArray) -> FloatArray:
-    cofactors = np.empty(F.shape)
-    for i in range(3):  # rows are vector products of the other two; indices count from the end
-        b, c = F[i - 2], F[i - 1]
-        for j in range(3):
-            np.multiply(b[j - 2], c[j - 1], out=cofactors[i, j])
-            cofactors[i, j] -= b[j - 1] * c[j - 2]
-    return cofactors
-
-
-def _determinant(cofactors: FloatArray, F: FloatArray) -> FloatArray:
-    return np.asarray(F[0, 0] * cofactors[0, 0] + F[0, 1] * cofactors[0, 1] + F[0, 2] * cofactors[0, 2])
-
-
-def turn(x: FloatArray, R: FloatArray) -> FloatArray:
-    """Return x (n,) or rows (k, n) with nodal vectors turned by R (3, 3, n_owned); the rest is unchanged."""
-    n = 3 * R.shape[2]
-    y = np.array(x)
-    for row in y.reshape(-1, y.shape[-1]):  # products of long vectors: much faster than many small matrices
-        components = np.ascontiguousarray(row[:n].reshape(-1, 3).T)
-        row[:n].reshape(-1, 3)[:] = np.einsum("ijn,jn->in", R, components).T
+def turn(x: FloatArray, R: FloatArray, *, back: bool = False) -> FloatArray:
+    """Return x (n,) or rows (k, n) with nodal vectors turned by R (3, 3, n_owned), or back; the rest is unchanged."""
+    x, R = np.ascontiguousarray(x), np.ascontiguousarray(R)
+    y = np.empty_like(x)
+    n, numbers = R.shape[2], x.shape[-1]
+    _compiled().turn(n, R.ctypes.data, back, x.size // max(numbers, 1), numbers, x.ctypes.data, y.ctypes.data)
     return y
+
+
+@cache
+def _compiled() -> ctypes.CDLL:
+    found = library(Path(__file__).with_suffix(".c").read_text(encoding="utf-8"))
+    if found is None:
+        message = "rotations.c cannot be compiled: a C compiler is needed, as for the forms of FEniCSx"
+        raise StopError(message)
+    long, array = ctypes.c_long, ctypes.c_void_p
+    found.rotations.argtypes = [long, array, array, array]
+    found.turn.argtypes = [long, array, ctypes.c_int, long, long, array, array]
+    found.rotations.restype = found.turn.restype = None
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Turned:
     fixed: NDArray[np.int64]
 
     def _back(self, x: FloatArray) -> FloatArray:
-        y = turn(x, self.R.swapaxes(0, 1))
+        y = turn(x, self.R, back=True)
         y[..., self.fixed] = 0
         return y
 

@@ -222,6 +222,8 @@ class NodalAverages:
         if self._sums is not None:
             added = np.zeros((self._count, count))
             self._sums(added)
+            if self._comm.size == 1:
+                return np.divide(added.T, self._meeting, order="C").reshape(*self._shape, -1)
             sums = np.ascontiguousarray(added.T)
         else:
             values = self._values().reshape(-1, count).T

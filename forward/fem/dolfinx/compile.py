@@ -17,6 +17,7 @@ from dolfinx import fem
 
 from forward.fem.dolfinx import version
 from forward.machine import StopError, compiled_forms
+from forward.native import processor
 
 T = TypeVar("T")
 
@@ -28,12 +29,7 @@ FLAGS = ["-O3", "-march=native", *_REORDER]
 
 def _cache_directory() -> Path:
     """Folder of compiled code for this kind of processor, this Python and these flags."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        processor = next(line for line in lines if line.startswith("flags"))
-    except (OSError, StopIteration):
-        processor = ""
-    made_for = [processor, str(sysconfig.get_config_var("SOABI")), version.VERSION, *FLAGS]
+    made_for = [processor(), str(sysconfig.get_config_var("SOABI")), version.VERSION, *FLAGS]
     return compiled_forms() / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
 
 

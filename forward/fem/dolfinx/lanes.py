@@ -156,6 +156,7 @@ class Kernel:
         self.available = self._assemble is not None
         self._cells = len(places)
         self._places = _grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
+        self._at = self._places.ctypes.data
         self._kept = [_grouped(one.nodes) for one in [*coefficients, *added]], [one.values for one in coefficients]
         nodes, values = self._kept
         self._nodes, self._values = _addresses(nodes), _addresses(values)
@@ -165,12 +166,15 @@ class Kernel:
         if comm.rank == 0 and not (folder / "lanes.c").exists():
             _compile(folder_of(name), loop, folder / "lanes.c", library)
         exists = comm.bcast(library.exists() if comm.rank == 0 else None)
-        return ctypes.CDLL(str(library)).assemble if exists else None
+        if not exists:
+            return None
+        function = ctypes.CDLL(str(library)).assemble
+        function.argtypes, function.restype = [ctypes.c_int64, *[ctypes.c_void_p] * 5], None
+        return function
 
     def __call__(self, constants: FloatArray, out: FloatArray) -> None:
         """Add the values of all cells to those of the nodes in `out`, or put those of each cell there."""
-        places, values, to = (ctypes.c_void_p(array.ctypes.data) for array in (self._places, constants, out))
-        self._assemble(ctypes.c_int64(self._cells), places, self._nodes, self._values, values, to)
+        self._assemble(self._cells, self._at, self._nodes, self._values, constants.ctypes.data, out.ctypes.data)
 
 
 def _addresses(arrays: Sequence[NDArray[Any]]) -> ctypes.Array[ctypes.c_void_p]:

@@ -8,12 +8,7 @@ chapter 12). PETSc has MUMPS in double precision only; its library in single pre
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
 import re
-import shlex
-import subprocess
-import sysconfig
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,8 +17,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from forward import native
 from forward.fem.cost import SPARE
-from forward.fem.dolfinx.compile import cache_folder
 from forward.fem.dolfinx.linear import MOST_ROOM, ROOM, TOO_LITTLE_ROOM, DirectSolver, StiffnessMatrix
 from forward.machine import require
 from forward.model import FloatArray
@@ -44,20 +39,9 @@ def library() -> Any | None:
     found = next((one for one in beside if one.exists()), None)
     if found is None:
         return None
-    text = _SOURCE.read_text(encoding="utf-8")
-    shim = cache_folder() / f"single-{hashlib.sha256(f'{text}{found}'.encode()).hexdigest()[:12]}.so"
-    if not shim.exists():
-        partial = shim.with_suffix(f".{os.uname().nodename}.{os.getpid()}")
-        compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")
-        include = f"-I{found.parents[1] / 'include'}"
-        command = [*compiler, "-O2", "-fPIC", "-shared", include, str(_SOURCE), "-o", str(partial), str(found)]
-        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        if done.returncode != 0:  # no header
-            return None
-        partial.replace(shim)
-    try:
-        loaded = ctypes.CDLL(str(shim))
-    except OSError:
+    include = f"-I{found.parents[1] / 'include'}"
+    loaded = native.library(_SOURCE.read_text(encoding="utf-8"), flags=("-O2", include), against=(str(found),))
+    if loaded is None:  # no header
         return None
     loaded.begin.restype = ctypes.c_void_p
     loaded.factorise.argtypes = [
@@ -144,20 +128,34 @@ class SingleSolver:
     def _contracted(self) -> float:
         """Return the share of random errors that a refinement leaves, once only the largest are left."""
         random = np.random.default_rng(0)
-        before = self._once(random.standard_normal((TRIED, self._stiffness.matrix.getSize()[0])).astype(SINGLE))
+        before = self._scaled(random.standard_normal((TRIED, self._stiffness.matrix.getSize()[0])))
         for _ in range(TRIALS):
-            after = before - self._once(self._products(before).astype(SINGLE))
+            after = before - self._scaled(self._products(before))
             share = float((np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1)).max())
             before = after
         return share if np.isfinite(share) else np.inf
 
-    def _once(self, rights: NDArray[np.float32], *, transpose: bool = False) -> FloatArray:
-        """Solve with the factor for rows (k, n) in PETSc's order, which are overwritten."""
-        found, rows = library(), np.ascontiguousarray(rights)
+    def _once(self, rows: NDArray[np.float32], *, transpose: bool = False) -> None:
+        """Solve with the factor for rows (k, n) in PETSc's order, in place."""
+        found = library()
         assert found is not None
         status = found.solve(self._factor, rows.ctypes.data, len(rows), int(transpose and not self._symmetric))
         assert status >= 0, status
-        return rows.astype(float)
+
+    def _scaled(self, rights: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve with the factor for rows (k, n) of any size: single precision reaches from 1e-38 to 1e38 only.
+
+        Row by row, so that each stays in the cache.
+        """
+        rows, found, sizes = np.empty(rights.shape, SINGLE), np.empty(rights.shape), np.empty(len(rights))
+        for i, right in enumerate(rights):
+            size = max(float(right.max(initial=0.0)), -float(right.min(initial=0.0)))
+            sizes[i] = size if size != 0 else 1.0  # NaN stays
+            np.divide(right, sizes[i], out=rows[i], casting="same_kind")
+        self._once(rows, transpose=transpose)
+        for row, size, solution in zip(rows, sizes, found, strict=True):
+            np.multiply(row, size, out=solution)
+        return found
 
     def _products(self, rows: FloatArray, *, transpose: bool = False) -> FloatArray:
         multiply = self._stiffness.matrix.multTranspose if transpose else self._stiffness.matrix.mult
@@ -174,10 +172,7 @@ class SingleSolver:
             assert self._double is not None
             return self._double.solve(right, transpose=transpose, tolerance=tolerance)
         rights = self._stiffness.unknowns.reorder(np.atleast_2d(right))
-        # Numbers in single precision reach from 1e-38 to 1e38, and lose digits before.
-        sizes = np.abs(rights).max(axis=1, initial=0.0, keepdims=True)
-        sizes[sizes == 0] = 1.0
-        found = sizes * self._once((rights / sizes).astype(SINGLE), transpose=transpose)
+        found = self._scaled(rights, transpose=transpose)
         if tolerance < ROUGH:
             found = self._refined(found, rights, tolerance, transpose=transpose)
         return self._stiffness.unknowns.take(found).reshape(right.shape)
@@ -187,9 +182,7 @@ class SingleSolver:
         before = np.inf
         for _ in range(REFINEMENTS):
             residuals = rights - self._products(x, transpose=transpose)
-            sizes = np.abs(residuals).max(axis=1, initial=0.0, keepdims=True)
-            sizes[sizes == 0] = 1.0
-            step = sizes * self._once((residuals / sizes).astype(SINGLE), transpose=transpose)
+            step = self._scaled(residuals, transpose=transpose)
             lengths = np.linalg.norm(x, axis=1)
             share = float((np.linalg.norm(step, axis=1) / np.where(lengths > 0, lengths, 1.0)).max())
             if not share < before / 2:
