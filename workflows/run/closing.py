@@ -172,6 +172,7 @@ def _value(value: float, error: float) -> str:
     after = min(places(error), MOST - 1 - power)
     if SMALL <= power < MOST:
         return f"{round(value, after):.{max(after, 0)}f}"
+    power = math.floor(math.log10(abs(round(value, after)) or error))  # 9.6 has become 10
     return f"{value:.{max(power + after, 0)}e}"
 
 
