@@ -172,8 +172,8 @@ def _value(value: float, error: float) -> str:
     after = min(places(error), MOST - 1 - power)
     if SMALL <= power < MOST:
         return f"{round(value, after):.{max(after, 0)}f}"
-    power = math.floor(math.log10(abs(round(value, after)) or error))  # 9.6 has become 10
-    return f"{value:.{max(power + after, 0)}e}"
+    shown = round(value, after)
+    return f"{shown:.{max(math.floor(math.log10(abs(shown))) + after, 0)}e}" if shown else "0"
 
 
 def _table(rows: Sequence[Row]) -> Iterator[str]:
