@@ -30,6 +30,7 @@ DRIVERS = 3  # parameters named in a line
 UNSEEN = 0.01  # part of an error that is not worth a word
 SAID = 0.02  # share of the variance that is worth a word
 NAMED = 4  # names in a question
+GOALS = 4  # predictions on the card
 
 
 class AnswerFirst(Section):
@@ -251,7 +252,28 @@ def inversion(results: Results) -> Card:
     answers = [_unknown(one.sel(parameter=name), str(name), units.get(str(name), "1")) for name in one.parameter.values]
     if "stiffness_mean" in one and "draw" not in one:
         answers.insert(0, _stiffness(one))
+    if "prediction_share" in one:
+        goals = [str(name) for name in one["goal"].values]
+        question += f" And what {'is' if len(goals) == 1 else 'are'} {listed(goals)}, which nobody measured?"
+        answers = [*(_predicted(one.sel(goal=name), name) for name in goals[:GOALS]), *answers]
     return Card(question, answers)
+
+
+def _predicted(at: xr.Dataset, name: str) -> Answer:
+    """A quantity that was not measured, by the posterior."""
+    mean, std, lower, upper, before, wide, mesh = (
+        float(at[f"prediction_{which}"])
+        for which in ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "mesh_error")
+    )
+    unit = str(at["goal_unit"].item())
+    if not np.isfinite(mean):
+        return Answer(f"{name}, predicted", "no answer", ("it could not be predicted; the reason is below",))
+    lines = [f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}"]
+    if np.isfinite(before):
+        lines.append(f"before the data {and_error(before, wide, unit)}")
+    if np.isfinite(mesh):
+        lines.append(f"to be added for the mesh: {size(mesh, unit, like=mean)}")
+    return Answer(f"{name}, predicted", quantity(mean, std, unit), lines, leads=True)
 
 
 def _sets(of: xr.Dataset) -> Iterator[Answer]:

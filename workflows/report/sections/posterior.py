@@ -14,6 +14,7 @@ from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pict
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
 from workflows.report.plots import residuals
+from workflows.report.plots.told_by_case import told_by_case
 from workflows.report.section import Results, Section
 from workflows.report.sections.body import specimen
 from workflows.results.points import has_points
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
 PAIRABLE = 20  # draws from which on densities are drawn
+CASES_DRAWN = 24  # load cases and parameters that a map has
 DRAWN = 8  # data sets that have more than a row in the table
 
 
@@ -77,6 +79,12 @@ class Posterior(Section):
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before, units)])
             names = [str(name) for name in one.parameter.values if name != "noise"]
             yield from cases(one, *_widths(one, names, units))
+            if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
+                caption = (
+                    f"Share of the prior variance of each parameter that each {_words(one).part} alone removes, with "
+                    "the model linearised at the mode."
+                )
+                yield Pictures([Picture.drawn(told_by_case(one), caption)])
             yield Heading("Directions", level=3)
             yield Text(
                 "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
