@@ -338,6 +338,7 @@ class EnsembleEvaluate(OfModel):
             if claims is not None:
                 claims.wait(news=news or bool(found))
                 pending, news = claims.turned(pending), False
+            self.progress(0, 0)
             self.worker.dispatch(_Order(request, self.blocks, pending, keys), receive, self.progress)
         assert merger.count == len(blocks)
         return merger.result()

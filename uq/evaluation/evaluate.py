@@ -429,6 +429,18 @@ def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:
             raise ModelError(message)
 
 
+def _together(progress: Callable[[int, int], None], size: int, n: int) -> Callable[[int, int], None]:
+    """Tell a progress of n solves, by their numbers so far, when all are finished that are solved together."""
+    told = [0, 0]
+
+    def finished(solves: int, failures: int) -> None:
+        if solves % size == 0 or solves == n:
+            progress(solves - told[0], failures - told[1])
+            told[:] = solves, failures
+
+    return finished
+
+
 class BlockSolver:
     """Solves the blocks of one request on one group's model; collective over the group."""
 
@@ -465,7 +477,7 @@ class BlockSolver:
         outputs = np.full((n, m), np.nan)
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         of_meshes = _MeshErrors(n, m, saturations=self._saturations) if self._mesh_errors else None
-        seconds, solving = np.empty(n), np.zeros(n)
+        seconds, solving, finished = np.empty(n), np.zeros(n), _together(progress, model.together, n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         stability = np.zeros(n, dtype=np.int8)
@@ -506,7 +518,7 @@ class BlockSolver:
             if row is not None:
                 self._keep(rows, row)
             seconds[i] = time.process_time() - begin - solving[i]
-            progress(1, int(bool(failures) and failures[-1].index == i))
+            finished(i + 1, len(failures))
         for some in (slice(i, i + model.together) for i in range(0, n, model.together)):
             seconds[some] += solving[some].mean()
         fields = gathered(model, np.concatenate(rows)) if rows else np.zeros((0, 0))

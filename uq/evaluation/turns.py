@@ -20,7 +20,8 @@ from forward.machine import reason_to_stop
 from forward.model import ModelError, SolveError
 
 T = TypeVar("T")
-Progress = Callable[[int, int], None]  # told how many solves finished, and failed, since the last call
+# Told how many solves finished, and failed, since the last call; none and none: what follows has other costs.
+Progress = Callable[[int, int], None]
 _RESULT = 1
 SHORTEST, SHARE, LONGEST = 1e-5, 1.1, 0.01  # pauses (s) while waiting: about a tenth of what one has waited
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results

@@ -8,6 +8,7 @@ from collections import deque
 
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_MARKS = 1.0  # that the rate is computed between
+UNKNOWN = "time left not known yet"
 BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} solves [{elapsed}{postfix}]"
 
 
@@ -28,8 +29,9 @@ class Progress:
 
     Notes
     -----
-    The rate is that of the last minute, after the first solves were finished: those compile forms and factorise, which
-    is not repeated, and what was read from disk at first took no time.
+    The rate is that of the last minute of a phase: of solves that are asked for together. It begins when the first of
+    them are finished, which compile forms and factorise once for all; until the next are, neither rate nor time left is
+    known. What was read from disk, in no time, is before.
     """
 
     def __init__(self, planned: int, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
@@ -39,7 +41,7 @@ class Progress:
         self._failures = failures
         self._begin = time.monotonic()
         self._shown = self._begin  # when the last line was printed
-        self._marks: deque[tuple[float, int]] = deque()  # times and the counts then, from the first finished solve on
+        self._marks: deque[tuple[float, int]] = deque()  # times, and the counts then, of this phase
         self._bar = None
         terminal = sys.stderr.isatty()
         self._quiet = quiet or silent
@@ -50,7 +52,10 @@ class Progress:
             self._bar = tqdm(total=planned, dynamic_ncols=True, bar_format=BAR)
 
     def __call__(self, done: int, failed: int) -> None:
-        """Count solves that were finished, and how many of them failed."""
+        """Count solves that were finished, and how many of them failed; none at all: a phase begins."""
+        if not done:
+            self._marks.clear()
+            return
         self.done += done
         self.failed += failed if self._failures else 0
         now = time.monotonic()
@@ -78,9 +83,10 @@ class Progress:
     def _pace(self, now: float) -> str:
         """Solves per second since the first of the marks, and the time left by that."""
         then, before = self._marks[0]
-        rate = (self.done - before) / (now - then) if now > then else 0.0
-        left = max(self._planned - self.done, 0) / rate if rate > 0 else float("inf")
-        return f"{rate:.3g} per second, {_clock(left)} left"
+        if now <= then:
+            return UNKNOWN
+        rate = (self.done - before) / (now - then)
+        return f"{rate:.3g} per second, {_clock(max(self._planned - self.done, 0) / rate)} left"
 
     def _print(self, pace: str) -> None:
         line = f"{self.done}/{max(self._planned, self.done)} solves, {pace}{self._failures_so_far()}"
@@ -92,8 +98,6 @@ class Progress:
 
 
 def _clock(seconds: float) -> str:
-    if seconds == float("inf"):
-        return "unknown time"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

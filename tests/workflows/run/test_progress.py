@@ -74,7 +74,7 @@ def test_the_first_solve_does_not_spoil_the_time_left(capsys, clock, monkeypatch
         clock.now += 80.0 if number == 0 else 0.5
         shown(1, 0)
     first, *others = capsys.readouterr().err.splitlines()
-    assert first == "1/1001 solves, 0 per second, unknown time left"
+    assert first == "1/1001 solves, time left not known yet"
     left = [int(line.split()[0].partition("/")[0]) for line in others]
     assert [line.split(", ")[2] for line in others] == [
         f"{minutes}:{seconds:02d} left" for minutes, seconds in (divmod(round((1001 - n) / 2), 60) for n in left)
@@ -88,6 +88,25 @@ def test_the_first_solve_does_not_spoil_the_time_left(capsys, clock, monkeypatch
         shown(1, 0)
     assert shown._bar.postfix == "2 per second, 0:40 left"  # not the 53 minutes of 40 s for each
     shown.close()
+
+
+@pytest.mark.unit
+def test_each_phase_has_its_own_rate(capsys, clock):
+    """One solve alone; sixteen together after ten minutes that prepare them, 80 s for the next; two that are read."""
+    shown = Progress(100)
+    clock.now = 70.0
+    shown(1, 0)
+    for seconds, solves in ((0.0, 0), (600.0, 16), (80.0, 16), (80.0, 16), (0.0, 2), (0.0, 0), (300.0, 1), (75.0, 1)):
+        clock.now += seconds
+        shown(solves, 0)
+    assert capsys.readouterr().err.splitlines() == [
+        "1/100 solves, time left not known yet",
+        "17/100 solves, time left not known yet",
+        "33/100 solves, 0.2 per second, 5:35 left",
+        "49/100 solves, 0.2 per second, 4:15 left",
+        "52/100 solves, time left not known yet",
+        "53/100 solves, 0.0133 per second, 58:45 left",
+    ]
 
 
 @pytest.mark.unit
@@ -110,6 +129,7 @@ def test_the_command_shows_life_though_quiet(tmp_path, ranks):
     (tmp_path / "study.toml").write_text(STUDY)
     done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     assert (done.returncode, done.stdout) == (0, "")
-    counts = [re.fullmatch(r"(\d+)/10\d solves, .* per second, .* left", line) for line in done.stderr.splitlines()]
+    shown = re.compile(r"(\d+)/10\d solves, (.* per second, .* left|time left not known yet)")
+    counts = [shown.fullmatch(line) for line in done.stderr.splitlines()]
     assert len(counts) >= 2
     assert all(counts), done.stderr
