@@ -40,7 +40,7 @@ from benchmarks import (
     predictions,
     realisation,
     reduced,
-    reduced_tools,
+    reduced_bodies,
     saddle,
     scaling,
     selection,
@@ -60,7 +60,7 @@ from benchmarks import (
 ALL = {
     "realisation": realisation.main,
     "reduced": reduced.main,
-    "reduced_tools": reduced_tools.main,
+    "reduced_bodies": reduced_bodies.main,
     "live": live.main,
     "turning": turning.main,
     "bookkeeping": bookkeeping.main,
@@ -108,7 +108,7 @@ ALL = {
 }
 WITH_OPTIONS = {
     "reduced": reduced.main,
-    "reduced_tools": reduced_tools.main,
+    "reduced_bodies": reduced_bodies.main,
     "designs": designs.main,
     "intervals": intervals.main,
     "size": size.main,
