@@ -179,7 +179,7 @@ def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(fold
     assert "share of the variance" in page
     assert "And what are u, v and w, which nobody measured?" in page
     assert page.count(", predicted</h2>") == 3
-    assert "Share of the prior variance of each parameter" in page
+    assert "How many times narrower each" in page
 
 
 def test_another_model_with_the_same_unknowns(folder):

@@ -52,7 +52,11 @@ def _panels(rows: int, columns: int) -> list[list[Any]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.9 * columns + 0.8, 2.8 * rows), layout="constrained")
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    # It does not see the ticks of boxes, which would lie on the title below.
+    layout = ConstrainedLayoutEngine(h_pad=0.12, hspace=0.1)
+    figure = Figure(figsize=(2.9 * columns + 0.8, 3.0 * rows), layout=layout)
     FigureCanvasAgg(figure)
     return [
         [figure.add_subplot(rows, columns, columns * row + k + 1, projection="3d") for k in range(columns)]

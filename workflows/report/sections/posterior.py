@@ -81,8 +81,8 @@ class Posterior(Section):
             yield from cases(one, *_widths(one, names, units))
             if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
                 caption = (
-                    f"Share of the prior variance of each parameter that each {_words(one).part} alone removes, with "
-                    "the model linearised at the mode."
+                    f"How many times narrower each {_words(one).part} alone makes what was known of each parameter "
+                    "before the data, with the model linearised at the mode."
                 )
                 yield Pictures([Picture.drawn(told_by_case(one), caption)])
             yield Heading("Directions", level=3)
