@@ -51,7 +51,6 @@ def distances(one: xr.Dataset) -> Axes:
 def _panels(rows: int, columns: int) -> list[list[Any]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     # It does not see the ticks of boxes, which would lie on the title below.

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PALE = 0.55  # shades above it are written on in white
+SAID = 1.05  # times narrower from which it is written
 LEAST = 4.0  # times narrower that the darkest shade stands for, at least
 
 
@@ -32,7 +33,7 @@ def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.imshow(shades, cmap="Blues", vmin=0, vmax=1.1, aspect="auto")
     for (i, j), factor in np.ndenumerate(factors):
         colour = "white" if shades[i, j] > PALE else "black"
-        text = f"{number(float(factor), 2)} ×"
+        text = f"{number(float(factor), 2)} ×" if factor >= SAID else ""
         ax.annotate(text, (j, i), ha="center", va="center", fontsize="small", color=colour)
     ax.set_xticks(range(len(names)), [text_of(name) for name in names], rotation=25, ha="right")
     ax.set_yticks(range(len(rows)), [text_of(row) for row in rows])

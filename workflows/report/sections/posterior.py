@@ -82,7 +82,7 @@ class Posterior(Section):
             if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
                 caption = (
                     f"How many times narrower each {_words(one).part} alone makes what was known of each parameter "
-                    "before the data, with the model linearised at the mode."
+                    "before the data, with the model linearised at the mode; empty where it tells nothing."
                 )
                 yield Pictures([Picture.drawn(told_by_case(one), caption)])
             yield Heading("Directions", level=3)
