@@ -107,6 +107,7 @@ ALL = {
     "indentation": indentation.main,
 }
 WITH_OPTIONS = {
+    "throughput": throughput.main,
     "reduced": reduced.main,
     "reduced_bodies": reduced_bodies.main,
     "designs": designs.main,

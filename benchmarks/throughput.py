@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from benchmarks.beams import CONFIG
 
@@ -38,8 +41,14 @@ ensemble.run(model, task)
 """
 
 
-def main() -> None:
-    """Print the ratios, measured in turn without start-up, and the memory of 10⁴ realisations."""
+def main(options: Sequence[str] = ()) -> None:
+    """Print the ratios, measured in turn without start-up, and the memory of many realisations; or the memory only."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks throughput")
+    parser.add_argument("--memory", type=int, metavar="N", help="only the memory, of so many realisations")
+    given = parser.parse_args(list(options))
+    if given.memory is not None:
+        print(memory(given.memory))
+        return
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))}
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"}
 
@@ -63,15 +72,46 @@ def main() -> None:
 
 
 def memory(realisations: int = 10_000) -> str:
-    """Say how the resident memory grows over many realisations of a coarse body."""
-    sizes = memory_over(realisations)
+    """Say how the resident memory grows over many realisations of a coarse body, one by one and in lockstep."""
     few = realisations // 10
-    return f"memory: {sizes[0]:.1f} MiB after {few:,} realisations, {sizes[-1]:.1f} MiB after {realisations:,}"
+    lines = [
+        f"memory, {how}: {sizes[0]:.1f} MiB after {few:,} realisations, {sizes[-1]:.1f} MiB after {realisations:,}"
+        for how, sizes in (("one by one", memory_over(realisations)), ("in lockstep", memory_together(realisations)))
+    ]
+    return "\n".join(lines)
 
 
 def memory_over(realisations: int) -> list[float]:
     """Return the resident memory (MiB) after each tenth of many realisations with tangents, corrected and by Newton."""
     import numpy as np
+
+    model, inputs, prediction = _coarse()
+    guess = prediction.on(model)
+    sizes = []
+    for i in range(realisations):
+        point = inputs.mean * (1 + 0.01 * np.sin(i))
+        model.solve(point, replace(guess(point), reference=None) if i % 4 == 0 else guess(point)).tangent(np.ones(2))
+        if i % (realisations // 10) == realisations // 10 - 1:
+            sizes.append(resident())
+    return sizes
+
+
+def memory_together(realisations: int) -> list[float]:
+    """Return the resident memory (MiB) after each tenth of many realisations as studies solve them, in lockstep."""
+    from uq.evaluation.evaluate import Request, SerialEvaluate
+    from uq.inputs.sampling import random_points
+
+    model, inputs, prediction = _coarse()
+    sizes, each = [], realisations // 10
+    for tenth in range(10):
+        points = inputs.points(random_points(1, tenth * each, (tenth + 1) * each, 2))
+        SerialEvaluate(model)(Request(points, start=prediction))
+        sizes.append(resident())
+    return sizes
+
+
+def _coarse() -> tuple[Any, Any, Any]:
+    """A body of two cells, its inputs, and the tangent at their mean."""
     from mpi4py import MPI
 
     from uq.evaluation.evaluate import SerialEvaluate
@@ -82,14 +122,7 @@ def memory_over(realisations: int) -> list[float]:
     model = study.model.build(MPI.COMM_SELF, study.inputs.names)
     prediction = linearise(study.inputs, SerialEvaluate(model)).prediction
     assert prediction is not None
-    guess = prediction.on(model)
-    sizes = []
-    for i in range(realisations):
-        point = study.inputs.mean * (1 + 0.01 * np.sin(i))
-        model.solve(point, replace(guess(point), reference=None) if i % 4 == 0 else guess(point)).tangent(np.ones(2))
-        if i % (realisations // 10) == realisations // 10 - 1:
-            sizes.append(resident())
-    return sizes
+    return model, study.inputs, prediction
 
 
 def resident() -> float:
