@@ -3,17 +3,25 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import xarray as xr
 
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
+NOT_KEPT = "PYTHONDONTWRITEBYTECODE"
 
 
 def environment():
-    """The environment of a fresh shell: a process that has initialised MPI cannot start mpirun with its own."""
+    """The environment of a fresh shell: a process that has initialised MPI cannot start mpirun with its own.
+
+    Compiled modules are kept, elsewhere if not beside their sources: to compile them in each of hundreds of programs
+    takes longer than what these do.
+    """
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PMI_"))}
+    if clean.pop(NOT_KEPT, ""):
+        clean.setdefault("PYTHONPYCACHEPREFIX", f"{tempfile.gettempdir()}/tissuq-tests-{os.getuid()}")
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}  # other tests run beside
     return clean | root | shared | {"OMP_NUM_THREADS": "1"}

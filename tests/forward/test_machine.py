@@ -103,6 +103,7 @@ def test_files_are_whole_or_not_there(tmp_path):
 import resource, sys
 from pathlib import Path
 from forward.machine import StopError, write_whole
+sys.dont_write_bytecode = True  # or else parts of modules are kept
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
 try:
     write_whole(Path(sys.argv[1]), b"x" * 2000)

@@ -105,8 +105,8 @@ mesh_error = false
 RATIOS = "displacements tell ratios of stiffnesses only"
 
 
-def here(path, out):
-    return run_study(load(path), path.stem, out, quiet=True)
+def here(path, out, *, report=False):
+    return run_study(load(path), path.stem, out, quiet=True, report=report)
 
 
 def results(out):
@@ -242,7 +242,7 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
     assert any(RATIOS in finding.text and "material.mu" in finding.text for finding in blind.findings)
     assert not any(RATIOS in finding.text for finding in seeing.findings)
     here(folder / "blind.toml", folder / "out-blind")
-    here(folder / "few.toml", folder / "out-few")
+    here(folder / "few.toml", folder / "out-few", report=True)
     without, found = results(folder / "out-blind"), results(folder / "out-few")
     of = {"parameter": "material.mu"}
     spread = np.log(without["draw"].sel(of)).std() / np.sqrt(np.log1p((7 / 13) ** 2))
@@ -269,7 +269,7 @@ def test_forces_alone_are_data_enough(folder):
     (folder / "alone").mkdir()
     (folder / "alone" / "made.csv").write_text("\n".join(["case,output,value,sigma", *rows]))
     (folder / "alone.toml").write_text(FEW.replace('["data"]', '["alone"]'))
-    here(folder / "alone.toml", folder / "out-alone")
+    here(folder / "alone.toml", folder / "out-alone", report=True)
     found = results(folder / "out-alone")
     assert int(np.isfinite(found["measured"]).sum()) == len(forces) < len(data.values)
     assert int(found["points_moved"]) == 0

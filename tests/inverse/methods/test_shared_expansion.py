@@ -88,7 +88,8 @@ def folder(tmp_path_factory):
 
 
 def run(folder, name, *changes):
-    code = run_study(load(folder / "batch.toml", changes), "batch", folder / name, quiet=True)
+    shown = name == "expanded"
+    code = run_study(load(folder / "batch.toml", changes), "batch", folder / name, quiet=True, report=shown)
     found = xr.load_dataset(folder / name / "results.nc", engine="h5netcdf")
     return code, found, json.loads((folder / name / "summary.json").read_text())
 

@@ -14,7 +14,7 @@ from threading import Thread
 
 import pytest
 
-from tests.launch import ROOT, TISSUQ, environment, on_ranks, run_script
+from tests.launch import NOT_KEPT, ROOT, TISSUQ, environment, on_ranks, run_script
 from workflows.__main__ import main
 
 MODEL = """
@@ -78,7 +78,8 @@ def tissuq(*arguments, ranks=None, case="", limits=()):
         capture_output=True,
         text=True,
         timeout=300,
-        env=environment() | {"CASE": case},
+        # Of compiled modules too Python keeps what it could write, and stumbles over it later.
+        env=environment() | {"CASE": case} | ({NOT_KEPT: "1"} if limits else {}),
         check=False,
         cwd=ROOT,
         preexec_fn=limit,
@@ -303,7 +304,7 @@ ON_A_SMALL_DISK = """
 import resource, sys
 from mpi4py import MPI  # whose own files may be large
 from workflows.__main__ import main
-sys.dont_write_bytecode = True  # Python keeps what it could write of a module, and stumbles over it later
+sys.dont_write_bytecode = True  # or else parts of modules are kept
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 sys.exit(main(["run", *sys.argv[2:]]))
 """

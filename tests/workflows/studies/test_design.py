@@ -174,7 +174,7 @@ def test_variances_of_parameters_and_predictions(folder):
 @pytest.mark.fem
 def test_chosen_points_are_what_other_studies_take(folder):
     path = cube(folder, "number = 6\ncosts = { 'pull.grip' = 1.5 }\nnoises = { '*.grip' = { relative = 0.02 } }")
-    assert run(load(path), "cube", folder / "out", quiet=True) == 0
+    assert run(load(path), "cube", folder / "out", quiet=True, report=False) == 0
     found = xr.load_dataset(folder / "out" / "results.nc")
     names = found["candidate"].values[found["chosen"].to_numpy()]
     assert "pull.grip" in names  # displacements alone say nothing of the modulus where all that acts is a displacement
@@ -409,7 +409,7 @@ number = 3
 """
     )
     (tmp_path / "cube.toml").write_text(text)
-    assert run(load(tmp_path / "cube.toml"), "cube", tmp_path / "out", quiet=True) == 0
+    assert run(load(tmp_path / "cube.toml"), "cube", tmp_path / "out", quiet=True, report=False) == 0
     assert (tmp_path / "out" / "observed.toml").exists()
     found = xr.load_dataset(tmp_path / "out" / "results.nc")
     assert (np.diff(found["worth"]) > 0).all()
