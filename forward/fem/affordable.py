@@ -10,8 +10,9 @@ from forward.fem.cost import MOST_BYTES, REPORT, START, Estimate, estimate
 
 MOST_UNKNOWNS = 40_000
 TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough
+ALONE = 1.5  # the same of a mesh without an estimate of its own, where none of these is: with it the order shows best
 SHARE = 0.2  # of what a study takes without its solves
-COARSEST = 0.35  # the same for the last of these meshes: without any, half of what is seen would be in doubt
+OF_ALONE = 0.35  # the same for that mesh: without any, half of what is seen would be in doubt
 AROUND = 0.15  # processor time (s) of what estimates need besides: forms to be loaded, a longer report
 
 
@@ -24,12 +25,15 @@ class Finer(NamedTuple):
         The body there, and how many times the cells along each edge.
     seconds, bytes
         Of one solution with its estimate, and the memory.
+    estimated
+        Whether the error of that mesh is estimated too.
     """
 
     spec: Any
     times: float
     seconds: float
     bytes: float
+    estimated: bool = True
 
 
 def own_estimate(spec: Any) -> Estimate:
@@ -59,21 +63,30 @@ def richer(spec: Any) -> float:
 
 def finer(spec: Any, spare: float = math.inf) -> Finer | None:
     """Return a body on the finest mesh that is affordable; None where any takes too much."""
-    formulation, left = "mixed" if spec.mixed else "displacement", MOST_BYTES - own_estimate(spec).bytes
+    allowed = allowance(spec, spare)
     for times in TIMES:
-        allowed = allowance(spec, spare, COARSEST if times == TIMES[-1] else SHARE)
-        body = _with_cells(spec, times)
-        if body is None:
-            continue
-        there = spec.model_copy(update={"body": body, "formulation": formulation, "adapt": None})
-        cost, estimating = there.cost(factors=1), own_estimate(there)
-        if there.unknowns > MOST_UNKNOWNS or cost.bytes + estimating.bytes > left:
-            continue
-        solving = cost.setup + cost.assembly + cost.factorisation + cost.corrected
-        seconds = solving + estimating.once + estimating.seconds
-        if seconds <= allowed:
-            return Finer(there, times, seconds, cost.bytes + estimating.bytes)
-    return None
+        found = _there(spec, times, estimated=True)
+        if found is not None and found.seconds <= allowed:
+            return found
+    found = _there(spec, ALONE, estimated=False)
+    return found if found is not None and found.seconds <= allowance(spec, spare, OF_ALONE) else None
+
+
+def _there(spec: Any, times: float, *, estimated: bool) -> Finer | None:
+    """Return a body on a mesh with so many times the cells along edges; None without one, or if it is too large."""
+    body = _with_cells(spec, times)
+    if body is None:
+        return None
+    formulation = "mixed" if spec.mixed else "displacement"
+    there = spec.model_copy(update={"body": body, "formulation": formulation, "adapt": None})
+    cost = there.cost(factors=1)
+    seconds, size = cost.setup + cost.assembly + cost.factorisation + cost.corrected, cost.bytes
+    if estimated:
+        estimating = own_estimate(there)
+        seconds, size = seconds + estimating.once + estimating.seconds, size + estimating.bytes
+    if there.unknowns > MOST_UNKNOWNS or size > MOST_BYTES - own_estimate(spec).bytes:
+        return None
+    return Finer(there, times, seconds, size, estimated)
 
 
 def _with_cells(spec: Any, times: float) -> Any | None:

@@ -7,6 +7,12 @@ makes the errors of both degrees. So ψ = ψ_f + e_f + s/(1 − s) (ψ_f + e_f �
 the order that is observed (L. F. Richardson, Phil. Trans. R. Soc. A 226 (1927) 299–361). Where linear elements show an
 order a, which is 2 at most, the richer ones have 2a − 1. Orders below 1, and estimates that change their sign, are not
 believed: then it is 1, and the doubt is larger.
+
+Where the estimate on the finer mesh would take too much, ψ_h, ψ_h + e_h and ψ_f are left. Beside such singularities
+errors fall twice as fast with the degree p as with the size of cells (`forward.fem.saturation`), as C (h/p²)^a: then
+e_h/(ψ_f − ψ_h) = (1 − (p/(p+1))^2a)/(1 − t^−a), which tells a, and ψ − ψ_h = (ψ_f − ψ_h)/(1 − t^−a). For quadratic
+elements and t = 3/2 richer elements are as good as a second such mesh, and this is Aitken's extrapolation. Where no
+order shows, it is 3/2, and the doubt reaches from order 1 to 4.
 """
 
 from __future__ import annotations
@@ -30,6 +36,8 @@ if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders
+USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
+ORDERS = np.linspace(HIGHEST, LOWEST, 400)
 OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
 LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 THOROUGH = {False: 1e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
@@ -67,10 +75,25 @@ def limit(
         share = share**2 * times
     rest = share / (1 - share) * (there + e_there - values - e)
     errors = there + e_there - values + rest
-    doubts = (
-        OF_REST * (2 / times) ** 0.5 * np.abs(rest) + OF_ALL * np.abs(errors) + np.where(regular, 0.0, np.abs(e_there))
-    )
-    return Limit(errors, doubts)
+    return Limit(errors, _doubts(errors, rest, times) + np.where(regular, 0.0, np.abs(e_there)))
+
+
+def limit_alone(own: ArrayLike, seen: ArrayLike, finer: ArrayLike, times: float, degree: int = 2) -> Limit:
+    """Extrapolate errors of outputs where there is no estimate on the finer mesh; parameters as of `limit`."""
+    values, e, there = np.broadcast_arrays(*(np.asarray(part, dtype=float) for part in (own, seen, finer)))
+    gone = 1 - times**-ORDERS  # of the error, on the finer mesh
+    ratios = (1 - (degree / (degree + 1)) ** (2 * ORDERS)) / gone  # rise as the order falls
+    moved = there - values
+    ratio = np.divide(e, moved, out=np.full(e.shape, np.nan), where=moved != 0)
+    regular = (ratio >= ratios[0]) & (ratio <= ratios[-1])
+    errors = moved / np.where(regular, np.interp(ratio, ratios, gone), 1 - times**-USUAL)
+    errors = np.where(np.isnan(e), np.nan, errors)
+    return Limit(errors, _doubts(errors, errors - moved, times) + np.where(regular, 0.0, np.abs(e - moved)))
+
+
+def _doubts(errors: FloatArray, rest: FloatArray, times: float) -> FloatArray:
+    """How far errors (m,) may be wrong of which a part was extrapolated."""
+    return np.asarray(OF_REST * (2 / times) ** 0.5 * np.abs(rest) + OF_ALL * np.abs(errors))
 
 
 def saturation(seen: FloatArray, found: Limit, of_state: float) -> Saturation:
@@ -109,11 +132,11 @@ class FinerMesh:
 
     @cached_property
     def _untested(self) -> HyperelasticModel:
-        """The same, whose solutions are not tested for stability: one factorisation less."""
+        """The same for one solution: not tested for stability, which is one factorisation less, nor is its factor."""
         assert self._finer is not None
         spec = self._finer.spec
-        solver = spec.solver.model_copy(update={"kind": "predict-correct", "accept_unstable": True})
-        return self._built(spec.model_copy(update={"solver": solver}))
+        once = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
+        return self._built(spec.model_copy(update={"solver": spec.solver.model_copy(update=once)}))
 
     def _built(self, spec: Hyperelastic) -> HyperelasticModel:
         names = tuple(self._model.parameters[i] for i in self._scalars)
@@ -136,15 +159,19 @@ class FinerMesh:
         own = solution.estimated(model.enriched, (solution.enriched_state, bent))
         seen = model.enriched.values(solution, own) - solution.outputs
         other, there = self._solved(point[self._scalars], own.state)
-        richer = there.estimated(other.enriched, (there.enriched_state, bent))
-        seen_there = other.enriched.values(there, richer) - there.outputs
         times, degree = self._finer.times, model.spec.body.degree
-        found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
+        after = [there.state]
+        if self._finer.estimated:
+            richer = there.estimated(other.enriched, (there.enriched_state, bent))
+            seen_there = other.enriched.values(there, richer) - there.outputs
+            found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
+            after.append(other.enriched.down(richer.change))
+        else:
+            found = limit_alone(solution.outputs, seen, there.outputs, times, degree)
         before = _everywhere(model.equations, np.array([solution.state, model.enriched.down(own.change)]))
-        moved = np.array([there.state, other.enriched.down(richer.change)])
-        after = _moved(other.equations, model.equations, moved)
+        moved = _moved(other.equations, model.equations, np.array(after))
         n = model.space.displacements
-        return saturation(usual, found, of_states(before[:, :n], after[:, :n], times, degree))
+        return saturation(usual, found, of_states(before[:, :n], moved[:, :n], times, degree))
 
     def _solved(self, parameters: FloatArray, richer: FloatArray) -> tuple[HyperelasticModel, FiniteElementSolution]:
         """Solve from what richer elements say of the state, (U⁺_local,), with the one factor of the stiffness there.
@@ -166,16 +193,17 @@ def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) 
     Parameters
     ----------
     before, after
-        State and estimate (2, U) on the mesh, and on the finer one.
+        State and estimate (2, U) on the mesh, and on the finer one; there (1, U) without an estimate.
     times, degree
         As of `limit`.
     """
-    (own, seen), (there, seen_there) = before, after
+    (own, seen), (there, *seen_there) = before, after
     square = float(seen @ seen)
     if not square > 0:
         return 1.0
-    along = [float(x @ seen) / square for x in (there - own, seen_there)]
-    return float(np.clip(limit(0.0, 1.0, along[0], along[1], times, degree).errors, LEAST, MOST))
+    moved, *shrunk = [float(x @ seen) / square for x in (there - own, *seen_there)]
+    found = limit(0.0, 1.0, moved, *shrunk, times, degree) if shrunk else limit_alone(0.0, 1.0, moved, times, degree)
+    return float(np.clip(found.errors, LEAST, MOST))
 
 
 def _everywhere(equations: Discretisation, rows: FloatArray) -> FloatArray:

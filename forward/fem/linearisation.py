@@ -55,10 +55,11 @@ class Linearisation(Forms):
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance, often=True)
         # Equations beside others are those of an estimate, which has ways of its own.
-        self.linear = spec.linear if beside is None else Linear.FACTOR
+        self._lasting = beside is None
+        self.linear = spec.linear if self._lasting else Linear.FACTOR
         self._prescribe()
         self._of_stiffness = self.stiffness_form(imbalance)
-        if beside is None:
+        if self._lasting:
             assert self._solver  # so that memory is checked before anything else is allocated
 
     @cached_property
@@ -258,10 +259,15 @@ class Linearisation(Forms):
         return self._stiffness if self.symmetric else self._bilinear(self._symmetric_form)
 
     def new_factor(self) -> LinearSolver:
-        """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own."""
+        """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own.
+
+        For estimates in double precision: a factor in single precision is tested first, which is as much work as most
+        of them have for it.
+        """
         matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
         alone = self.comm.size == 1  # entries and right-hand sides are not distributed
-        return single.SingleSolver(matrix) if self.spec.single and alone else linear.DirectSolver(matrix)
+        small = self.spec.single and self._lasting and alone
+        return single.SingleSolver(matrix) if small else linear.DirectSolver(matrix)
 
     def new_symmetric_solver(self) -> LinearSolver:
         """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""

@@ -44,6 +44,7 @@ SEEN = 3  # last rounds of an expansion from which the next ones are predicted
 ROUNDS = 5  # of an expansion in any case, where samples are few
 SOME = 1024  # samples beyond which tails are looked at
 LEAST_POWER = 0.5  # of the number of samples with which claims fall: that of sampling
+ENOUGH = 1.1  # times the further samples that are predicted to be enough
 WORTH = 1.5  # times fewer solves, predicted: then what was begun is given up,
 PATIENCE = 0.5  # but not before it has taken this share of what would follow: expansions may begin slowly
 FUNCTIONS, LEAST_ORDER, LARGEST_ORDER = 500, 6, 20  # of the largest whole basis, and orders
@@ -142,8 +143,12 @@ class Automatic(Method):
         trail: list[tuple[int, float]] = []
         found: Expanded | None = None
         other: _Outlook | None = None
+
+        def wanted() -> float:
+            return trail[-1][0] + ENOUGH * _further(trail)
+
         try:
-            for found in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT):
+            for found in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT, wanted):
                 trail.append((found.count, goal.reached(found.regression.estimates())))
                 if trail[-1][1] <= 1:
                     break

@@ -7,7 +7,7 @@ which functions it has, and when there are enough samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up by default
-GROWTH = 1.5  # growth of the design between checks of the tolerance
+GROWTH, LEAST_GROWTH = 1.5, 1.1  # growth of the design between checks of the tolerance
 DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
 QUARTERS = 4
 BINS = 80
@@ -162,11 +162,17 @@ class Chaos(Amount):
         return min(self.samples or LARGEST, max(goal.most - 1, 2))
 
     def rounds(
-        self, inputs: Inputs, evaluate: Evaluate, limit: int | None = None, scramble: int = 0
+        self,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        limit: int | None = None,
+        scramble: int = 0,
+        wanted: Callable[[], float] | None = None,
     ) -> Iterator[Expanded]:
         """Solve and fit, again and again with more samples, up to a limit (by default that of the method).
 
-        The samples are those of a scramble of the Sobol' points. Errors as in `run`.
+        The samples are those of a scramble of the Sobol' points. After each round `wanted` may say how many there
+        should be next, at most half as many more. Errors as in `run`.
         """
         refusal = self.objection(inputs)
         if refusal is not None:
@@ -207,7 +213,8 @@ class Chaos(Amount):
                 centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
             )
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
-            target = int(min(limit, np.ceil(GROWTH * count), paid))
+            growth = GROWTH if wanted is None else max(LEAST_GROWTH, min(GROWTH, wanted() / count))
+            target = int(min(limit, np.ceil(growth * count), paid))
 
 
 def objection(inputs: Inputs, kind: str) -> str | None:

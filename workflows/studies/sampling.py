@@ -200,6 +200,12 @@ class Study(Sourced, StudyKind):
         return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
+        if "mesh_error" in self.accuracy.model_fields_set and self.accuracy.mesh_error and not self.spec.meshed:
+            yield Finding(
+                "note",
+                "The error of the mesh is not estimated, as accuracy.mesh_error = true asks for: a model of kind "
+                f"'{self.model.kind}' has no mesh of its own.",
+            )
         if self._estimating and self._too_large is not None:
             yield Finding(
                 "warning",

@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.affordable import COARSEST, MOST_UNKNOWNS, SHARE, TIMES, allowance, finer
-from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, saturation
+from forward.fem.affordable import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
+from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, saturation
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import OUTPUTS, loaded_body
 from tests.launch import run_script
@@ -39,6 +39,22 @@ def test_richer_elements_than_linear_ones_have_orders_beyond_two():
     there, richer_there = times**-order, times ** -(2 * order - 1)
     found = limit(3 + poor + rich, -poor, 3 + poor * there + rich * richer_there, -poor * there, times, degree=1)
     np.testing.assert_allclose(found.errors, -(poor + rich), rtol=1e-12)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("degree", [1, 2])
+def test_richer_elements_tell_the_order_where_a_finer_mesh_has_no_estimate(degree):
+    """Errors C (h/p²)^a, as beside edges that are held; without an order it is 3/2."""
+    order, error = np.array([1.05, 1.4, 2.0, 3.5]), np.array([1.0, -0.2, 3.0, 0.1])
+    rich, there = (degree / (degree + 1)) ** (2 * order), ALONE**-order
+    found = limit_alone(2.0 - error, error * (1 - rich), 2.0 - error * there, ALONE, degree)
+    np.testing.assert_allclose(found.errors, error, rtol=1e-3)
+    assert (found.doubts < abs(error)).all()
+    odd = limit_alone(1.0, [-0.1, 0.0, np.nan, 0.1], [1.05, 1.05, 1.05, 1.0], ALONE, degree)
+    whole = 0.05 / (1 - ALONE**-1.5)
+    np.testing.assert_allclose(odd.errors, [whole, whole, np.nan, 0.0])
+    assert (odd.doubts[:2] > 0.05 / (1 - ALONE**-1.0) - whole).all()  # that of order 1
+    assert odd.doubts[3] == pytest.approx(0.1)
 
 
 @pytest.mark.unit
@@ -177,8 +193,8 @@ def test_errors_of_a_mixed_form_are_calibrated():
 
 @pytest.mark.unit
 def test_the_finer_mesh_is_as_fine_as_is_affordable(tmp_path):
-    found, times, *_ = finer(block(degree=2))
-    assert (found.body.cells, times) == ((4, 4, 4), 2.0)
+    found, times, *_, estimated = finer(block(degree=2))
+    assert (found.body.cells, times, estimated) == ((4, 4, 4), 2.0, True)
     found, times, *_ = finer(block(cells=(7, 7, 5), degree=2))
     assert (found.body.cells, times) == ((11, 11, 8), 1.5)
     assert found.unknowns <= MOST_UNKNOWNS
@@ -247,16 +263,34 @@ def test_layers_of_plane_strain_are_not_cut():
 def test_short_studies_have_coarser_finer_meshes_or_none():
     spec = block((5, 5, 5), degree=2)
     found = [finer(spec, spare) for spare in (math.inf, 1000.0, 20.0, -2.0)]
-    times = [0.0 if one is None else one.times for one in found]
-    assert times == sorted(times, reverse=True)
-    assert times[0] == 2.0 > times[-1]
+    seconds = [0.0 if one is None else one.seconds for one in found]
+    assert seconds == sorted(seconds, reverse=True)
+    assert found[0].times == 2.0
+    assert found[-1] is None or found[-1].times < 2.0
     for one, spare in zip(found, (math.inf, 1000.0, 20.0, -2.0), strict=True):
-        share = COARSEST if one is not None and one.times == TIMES[-1] else SHARE
-        assert one is None or one.seconds <= allowance(spec, spare, share)
+        assert one is None or one.seconds <= allowance(spec, spare, SHARE if one.estimated else OF_ALONE)
     assert spec.mesh_error_cost(-2.0).calibration < spec.mesh_error_cost().calibration
     assert allowance(spec, 100.0) - allowance(spec, 0.0) == pytest.approx(100 * spec.cost().sample)
 
 
+@pytest.mark.fem
+def test_a_mesh_without_an_estimate_of_its_own_calibrates_nearly_as_well(monkeypatch):
+    """Where a study is short and richer elements are dear: those of the mixed form."""
+    energy = {"kind": "strain-energy", "name": "energy"}
+    spec = block((2, 2, 2), 2, formulation="mixed", material=SOFT, outputs=(energy,))
+    solution = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+    best = solution.saturation()
+    monkeypatch.setattr("forward.fem.affordable.TIMES", ())
+    alone = solution.saturation()
+    assert not finer(spec).estimated
+    assert alone.measured
+    assert alone.doubts > best.doubts
+    better, error = (solution.mesh_error().calibrated(one).outputs for one in (best, alone))
+    assert abs(error - better) <= alone.doubts
+    assert 0.6 < error / better < 1.6
+
+
+@pytest.mark.fem
 def test_a_finer_mesh_is_solved_on_with_one_factor():
     """The same as with Newton's method and a test of stability."""
     solution = block((3, 3, 2), degree=2).build(MPI.COMM_SELF, ()).solve(np.zeros(0))

@@ -273,3 +273,11 @@ assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and 
 """
     done = run_script(None, script)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.unit
+def test_models_without_a_mesh_say_so_where_its_error_is_asked_for():
+    own = ROOT / "configs" / "own-model.toml"
+    texts = [one.text for one in load(own, ["accuracy.mesh_error=true"]).findings]
+    assert any("a model of kind 'python' has no mesh of its own" in text for text in texts)
+    assert not any("mesh" in one.text for one in load(own).findings)
