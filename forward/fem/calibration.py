@@ -202,7 +202,7 @@ def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) 
     if not square > 0:
         return 1.0
     moved, *shrunk = [float(x @ seen) / square for x in (there - own, *seen_there)]
-    found = limit(0.0, 1.0, moved, *shrunk, times, degree) if shrunk else limit_alone(0.0, 1.0, moved, times, degree)
+    found = limit(0.0, 1.0, moved, shrunk[0], times, degree) if shrunk else limit_alone(0.0, 1.0, moved, times, degree)
     return float(np.clip(found.errors, LEAST, MOST))
 
 
