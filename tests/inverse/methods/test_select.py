@@ -140,7 +140,7 @@ def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
     strange = np.where(np.arange(18) == 4, 2 * values, values)
     (doubt,) = doubts(strange, "mooney-rivlin")
     assert "not belong to the other 1" in doubt.text
-    assert "by residuals in standard deviations: uniaxial at 2.9: -" in doubt.text  # the largest is listed first
+    assert "by residuals in standard deviations: uniaxial at 2.9: −10" in doubt.text  # the largest is listed first
     doubt, *_ = doubts(values, "neo-hookean", C1=Normal(mean=1e5, std=1e4))
     assert re.match(r"neo-hookean: the posterior of C1 .* prior deviations from the prior \(100,000\)", doubt.text)
     assert doubt.severity == "error"
