@@ -31,9 +31,9 @@ def rotations(F: FloatArray, since: FloatArray | None = None) -> FloatArray:
     Where det F is negative, the identity is taken for the rotation in F.
     """
     F = np.ascontiguousarray(F)
+    before = None if since is None else np.ascontiguousarray(since)
     found = np.empty_like(F)
-    n = F.shape[2]
-    _compiled().rotations(n, F.ctypes.data, None if since is None else since.ctypes.data, found.ctypes.data)
+    _compiled().rotations(F.shape[2], F.ctypes.data, None if before is None else before.ctypes.data, found.ctypes.data)
     return found
 
 

@@ -95,6 +95,10 @@ def test_rotations_are_those_of_the_polar_decomposition():
     F = F[np.linalg.det(F) > 0.05]
     U, _, V = np.linalg.svd(F)
     np.testing.assert_allclose(rotations(np.moveaxis(F, 0, 2)), np.moveaxis(U @ V, 0, 2), atol=1e-9)
+    since = np.moveaxis(U, 0, 2)  # from rotations of an earlier state, in any order in memory
+    np.testing.assert_allclose(
+        rotations(np.moveaxis(F, 0, 2), since), np.moveaxis(U @ V @ U.transpose(0, 2, 1), 0, 2), atol=1e-9
+    )
 
 
 def test_space_that_is_turned_over_is_not_turned():
