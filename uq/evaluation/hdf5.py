@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 File = h5py.File
+NO_VARIABLE = b"This is a netCDF dimension but not a netCDF variable."
 OTHER = "_nc4_non_coord_"  # before the name of a variable that has the name of a dimension
 OF_FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_FillValue"}
 ENCODED = {"scale_factor", "add_offset", "missing_value", "calendar"}  # attributes of numbers that are not as written
@@ -63,18 +64,67 @@ def netcdf(
     more
         Writes data that are not netCDF into groups of the file.
     """
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
-
     with in_memory(creation(head, ordered=True)) as file:
-        for name in groups or {}:
-            h5py.h5g.create(file.id, name.encode(), gcpl=_ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE)))
-        with h5netcdf.File(file, "a") as whole:
-            dataset.dump_to_store(H5NetCDFStore(whole))  # type: ignore[no-untyped-call]
-            for name, part in (groups or {}).items():
-                part.dump_to_store(H5NetCDFStore(whole.groups[name]))  # type: ignore[no-untyped-call]
+        _write(file, dataset)
+        for name, part in (groups or {}).items():
+            _write(h5py.Group(h5py.h5g.create(file.id, name.encode(), gcpl=_ordered_group())), part)
         more(file)
         return image(file)
+
+
+def _write(group: Any, dataset: xr.Dataset) -> None:
+    """Write variables as xarray encodes them; h5netcdf would look up every dimension in the file, again and again.
+
+    A dimension is a dimension scale of HDF5: the variable of its name, or else an empty data set.
+    """
+    from xarray.conventions import cf_encoder, encode_dataset_coordinates
+
+    encoded, about = cf_encoder(*encode_dataset_coordinates(dataset))
+    sizes = {dim: size for one in encoded.values() for dim, size in one.sizes.items()}
+    own = {dim for dim in sizes if dim in encoded and encoded[dim].dims == (dim,)}
+    scales, written = {}, []
+    for dim in (dim for dim in sizes if dim not in own):
+        scales[dim] = _data_set(group, dim, np.dtype(">f4"), (sizes[dim],))
+        h5py.h5ds.set_scale(scales[dim].id, NO_VARIABLE + f"{sizes[dim]:10}".encode())
+    for name, one in encoded.items():
+        texts = one.dtype.kind in "OU"
+        fill = one.attrs.pop("_FillValue", None)
+        kind = h5py.string_dtype() if texts else one.dtype
+        made = _data_set(group, OTHER + name if name in scales else name, kind, one.shape, fill)
+        if made.size:
+            made[...] = one.values.astype(object) if texts else one.values
+        if name in own:
+            scales[name] = made
+            h5py.h5ds.set_scale(made.id, name.encode())
+        else:
+            written.append((made, one.dims))
+        _attributes(made, one.attrs if fill is None else {"_FillValue": fill} | one.attrs)
+    for number, dim in enumerate(sizes):
+        _attributes(scales[dim], {"_Netcdf4Dimid": np.int32(number)})
+    for made, dims in written:
+        for axis, dim in enumerate(dims):
+            h5py.h5ds.attach_scale(made.id, scales[dim].id, axis)
+    _attributes(group, about)
+
+
+def _data_set(group: Any, name: str, dtype: Any, shape: tuple[int, ...], fill: Any = None) -> Any:
+    """Make a data set; dimensions of length zero are unlimited, since netCDF has no others."""
+    most = tuple(size or None for size in shape)
+    return group.create_dataset(
+        name, shape, dtype, maxshape=None if most == shape else most, fillvalue=fill, track_order=True
+    )
+
+
+def _attributes(to: Any, values: Mapping[str, Any]) -> None:
+    """Write attributes: texts, and lists of numbers or texts."""
+    for name, value in values.items():
+        several = np.atleast_1d(value)
+        texts = several.astype(h5py.string_dtype()) if several.dtype.kind == "U" else several
+        to.attrs.create(name, value if isinstance(value, str) else texts)
+
+
+def _ordered_group() -> Any:
+    return _ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE))
 
 
 def _ordered(properties: Any) -> Any:
@@ -122,7 +172,7 @@ def _variables(part: Any) -> dict[str, Variable]:
         if not isinstance(one, h5py.Dataset):
             continue
         attributes = dict(one.attrs)
-        if b"not a netCDF variable" in bytes(attributes.get("NAME", b"")):
+        if NO_VARIABLE in bytes(attributes.get("NAME", b"")):
             continue
         dims = tuple(Path(dim[0].name).name if len(dim) else "" for dim in one.dims)
         texts = h5py.check_string_dtype(one.dtype) is not None

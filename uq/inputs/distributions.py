@@ -390,8 +390,9 @@ class Beta(_Bounded):
     def _inverse(self, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         from scipy.special import betaincinv
 
-        u, rest = betaincinv(self.a, self.b, p), betaincinv(self.b, self.a, q)
-        u, rest = np.where(p <= q, u, 1 - rest), np.where(p <= q, 1 - u, rest)
+        low = p <= q
+        near = betaincinv(np.where(low, self.a, self.b), np.where(low, self.b, self.a), np.minimum(p, q))
+        u, rest = np.where(low, near, 1 - near), np.where(low, 1 - near, near)
         with np.errstate(divide="ignore"):
             return u, self._log(u, rest)
 

@@ -17,10 +17,13 @@ def awkward():
         "point": (("a", "point"), np.arange(12).reshape(3, 4)),
         "whole": ((), 3.5),
         "said": ((), "a text"),
+        "none": (("empty", "a"), np.zeros((0, 3))),
         "wide": (("a",), np.array([1, 2, 3], dtype=np.int32)),
     }
     coordinates = {"b": ["second", "first"], "unit": (("b",), ["m", "Pa"]), "a": [2.0, 1.0, 3.0]}
-    return xr.Dataset(variables, coordinates, {"config": "x = 1\n", "count": 3, "list": [1.0, 2.0]})
+    return xr.Dataset(
+        variables, coordinates, {"config": "x = 1\n", "count": 3, "list": [1.0, 2.0], "texts": ["m", "µ"]}
+    )
 
 
 def test_datasets_are_read_as_xarray_does(awkward, tmp_path):
@@ -32,6 +35,8 @@ def test_datasets_are_read_as_xarray_does(awkward, tmp_path):
     assert list(found.sizes) == list(expected.sizes)
     for name in found.variables:
         assert found[name].dtype.kind == expected[name].dtype.kind, name
+        np.testing.assert_array_equal(found[name], awkward[name])
+        assert found[name].dims == awkward[name].dims
 
 
 def test_numbers_that_another_program_has_packed_are_unpacked(tmp_path):
