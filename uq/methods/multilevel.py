@@ -1,51 +1,32 @@
 """Multilevel Monte Carlo over nested meshes: the total error, of mesh and sampling, at the least cost.
 
-With ψ_l the quantity on mesh l, E[ψ_L] = Σ_l E[Y_l], Y_l = ψ_l − ψ_{l−1}, Y_0 = ψ_0: both meshes of a difference get
-the same parameters, so that Var Y_l is small, and differences on fine meshes need few samples (M. B. Giles, Acta
-Numerica 24 (2015) 259–328). Each mesh is linearised at the mean parameters. With the deviation w_l = ψ_l − ψ̄_l, its
-tangent prediction T_l and V_l = E[T_l²], the terms of the mean and of the second moment of w_L are
-
-    ⟨w_l − w_{l−1} − (T_l − T_{l−1})⟩
-    ⟨w_l² − w_{l−1}² − (T_l² − V_l − T_{l−1}² + V_{l−1})⟩
-
-where the controls, in brackets, have expectation zero. `moments.combine` adds them up.
-
-Allotting samples, estimating differences and adding errors depend on each other at every step, hence one file.
+The meshes, and the terms of the telescoping sums, are in `uq.methods.multilevel_meshes`; what is estimated from them is
+in `uq.methods.multilevel_estimates`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ModelError, SolveError
+from forward.model import FloatArray, ModelError
 from uq.estimators.doubts import of_differences, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
-    Estimates,
-    Moments,
-    Term,
-    combine,
-    controlled,
-    estimate,
-    monomials,
     ratio,
-    term,
 )
-from uq.estimators.tails import of_influences, unseen
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request
+from uq.evaluation.evaluate import Evaluate, Recorder
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import random_points
-from uq.methods.method import MESH
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
-from uq.methods.stopping import TEXTBOOK, Amount, seconds_per_solve
-from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from uq.methods.multilevel_estimates import RATES, Found, influences, rate
+from uq.methods.multilevel_meshes import Mesh, Pilot, name_of
+from uq.methods.stopping import Amount
+from uq.surrogates.linearisation import local_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -54,9 +35,6 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec, Times
 
 FIRST_MESHES = 3  # two differences, the fewest that show a rate
-ASSUMED_RATE = 1.0  # of convergence per mesh, if there is only one difference
-RATES = (0.5, 2.0)  # assumed bounds of rates: faster ones do not last where stresses are singular
-SIZE = 10_000  # unknowns assumed on the coarsest mesh for a model without a state
 HEAVY_TAILED = 100.0  # kurtosis beyond which a variance from a few samples says little
 UNCOUPLED = 0.5  # of the variance on a mesh: a difference that varies more gains nothing from the coarser mesh
 
@@ -115,7 +93,7 @@ class MultilevelMonteCarlo(Amount):
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
         """Return the body on the finer meshes."""
-        return {_name(level): spec.refined(level) for level in range(1, self.levels)}
+        return {name_of(level): spec.refined(level) for level in range(1, self.levels)}
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find that there are no meshes, or that they have different parameters."""
@@ -127,7 +105,7 @@ class MultilevelMonteCarlo(Amount):
 
     def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
         """Predict the processor time (s) of the pilots."""
-        each = [costs[_name(level)].sample for level in range(self.levels)]
+        each = [costs[name_of(level)].sample for level in range(self.levels)]
         return self.pilot * (2 * sum(each) - each[-1])
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -152,20 +130,21 @@ class MultilevelMonteCarlo(Amount):
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ModelError(message)
         recorder = Recorder(evaluate)
-        meshes = [_Mesh(self, inputs, recorder, None)]
+        pilot = Pilot(self.pilot, self.seed, self.control != "none")
+        meshes = [Mesh(pilot, inputs, recorder, None)]
         while len(meshes) < min(self.levels, FIRST_MESHES):
             if len(meshes) > 1 and not meshes[-1].affords_finer(self._left(recorder)):
                 break
-            meshes.append(_Mesh(self, inputs, recorder, meshes[-1]))
+            meshes.append(Mesh(pilot, inputs, recorder, meshes[-1]))
         while True:
-            found = _Found.of(inputs, meshes)
+            found = Found.of(inputs, meshes)
             reached = float(found.relative(found.total_error).max())
             left = self._left(recorder)
             allocation = _allocate(self, meshes, found, left)
             if self.met(reached):
                 break
             if self._wants_finer(meshes, found, allocation, left):
-                meshes.append(_Mesh(self, inputs, recorder, meshes[-1]))
+                meshes.append(Mesh(pilot, inputs, recorder, meshes[-1]))
             elif allocation.settled:
                 break
             else:
@@ -177,7 +156,7 @@ class MultilevelMonteCarlo(Amount):
         """What is left of the budget (s)."""
         return np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
 
-    def _wants_finer(self, meshes: list[_Mesh], found: _Found, allocation: _Allocation, left: float) -> bool:
+    def _wants_finer(self, meshes: list[Mesh], found: Found, allocation: _Allocation, left: float) -> bool:
         """Whether a finer mesh is the next step."""
         if len(meshes) == self.levels or not meshes[-1].affords_finer(left):
             return False
@@ -187,7 +166,7 @@ class MultilevelMonteCarlo(Amount):
             return allocation.settled and 2 * error**2 > self.tolerance**2
         return error > allocation.sampling_error
 
-    def _why(self, meshes: list[_Mesh], found: _Found, reached: float, allocation: _Allocation) -> str:
+    def _why(self, meshes: list[Mesh], found: Found, reached: float, allocation: _Allocation) -> str:
         counts = " + ".join(str(len(mesh.points)) for mesh in meshes)
         mesh, sampling = (float(found.relative(e).max()) for e in (found.bias_error, found.estimates.mean_error))
         error = f"relative total error {reached:.3g} (mesh {mesh:.2g}, sampling {sampling:.2g})"
@@ -197,11 +176,11 @@ class MultilevelMonteCarlo(Amount):
         return self.why_stopped(reached, error, 1 - int(allocation.cut), 1, amount)
 
     def _dataset(
-        self, inputs: Inputs, evaluate: Evaluate, meshes: list[_Mesh], found: _Found, stopped: str
+        self, inputs: Inputs, evaluate: Evaluate, meshes: list[Mesh], found: Found, stopped: str
     ) -> xr.Dataset:
         by_output, by_level, both = ("output",), ("level",), ("level", "output")
         finest = len(meshes) - 1
-        dataset = local_dataset(inputs, evaluate.on(_name(finest)), meshes[-1].centre, fields=False)
+        dataset = local_dataset(inputs, evaluate.on(name_of(finest)), meshes[-1].centre, fields=False)
         single, telescoped = [mesh.single for mesh in meshes], found.by_mesh
         differences = [mesh.term for mesh in meshes]
         plain, kurtosis = np.array([mesh.plain_variance for mesh in meshes]), np.array([m.kurtosis for m in meshes])
@@ -243,7 +222,7 @@ class MultilevelMonteCarlo(Amount):
             }
         )
         dataset.attrs["stopped"] = stopped
-        moved, claimed = _influences(meshes), found.estimates.relative_std_error
+        moved, claimed = influences(meshes), found.estimates.relative_std_error
         add(dataset, *of_tails(evaluate.outputs, meshes[0].values, claimed, moved[0]))
         add(dataset, *of_differences(evaluate.outputs, moved, found.estimates.std, claimed))
         notes = list(_notes(evaluate.outputs, consistency, kurtosis, shares, len(meshes)))
@@ -257,11 +236,6 @@ class MultilevelMonteCarlo(Amount):
         if notes:
             dataset.attrs["note"] = "; ".join(notes)
         return dataset
-
-
-def _name(level: int) -> str:
-    """Name of the model on a mesh."""
-    return f"{MESH}{level}" if level else OWN
 
 
 def _notes(
@@ -294,259 +268,6 @@ def _notes(
     return notes
 
 
-class _Mesh:
-    """A mesh with its linearisation and the samples on it and on the next coarser one.
-
-    Attributes
-    ----------
-    centre
-        Linearisation at the mean parameters.
-    points, fine, coarse, ok
-        Parameters (n, d), outputs (n, m) on this mesh and on the coarser one (zero where there is none), and which
-        samples have both.
-    """
-
-    def __init__(self, method: MultilevelMonteCarlo, inputs: Inputs, evaluate: Evaluate, coarser: _Mesh | None) -> None:
-        self._method, self._inputs, self._coarser = method, inputs, coarser
-        self.level: int = 0 if coarser is None else coarser.level + 1
-        self._evaluate = evaluate.on(_name(self.level))
-        self.centre: Linearisation = linearise(inputs, self._evaluate)
-        self.unknowns = self._evaluate.displacements or SIZE * 8**self.level
-        self._solves, self._seconds = 0, 0.0
-        d, m = len(inputs.names), len(self.centre.outputs)
-        self.points = np.empty((0, d))
-        self.fine, self.coarse = np.empty((0, m)), np.empty((0, m))
-        self.ok = np.empty(0, dtype=bool)
-        self._reasons: set[str] = set()
-        self.extend(method.pilot)
-
-    def extend(self, count: int) -> None:
-        """Go on to `count` samples."""
-        before = len(self.points)
-        if count <= before:
-            return
-        cube = random_points((self._method.seed, self.level), before, count, len(self._inputs.names))
-        points = self._inputs.points(cube)
-        here = self._solve(points)
-        fine, ok, coarse = here.outputs, here.ok, np.zeros_like(here.outputs)
-        if self._coarser is not None:
-            there = self._coarser._solve(points)
-            coarse, ok = there.outputs, ok & there.ok
-            self._reasons |= {failure.reason for failure in there.failures}
-        self._reasons |= {failure.reason for failure in here.failures}
-        self.points = np.concatenate([self.points, points])
-        self.fine, self.coarse = np.concatenate([self.fine, fine]), np.concatenate([self.coarse, coarse])
-        self.ok = np.concatenate([self.ok, ok])
-        if self.ok.sum() < 2:
-            reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"level {self.level}: {self.ok.sum()} of {count} samples have an answer, expected 2: {reasons}"
-            raise SolveError(message)
-
-    def _solve(self, points: FloatArray) -> Evaluations:
-        found = self._evaluate(Request(points, start=self.centre.prediction))
-        self._solves += len(points)
-        self._seconds += float(found.seconds.sum())
-        return found
-
-    @property
-    def seconds_per_solve(self) -> float:
-        """Predicted time (s) of one solve: measured times would make results depend on the machine."""
-        return seconds_per_solve(self.unknowns)
-
-    @property
-    def cost(self) -> float:
-        """Predicted time (s) of one sample, on both meshes."""
-        return self.seconds_per_solve + (0 if self._coarser is None else self._coarser.seconds_per_solve)
-
-    @property
-    def measured_cost(self) -> float:
-        """Time (s) that one sample took on both meshes, which counts against a budget."""
-        here = self._seconds / self._solves
-        return here if self._coarser is None else here + self._coarser._seconds / self._coarser._solves
-
-    @property
-    def cost_of_finer(self) -> float:
-        """Predicted time (s) of linearisation and pilot on the next finer mesh."""
-        finer = seconds_per_solve(8 * self.unknowns)
-        return TEXTBOOK * finer + self._method.pilot * (finer + self.seconds_per_solve)
-
-    def affords_finer(self, left: float) -> bool:
-        """Whether the next finer mesh takes at most half of the remaining budget (s), judging by the solves so far."""
-        return self.cost_of_finer * self.measured_cost / self.cost <= left / 2
-
-    @property
-    def nominal(self) -> FloatArray:
-        """Difference (m,) of the outputs at the mean parameters."""
-        return self.centre.outputs - (0 if self._coarser is None else self._coarser.centre.outputs)
-
-    @property
-    def offset(self) -> FloatArray:
-        """Difference (m,) of the values from which deviations are taken."""
-        return self.centre.middle - (0 if self._coarser is None else self._coarser.centre.middle)
-
-    def deviations(self, outputs: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return w and T (n, m) of outputs on this mesh, and E[T²] (m,)."""
-        slopes = self.centre.output_slopes
-        variance = np.einsum("mi,ij,mj->m", slopes, self._inputs.correlation, slopes)
-        return outputs - self.centre.middle, self.centre.coordinates.of(points) @ slopes.T, variance
-
-    def influences(self, mean: FloatArray) -> FloatArray:
-        """By how much each sample (n, m) moves the variance on the finest mesh, with the mean (m,) of w there."""
-        first, second, *controls = self._moments()
-        c, d = controls
-        first, second = controlled(first, second, None if self._method.control == "none" else (c, d))
-        moved = second - 2 * mean * first
-        return np.asarray(moved - moved.mean(axis=0))
-
-    @property
-    def values(self) -> FloatArray:
-        """Outputs (n, m) on this mesh of the samples with an answer on both."""
-        return np.asarray(self.fine[self.ok])
-
-    def _moments(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return w_l − w_{l−1}, the second moment's term, and their controls (n, m) with expectation zero."""
-        points = self.points[self.ok]
-        w, T, V = self.deviations(self.fine[self.ok], points)
-        if self._coarser is None:
-            return w, w**2, T, T**2 - V
-        w0, T0, V0 = self._coarser.deviations(self.coarse[self.ok], points)
-        return w - w0, w**2 - w0**2, T - T0, T**2 - T0**2 - (V - V0)
-
-    @property
-    def term(self) -> Term:
-        """This mesh's term of the telescoping sums."""
-        first, second, c, d = self._moments()
-        return term(first, second, None if self._method.control == "none" else (c, d))
-
-    @property
-    def plain_variance(self) -> FloatArray:
-        """Variance (m,) of the difference without control."""
-        return np.asarray(self._moments()[0].var(axis=0, ddof=1))
-
-    @property
-    def kurtosis(self) -> FloatArray:
-        """Fourth central moment over the squared variance (m,) of the controlled difference."""
-        r, _, control, _ = self._moments()
-        if self._method.control != "none":
-            r = r - control
-        r = r - r.mean(axis=0)
-        return ratio((r**4).mean(axis=0), (r**2).mean(axis=0) ** 2, empty=3.0)
-
-    @property
-    def single(self) -> Moments:
-        """Moments on this mesh alone."""
-        w, T, V = self.deviations(self.fine[self.ok], self.points[self.ok])
-        n, offset = len(w), self.centre.middle
-        if self._method.control == "none":
-            return estimate(monomials(w, None).sum(axis=1), n, offset)
-        return estimate(monomials(w, T).sum(axis=1), n, offset, V)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Estimates from the samples so far.
-
-    Attributes
-    ----------
-    by_mesh
-        The telescoped moments up to each mesh.
-    differences
-        E[Y_l] (L, m), l = 1 … L.
-    signs, std_signs
-        Whether the last meshes raise (1) or lower (−1) mean and standard deviation (m,): as finer ones will.
-    bias_error, std_bias_error
-        Estimated errors (m,) of mean and standard deviation on the finest mesh.
-    consistency
-        Of l = 1 … L (L, m).
-    """
-
-    by_mesh: tuple[Estimates, ...]
-    differences: FloatArray
-    signs: FloatArray
-    std_signs: FloatArray
-    bias_error: FloatArray
-    std_bias_error: FloatArray
-    consistency: FloatArray
-
-    @classmethod
-    def of(cls, inputs: Inputs, meshes: Sequence[_Mesh]) -> _Found:
-        terms = [mesh.term for mesh in meshes]
-        *coarser, finest = (combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
-        moved = _influences(meshes)
-        tails = [of_influences(finest, inputs, one) for one in moved]
-        first = np.maximum(tails[0], unseen(inputs, meshes[0].values) * finest.std)
-        error = np.linalg.norm([finest.std_error, first, *tails[1:]], axis=0)
-        by_mesh = (*coarser, replace(finest, std_error=error))
-        differences = np.array([mesh.offset + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
-        std_differences = np.diff([e.std for e in by_mesh], axis=0)
-        consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
-        # The differences at the mean parameters converge at the same rate, without sampling error.
-        nominal = np.array([mesh.nominal for mesh in meshes])[1:]
-        alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
-        return cls(
-            by_mesh,
-            differences,
-            np.sign(differences[-1]),
-            np.sign(std_differences[-1]),
-            bias(differences, alpha),
-            bias(std_differences, alpha),
-            consistency,
-        )
-
-    @property
-    def estimates(self) -> Estimates:
-        return self.by_mesh[-1]
-
-    @property
-    def total_error(self) -> FloatArray:
-        return np.hypot(self.bias_error, self.estimates.mean_error)
-
-    def relative(self, error: FloatArray) -> FloatArray:
-        """An error (…, m) over the mean, or over the standard deviation if that is larger."""
-        scale = np.maximum(np.abs(self.estimates.mean), self.estimates.std)
-        return ratio(error, np.broadcast_to(scale, error.shape))
-
-
-def _influences(meshes: Sequence[_Mesh]) -> list[FloatArray]:
-    """By how much each sample (n, m) of every mesh moves the variance on the finest one."""
-    mean = np.sum([mesh.term.first for mesh in meshes], axis=0)
-    return [mesh.influences(mean) for mesh in meshes]
-
-
-def _consistency(coarser: _Mesh, mesh: _Mesh) -> FloatArray:
-    """Compare the mean of ψ_{l−1} as the coarser and as the finer of two meshes: |a − b + c| / 3(σ_a + σ_b + σ_c).
-
-    a and b are the estimates of E[ψ_{l−1}] and E[ψ_l], each from the samples of its own level, and c that of E[Y_l],
-    with standard errors σ: beyond 1 the sum does not telescope (M. B. Giles, Acta Numerica 24 (2015), section 3.3).
-    """
-    a, b, c = coarser.single, mesh.single, mesh.term
-    c_mean, c_error = mesh.offset + c.first, np.sqrt(c.variance / c.n)
-    gap = np.abs(a.mean - b.mean + c_mean)
-    # Rounding is no inconsistency, where the control leaves nothing else.
-    gap = np.where(gap < 1e-12 * np.abs(b.mean), 0.0, gap)
-    return ratio(gap, 3 * (a.mean_error + b.mean_error + c_error))
-
-
-def rate(values: FloatArray) -> FloatArray:
-    """Slope (m,) of −log₂|value| over the rows (L, m), by least squares; what is assumed where there is one row."""
-    if len(values) < 2:
-        return np.full(values.shape[1], ASSUMED_RATE)
-    steps = np.arange(len(values)) - (len(values) - 1) / 2
-    logs = np.log2(np.maximum(np.abs(values), np.finfo(float).tiny))
-    return np.asarray(-(steps @ logs) / (steps @ steps))
-
-
-def bias(differences: FloatArray, alpha: FloatArray) -> FloatArray:
-    """Estimate the error (m,) on the finest mesh from the differences (L, m) between meshes: |E[Y_L]| / (2^α − 1).
-
-    |E[Y_L]| counts as at least what the two differences before it predict with the rate α (m,), which guards against
-    one that is small by chance (M. B. Giles, Acta Numerica 24 (2015), section 3.2).
-    """
-    last = np.abs(differences[-3:])
-    expected = last * 2.0 ** (-alpha * np.arange(len(last))[::-1, None])
-    return np.asarray(expected.max(axis=0) / (2.0**alpha - 1))
-
-
 @dataclass(frozen=True)
 class _Allocation:
     """Numbers of samples on every mesh.
@@ -574,7 +295,7 @@ def optimal(variances: FloatArray, costs: FloatArray, target: float) -> FloatArr
     return np.asarray(np.sqrt(variances / costs) * np.sqrt(variances * costs).sum() / target)
 
 
-def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Found, left: float) -> _Allocation:
+def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[Mesh], found: Found, left: float) -> _Allocation:
     """Choose numbers of samples: the least of what tolerance, samples and budget allow."""
     counts = np.array([len(mesh.points) for mesh in meshes], dtype=float)
     costs = np.array([mesh.cost for mesh in meshes])
@@ -610,7 +331,7 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Fou
 
 
 def _target(
-    method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Found, variances: FloatArray, costs: FloatArray
+    method: MultilevelMonteCarlo, meshes: Sequence[Mesh], found: Found, variances: FloatArray, costs: FloatArray
 ) -> float:
     """Square of the relative error allowed for sampling."""
     assert method.tolerance is not None

@@ -17,7 +17,8 @@ from uq.findings import findings
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
-from uq.methods.multilevel import MultilevelMonteCarlo, bias, optimal, rate
+from uq.methods.multilevel import MultilevelMonteCarlo, optimal
+from uq.methods.multilevel_estimates import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.report import plots

@@ -1,0 +1,292 @@
+"""Rows of exchanged samples, and what is estimated from them: Sobol' indices and moments.
+
+Rows have d + 2 solves (A. Saltelli et al., Comput. Phys. Commun. 181 (2010) 259–270); A and B are the halves of
+scrambled Sobol' points in 2d dimensions. A row in which a solve failed is left out as a whole: with only some of its
+points, the differences that the estimators average would be incomplete.
+
+The rows belong to one scrambled Sobol' sequence: independent scrambles of a sixteenth of the rows each have two to four
+times the error at a thousand rows. Errors come from resampling its R parts of consecutive rows, each a net by itself.
+This ignores that the parts complement each other: it claims the error of R independent parts, which is no smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import Finding, FloatArray, ForwardModel, SolveError, scattered
+from uq.estimators.doubts import of_field_tails, of_tails
+from uq.estimators.indices import (
+    ExchangedVariances,
+    RowProducts,
+    bootstrap,
+    bootstrap_error,
+    exchanged,
+    field_indices,
+    jackknife_error,
+    shares,
+)
+from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.tails import counted
+from uq.evaluation.evaluate import Evaluate, Evaluations, Request
+from uq.findings import add
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.methods.monte_carlo import by_node
+from uq.methods.sobol_variables import RUNNING, Variables, by_output, by_round
+from uq.surrogates.linearisation import Linearisation, local_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class Design:
+    """What is asked of the rows.
+
+    Attributes
+    ----------
+    products
+        What is averaged over them, with K points to a row.
+    parts
+        Number R of parts of the scrambled sequence.
+    seed
+        Of the sequence.
+    pairs
+        Whether rows have points for pairs of parameters.
+    fields
+        Whether the displacement field is looked at.
+    quantiles
+        Probabilities of the quantiles of the outputs.
+    """
+
+    products: RowProducts
+    parts: int
+    seed: int
+    pairs: bool
+    fields: bool
+    quantiles: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _FieldProducts:
+    """Sum of the products of the state's deviations in a row, and of third and fourth powers at the points A and B."""
+
+    products: RowProducts
+    size: int
+    state: FloatArray
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        state = scattered(model, self.state[None, :])[0]
+        used = self.products.size
+
+        def rows(states: FloatArray) -> FloatArray:
+            deviations = states[:used] - state
+            higher = [(deviations[:2] ** k).mean(axis=0) for k in (3, 4)]
+            return np.concatenate([self.products.of(deviations), higher])
+
+        return rows
+
+
+class Rows:
+    """All rows, in parts of as many rows each, and the sums of the fields over each part.
+
+    The sums are kept for every part: R (3 (d + groups) + 5) fields on rank 0.
+
+    Attributes
+    ----------
+    each
+        Number n of rows of each of the R parts.
+    points, outputs
+        (R n, K, d) and (R n, K, m).
+    ok
+        Rows (R n,) of which all points have an answer.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        centre: Linearisation,
+        members: NDArray[np.bool_],
+    ) -> None:
+        self._design, self._inputs, self._evaluate, self._centre = design, inputs, evaluate, centre
+        self._members = members
+        self.products = design.products
+        self._of_fields = RowProducts(len(members))
+        R, d, m = design.parts, len(inputs.names), len(evaluate.outputs)
+        K = self.products.size
+        self.each = 0
+        self._parts = R
+        self.points = np.empty((0, K, d))
+        self.outputs = np.empty((0, K, m))
+        self.ok = np.empty(0, dtype=bool)
+        self._sums: list[FloatArray | None] = [None] * R
+        self._reasons: set[str] = set()
+
+    def extend(self, each: int) -> None:
+        """Extend every part to `each` rows: to all from none, or to twice as many."""
+        design, centre, K = self._design, self._centre, self.products.size
+        d, before, after = len(self._inputs.names), len(self.ok), self._parts * each
+        cubes = sobol_points(design.seed, 0, before, after, 2 * d)
+        first, second = (self._inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
+        points = exchanged(first, second, self._members, pairs=design.pairs)
+        if design.fields and centre.state.size:
+            joint = _FieldProducts(self._of_fields, K, centre.state)
+            parts = points.reshape(-1, each * K, d)
+            found = [self._ask(Request(part, start=centre.prediction, joint=joint)) for part in parts]
+            joined = [_added(*pair) for pair in zip(self._sums[::2], self._sums[1::2], strict=True)] if before else []
+            self._sums = [*joined, *(part.fields if part.fields.size else None for part in found)]
+        else:
+            found = [self._ask(Request(points.reshape(-1, d), start=centre.prediction))]
+        outputs = np.concatenate([part.outputs for part in found]).reshape(after - before, K, -1)
+        ok = np.concatenate([part.ok for part in found]).reshape(after - before, K).all(axis=1)
+        self.each = each
+        self.points = np.concatenate([self.points, points])
+        self.outputs = np.concatenate([self.outputs, outputs])
+        self.ok = np.concatenate([self.ok, ok])
+
+    def _ask(self, request: Request) -> Evaluations:
+        found = self._evaluate(request)
+        self._reasons |= {failure.reason for failure in found.failures}
+        return found
+
+    def _cut(self, values: NDArray, each: int) -> NDArray:  # type: ignore[type-arg]
+        """Return the first rows in parts of `each` (R, each, …)."""
+        return values[: self._parts * each].reshape(self._parts, each, *values.shape[1:])
+
+    def _usable(self, each: int) -> NDArray[np.bool_]:
+        """Which parts (R,) of `each` rows have a whole row."""
+        return np.asarray(self._cut(self.ok, each).any(axis=1))
+
+    def _of_outputs(self, each: int) -> tuple[FloatArray, FloatArray]:
+        """Sums (R', J, m) over the whole rows of every part that has some, and their numbers (R',)."""
+        some = self._usable(each)
+        if some.sum() < 2:
+            reasons = "; ".join(sorted(self._reasons)[:3])
+            message = f"{some.sum()} of {len(some)} parts have a row of answers, expected more: {reasons}"
+            raise SolveError(message)
+        ok = self._cut(self.ok, each)[some]
+        deviations = self._cut(self.outputs, each)[some] - self._centre.outputs
+        values = np.where(ok[..., None, None], deviations, 0.0)
+        products = self.products.of(np.moveaxis(values, 2, 0))  # (J, R', n, m)
+        return np.swapaxes(products.sum(axis=2), 0, 1), ok.sum(axis=1).astype(float)
+
+    def indices(self, each: int) -> dict[str, FloatArray]:
+        """Estimate the indices from the first R parts of `each` rows, with standard errors."""
+        sums, counts = self._of_outputs(each)
+        found = self._indices(self.products.variances(sums.sum(axis=0) / counts.sum()))
+        drawn = self._indices(self.products.variances(bootstrap(sums, counts, self._design.seed)))
+        for name, values in drawn.items():
+            found[f"{name}_error"] = bootstrap_error(values, len(counts), axis=0)
+        return found
+
+    def _indices(self, parts: ExchangedVariances) -> dict[str, FloatArray]:
+        """Shares (…, m, d) of variances by parameter (d, …, m)."""
+        d = len(self._inputs.names)
+        first, total = (np.moveaxis(shares(part, parts.variance), 0, -1) for part in (parts.first, parts.total))
+        found = {"sobol_first": first[..., :d], "sobol_total": total[..., :d]}
+        if len(self._members) > d:
+            found |= {"sobol_group_first": first[..., d:], "sobol_group_total": total[..., d:]}
+        if parts.second is not None:
+            found["sobol_second"] = np.moveaxis(shares(parts.second, parts.variance), (0, 1), (-2, -1))
+        return found
+
+    def field(self) -> tuple[Variables, list[Finding]]:
+        """Moments and indices of the displacement field, errors by leaving a part out, and what speaks against them."""
+        rows = self._cut(self.ok, self.each).sum(axis=1)
+        kept = [(total, n) for total, n in zip(self._sums, rows, strict=True) if total is not None]
+        if not kept:
+            return {}, []
+        count, d = self._evaluate.displacements, len(self._inputs.names)
+        sums = [total[:-2, :count] for total, _ in kept]
+        counts = [n for _, n in kept]
+        whole, n = np.sum(sums, axis=0), sum(counts)
+        volumes = self._evaluate.node_volumes
+
+        def of(means: FloatArray) -> Variables:
+            parts = self._of_fields.variances(means)
+            variance, first, total = (
+                part.reshape(*part.shape[:-1], -1, 3).sum(axis=-1)
+                for part in (parts.variance, parts.first[:d], parts.total[:d])
+            )
+            return field_indices(variance, first, total, volumes)
+
+        found = of(whole / n)
+        without = [of((whole - s) / (n - c)) for s, c in zip(sums, counts, strict=True)]
+        for name in RUNNING:
+            errors = jackknife_error(np.array([some[f"field_{name}"][1] for some in without]))
+            found[f"field_{name}_error"] = (("parameter",), errors)
+        square = self._of_fields.size
+        means = [[(s[0] + s[1]) / (2 * c), s[square] / c] for s, c in zip(sums, counts, strict=True)]
+        moments = estimate_from_replicates(np.swapaxes(np.array(means), 0, 1), self._centre.state[:count])
+        higher = np.sum([total[-2:, :count] for total, _ in kept], axis=0)
+        powers = np.array([whole[0] + whole[1], 2 * whole[square], *(2 * higher)])
+        doubts = of_field_tails(powers, 2 * n, moments.relative_std_error, volumes)
+        return found | by_node(moments, count), list(doubts)
+
+    def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
+        """Return all estimates as labelled arrays."""
+        design, centre, K = self._design, self._centre, self.products.size
+        part = np.repeat(np.arange(self._parts), self.each * K)
+        answered = ~np.isnan(self.outputs).any(axis=2).ravel()
+        whole = np.repeat(self.ok, K)
+        independent = whole & (np.arange(whole.size) % K < 2)  # A and B
+        values = self.outputs.reshape(whole.size, -1)
+        of_quantiles = quantiles_from_replicates(values[independent], part[independent], design.quantiles)
+        rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
+        moments = {each: self._moments(each) for each in rounds}
+        running = {each * self._parts * K: self.indices(each) for each in rounds}
+        of_field, doubts = self.field()
+        dataset = local_dataset(self._inputs, self._evaluate, centre, fields=design.fields)
+        dataset = dataset.assign_coords(
+            quantile=list(design.quantiles), round=list(running), index_round=list(running)
+        ).assign(
+            {
+                **{name: (("output",), getattr(moments[self.each], name)) for name in ESTIMATES},
+                **of_quantiles.variables,
+                **by_output(found),
+                "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
+                "values": (("sample", "output"), values),
+                "ok": (("sample",), answered),
+                "scramble": (("sample",), part),
+                **{
+                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for e in moments.values()]))
+                    for name in ("mean", "mean_error")
+                },
+                **by_round(running),
+                **of_field,
+            }
+        )
+        add(dataset, *doubts)
+        last = moments[self.each].relative_std_error
+        add(dataset, *of_tails(self._evaluate.outputs, values[independent], last))
+        lost = int((~self.ok).sum())
+        if lost:
+            dataset.attrs["note"] = (
+                f"{int((~answered).sum())} of {answered.size} samples have no answer; the {lost} of {self.ok.size} "
+                "rows that they are in are left out as a whole: estimates are conditional on the model having an answer"
+            )
+        return dataset
+
+    def _moments(self, each: int) -> Estimates:
+        """Moments of the outputs from the points A and B."""
+        sums, counts = self._of_outputs(each)
+        means = sums / counts[:, None, None]
+        K = self.products.size
+        products = np.array([(means[:, 0] + means[:, 1]) / 2, means[:, K]])
+        rows = self._parts * each
+        drawn = self.outputs[:rows, :2][self.ok[:rows]].reshape(-1, self.outputs.shape[2])
+        return counted(estimate_from_replicates(products, self._centre.outputs), self._inputs, drawn)
+
+
+def _added(one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
+    """Add what there is of two sums."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one + other
