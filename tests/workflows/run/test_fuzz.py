@@ -182,22 +182,23 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("name", "how"), [("a.vtu", {"binary": False}), ("a.vtu", {}), ("a.xdmf", {}), ("a.vtk", {})])
 def test_meshes_with_mistakes(tmp_path, name, how):
-    """As bodies, and as files of displacements."""
+    """As bodies and as files of displacements in turn: some formats are read by a process of their own each time."""
     whole = numbered(box())
     whole.point_data["displacement"] = whole.points / 100
     meshio.write(tmp_path / name, whole, **how)
     path = tmp_path / name
     good, chance = path.read_bytes(), random.Random(2)
-    for _ in range(60):
+    for number in range(60):
         data, done = damaged_bytes(good, chance)
         path.write_bytes(data)
         said = []
         try:
-            MeshFile(file=str(path))
+            if number % 2:
+                read(path.parent, Scan(file=path.name), ("one",))
+            else:
+                MeshFile(file=str(path))
         except ValidationError as error:
             said += [str(mistake["msg"]) for mistake in error.errors()]
-        try:
-            read(path.parent, Scan(file=path.name), ("one",))
         except DataError as error:
             said += error.args
         for line in said:
