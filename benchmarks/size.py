@@ -13,12 +13,15 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
 from forward.bodies.geometry import Box
 from forward.bodies.random_fields import Matern, Smoothness
+from workflows.config.study import load
 
 CELLS = {  # of tetrahedra of the published beam, by about how many unknowns these have
     1e4: (20, 2, 8),
@@ -28,6 +31,7 @@ CELLS = {  # of tetrahedra of the published beam, by about how many unknowns the
     1e6: (110, 9, 40),
 }
 SMOOTHNESS: tuple[Smoothness, ...] = (2, 4)
+MODES = 'model.fields=[{of="stiffness", length=0.04, std=0.3, modes=20}]'
 LENGTH = 0.3  # of random fields, over the edge of the cube
 WITH_FACTORS = 1e5  # most unknowns of these
 PARTS = ("build", "first solve", "of it stability", "tangents", "memory (GiB)")
@@ -88,9 +92,15 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--kept", type=Path, default=Path("sizes.jsonl"), help="file of the rows that were measured")
     parser.add_argument("--fields", action="store_true", help="random fields on cubes, in place of bodies")
+    parser.add_argument(
+        "--field-on-a-million", action="store_true", help="a random field on the largest beam, in place of bodies"
+    )
     given = parser.parse_args(list(options))
     if given.fields:
         of_fields()
+        return
+    if given.field_on_a_million:
+        of_a_million()
         return
     found: dict[str, list[list[float]]] = {}
     print("| solved by | unknowns | " + " | ".join(PARTS) + " |\n|---|" + "---:|" * (len(PARTS) + 1))
@@ -164,6 +174,37 @@ def of_fields(cells: Sequence[int] = (24, 35)) -> None:
             marks.append(time.process_time())
             times = " | ".join(f"{seconds:.2f}" for seconds in np.diff(marks))
             print(f"| {(n + 1) ** 3:,} | {smoothness} | {times} |", flush=True)
+
+
+def of_a_million() -> None:
+    """Print what a field of twenty modes adds to configs/beam-million.toml, and a solve and a tangent with it."""
+    study: Any = load(CONFIG.with_name("beam-million.toml"), [MODES])
+    body, names = study.spec, study.inputs.names
+    values = study.inputs.mean.copy()
+    field = [name.startswith("fields.") for name in names]
+    values[field] = np.random.default_rng(0).standard_normal(sum(field))
+    begin = time.process_time()
+
+    def told(what: str) -> None:
+        nonlocal begin
+        print(f"{what}: {time.process_time() - begin:.1f} s", flush=True)
+        begin = time.process_time()
+
+    matern = Matern.on(body.body, body.fields[0].length, body.fields[0].smoothness)
+    told(f"factor of the operator on {len(matern.mass):,} vertices")
+    assert matern.inflation.min() > 0
+    told("variance")
+    matern.modes(body.fields[0].modes)
+    told("modes")
+    del matern
+    model = body.build(MPI.COMM_SELF, names)
+    told(f"build, with the field, of {body.unknowns:,} unknowns")
+    solution = model.solve(values)
+    told("first solve")
+    solution.tangent(np.eye(len(names))[field.index(True)])
+    told("a tangent")
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    print(f"peak memory {int(peak.split()[1]) / 2**20:.2f} GiB")
 
 
 def draw(
