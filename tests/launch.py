@@ -52,6 +52,22 @@ def run_script(ranks, script, *arguments, timeout=300):
     return run(ranks, sys.executable, "-c", script, *arguments, timeout=timeout)
 
 
+def report_of_own(folder, study):
+    """Check and run a study with own parts, in the folder of their module, as a user does; return its report."""
+    (folder / "study.toml").write_text(study)
+    for command in (("check", "study.toml"), ("run", "study.toml", "--out", "out")):
+        done = subprocess.run(
+            [TISSUQ, *command],
+            cwd=folder,
+            env=environment() | {"PYTHONPATH": str(folder)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    return (folder / "out" / "report.html").read_text()
+
+
 def assert_same_bits(a, b):
     """The results of two runs are the same bytes."""
     left, right = (xr.load_dataset(d / "results.nc") for d in (a, b))

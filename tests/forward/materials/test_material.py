@@ -1,9 +1,7 @@
 """Energies that come from outside, in a file beside a study, work wherever the program's own do."""
 
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from forward.materials.admissible import Materials, admissible, moduli
 from forward.materials.material import MATERIALS, constants, measures, units
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from tests.bodies import loaded_body
-from tests.launch import environment
+from tests.launch import report_of_own
 
 OUTSIDE = '''
 from typing import Annotated, Any
@@ -271,17 +269,4 @@ seed = 1
 
 @pytest.mark.fem
 def test_a_study_is_checked_and_run(outside):
-    (outside / "study.toml").write_text(STUDY)
-    where = environment() | {"PYTHONPATH": str(outside)}
-    for command in (["check", "study.toml"], ["run", "study.toml", "--out", "out"]):
-        done = subprocess.run(
-            [Path(sys.executable).parent / "tissuq", *command],
-            cwd=outside,
-            env=where,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-    report = (outside / "out" / "report.html").read_text()
-    assert "Isotropic Fung" in report
+    assert "Isotropic Fung" in report_of_own(outside, STUDY)

@@ -1,8 +1,6 @@
 """Loads that come from outside, each in one file beside a study, held against the forces that balance them."""
 
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from mpi4py import MPI
 from forward.conformance import check_derivatives
 from forward.terms.term import Term
 from tests.bodies import loaded_body
-from tests.launch import environment
+from tests.launch import report_of_own
 
 pytestmark = pytest.mark.fem
 
@@ -144,13 +142,7 @@ seed = 1
 
 
 def test_a_study_with_springs_is_checked_and_run(outside):
-    (outside / "study.toml").write_text(STUDY)
-    tissuq = [str(Path(sys.executable).parent / "tissuq")]
-    where = environment() | {"PYTHONPATH": str(outside)}
-    for command in (["check", "study.toml"], ["run", "study.toml", "--out", "out"]):
-        done = subprocess.run(tissuq + command, cwd=outside, env=where, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-    assert "Springs: on = x-max, k = random" in (outside / "out" / "report.html").read_text()
+    assert "Springs: on = x-max, k = random" in report_of_own(outside, STUDY)
 
 
 def test_a_spot_is_a_force_of_its_size_that_moves_with_its_place():
