@@ -32,6 +32,7 @@ OUTPUTS = (
     'model.outputs=[{name="deepest", kind="max-displacement"}, {name="middle", kind="displacement", '
     'at=[0.06, 0.045, 0.03], component="z"}, {name="stress", kind="max-von-mises"}]'
 )
+TAKEN = "making.json"  # beside a reduced model: what its making took
 PERCENT = (1.0, 0.5, 0.25)  # errors, of the standard deviation, for which a making is charged
 
 
@@ -39,23 +40,29 @@ def main(arguments: Sequence[str] = ()) -> None:
     """Make the reduced model, and print gains and coverage of repeated studies."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gains")
     parser.add_argument("--cells", default="[16,12,6]", help="of the slab")
-    parser.add_argument("--snapshots", type=int, default=128)
-    parser.add_argument("--modes", type=int, default=40)
+    parser.add_argument("--snapshots", type=int, default=320)
+    parser.add_argument("--modes", type=int, default=60)
     parser.add_argument("--samples", type=int, default=64, help="what a study may spend, in solves of the body")
     parser.add_argument("--pilot", type=int, default=16)
+    parser.add_argument("--costs", type=float, nargs=2, help="of both models, in solves of the body; or as predicted")
     parser.add_argument("--repeats", type=int, default=4)
-    parser.add_argument("--file", default="", help="a reduced model that is there already")
+    parser.add_argument(
+        "--keep", default="", help="folder of the reduced model and of studies: what is there already counts"
+    )
     given = parser.parse_args(arguments)
     changes = [f"model.body.cells={given.cells}", FIELD, OUTPUTS]
     with tempfile.TemporaryDirectory() as folder:
-        file, off_line = given.file, 0.0
-        if not file:
-            file, off_line = _made(Path(folder) / "slab", changes, given)
-        _studies(file, off_line, changes, given)
+        out = Path(given.keep or folder) / "slab"
+        if not (out / TAKEN).exists():
+            _made(out, changes, given)
+        told = json.loads((out / TAKEN).read_text())
+        print(told["text"], flush=True)
+        if given.repeats:
+            _studies(out, told["seconds"], changes, given)
 
 
-def _made(out: Path, changes: Sequence[str], given: argparse.Namespace) -> tuple[str, float]:
-    """Make the reduced model: its file, and the processor time of the making."""
+def _made(out: Path, changes: Sequence[str], given: argparse.Namespace) -> None:
+    """Make the reduced model in a folder, and write down the processor time of the making."""
     method = {"snapshots": given.snapshots, "modes": given.modes, "cubature": 3e-3, "rounds": 0, "unseen": 0}
     sets = [*changes, *(f"method.{key}={value}" for key, value in method.items()), "method.derivatives=false"]
     options = [part for one in sets for part in ("--set", one)]
@@ -64,35 +71,45 @@ def _made(out: Path, changes: Sequence[str], given: argparse.Namespace) -> tuple
     seconds = time.process_time() - begin
     told = json.loads((out / "summary.json").read_text())["reduced"]
     parts = told["seconds"]
-    print(
+    text = (
         f"{told['snapshots']} snapshots in {parts['snapshots']:.0f} s, reduction {parts['reduction']:.0f} s, all "
         f"{seconds:.0f} s: {told['modes']} modes at {told['points']} points, {told['modes of the larger model']} at "
-        f"{told['points of the larger model']}",
-        flush=True,
+        f"{told['points of the larger model']}"
     )
-    return str(out / told["file"]), seconds
+    (out / TAKEN).write_text(json.dumps({"text": text, "seconds": seconds}))
 
 
-def _studies(file: str, off_line: float, changes: Sequence[str], given: argparse.Namespace) -> None:
+def _studies(out: Path, off_line: float, changes: Sequence[str], given: argparse.Namespace) -> None:
+    """Repeat studies, beside those of the same options that are kept, and print them all."""
     study: Any = load(CONFIG, [*changes, "method={kind='monte-carlo', samples=16}"])
-    cheap = ({"kind": "reduced", "file": file}, {"kind": "reduced", "file": file, "larger": True})
-    first = Multifidelity(samples=given.samples, cheap=cheap, pilot=given.pilot, control="tangent")  # type: ignore[arg-type]
+    costs = given.costs or [None, None]
+    cheap = [
+        {"kind": "reduced", "file": str(out / "reduced.npz"), "larger": larger, "cost": cost}
+        for larger, cost in zip((False, True), costs, strict=True)
+    ]
+    first = Multifidelity(samples=given.samples, cheap=tuple(cheap), pilot=given.pilot, control="tangent")  # type: ignore[arg-type]
     names = study.inputs.names
     others = {name: spec.build(MPI.COMM_SELF, names) for name, spec in first.models(study.spec).items()}
     model = study.spec.build(MPI.COMM_SELF, names)
-    rows, own, times = [], [], []
-    for seed in range(given.repeats):
+    kept = out / f"studies-{given.samples}-{given.pilot}-{costs}.npz"
+    rows, own, times, outputs = [], [], [], list(model.outputs)
+    if kept.exists():
+        with np.load(kept) as there:
+            rows, own, times = [*there["rows"]], [there["own"]], [there["times"]]
+    for seed in range(len(rows), len(rows) + given.repeats):
         recorder = Recorder(SerialEvaluate(model, others=others))
         begin = time.process_time()
         data = first.model_copy(update={"seed": seed}).run(study.inputs, recorder)
         cpu = time.process_time() - begin
-        outputs = list(data["output"].values)
         of_own = [one for one, name in zip(recorder.log, recorder.models, strict=True) if name == OWN][1:]
         own.append(np.concatenate([one.outputs[one.ok] for one in of_own]))
         times.append(np.concatenate([one.seconds for one in of_own]))
         needed = data["alternative_solves"]
         tangent = needed.sel(alternative="monte-carlo") / needed.sel(alternative="sensitivity-monte-carlo")
-        rows.append([data["mean"].values, data["mean_error"].values, np.full(len(outputs), cpu), tangent.values])
+        rows.append(
+            np.array([data["mean"].values, data["mean_error"].values, np.full(len(outputs), cpu), tangent.values])
+        )
+        np.savez(kept, rows=np.array(rows), own=np.concatenate(own), times=np.concatenate(times))
         if seed == 0:
             _described(data, recorder, outputs)
     plain, per_solve = np.concatenate(own), float(np.concatenate(times).mean())

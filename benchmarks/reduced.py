@@ -65,13 +65,25 @@ def _table(told: dict[str, Any], data: Any) -> None:
         f"fastest full solve {full:.1f} ms: {full / cold:.0f} times as long"
     )
     print(f"state: error {100 * told['error of the state']:.2g} %")
-    print("| output | error (% of the spread) | after correction | effectivity | gradient (%) | corrected |")
-    print("|---|---|---|---|---|---|")
+    print(
+        "| output | error (% of the spread) | after correction | effectivity | gradient (%) | corrected "
+        "| largest at the same place (% of the samples), corrected | gradient there (%) | corrected |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     for name, error in told["errors"].items():
         after, effectivity = told["errors after correction"][name], told["effectivity"][name]
-        of_gradient = told["errors of gradients"][name], told["errors of gradients after correction"][name]
-        gradients = " | ".join(f"{100 * one:.2g}" for one in of_gradient)
-        print(f"| {name} | {100 * error:.2g} | {100 * after:.2g} | {effectivity:.2f} | {gradients} |")
+        gradients, there, share = (
+            [f"{100 * told[before + which + end][name]:.2g}" for which in ("", " after correction")]
+            for before, end in (
+                ("errors of gradients", ""),
+                ("errors of gradients", ", at the same place"),
+                ("share of samples at the same place", ""),
+            )
+        )
+        print(
+            f"| {name} | {100 * error:.2g} | {100 * after:.2g} | {effectivity:.2f} | {' | '.join(gradients)} "
+            f"| {', '.join(share)} | {' | '.join(there)} |"
+        )
     _frames(model)
 
 

@@ -46,6 +46,11 @@ class _Extreme:
 
         return -ranks.smallest(self._equations.comm, -self._candidates().max(initial=0.0))
 
+    def place(self) -> int:
+        """Number of the node of this rank at which it is largest."""
+        candidates = self._candidates()
+        return int(np.argmax(candidates >= candidates.max(initial=0.0) * (1 - 1e-10)))
+
     def gradient(self) -> FloatArray:
         from forward.fem import ranks
 

@@ -58,6 +58,10 @@ class _MaxVonMises:
 
         return -ranks.smallest(self._equations.comm, -self._values().max(initial=0.0))
 
+    def place(self) -> int:
+        """Number of the quadrature point of this rank at which it is largest."""
+        return int(np.argmax(self._values()))
+
     def _at_place(self) -> Integral:
         """Return the stress at the point where it is currently largest."""
         equations = self._equations

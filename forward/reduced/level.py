@@ -12,96 +12,11 @@ from functools import cached_property
 import numpy as np
 
 from forward.model import FloatArray
-from forward.reduced.data import LevelData, Output, Points, ReducedData, Written
-from forward.reduced.kernels import Kernel, spread
+from forward.reduced.at_points import Integrand
+from forward.reduced.data import LevelData, Output, Points, ReducedData
+from forward.reduced.kernels import spread
 
 LENGTH = 3  # in place of an axis
-
-
-class Integrand:
-    """An integrand at points, and its derivatives by what it takes."""
-
-    def __init__(self, written: Written, points: Points, numbers: int) -> None:
-        self._written, self.points = written, points
-        m, n, count = points.fields.shape
-        self.components, self._varying = m, m + len(points.given) + len(points.logs)
-        self.fields = points.fields
-        self._flat = points.fields.reshape(m * n, count)
-        self.weighted = np.ascontiguousarray((points.weights[:, None] * points.fields).reshape(m * n, count))
-        self._numbers = numbers
-        self._inputs = np.empty((self._varying, n))  # filled again and again: what is given never changes
-        self._inputs[m : m + len(points.given)] = points.given
-
-    def _derived(self, along: Sequence[int]) -> Kernel:
-        """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
-        graph, outputs = self._written.tape.graph()
-        slopes = [graph.tangent(outputs, i) for i in along]
-        by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
-        return Kernel(graph.tape([*outputs, *by_output]), self._varying)
-
-    @cached_property
-    def _values(self) -> Kernel:
-        return self._derived(())
-
-    @cached_property
-    def dead(self) -> bool:
-        """Whether its outputs do not depend on the state."""
-        graph, outputs = self._written.tape.graph()
-        slopes = (one for i in range(self.components) for one in graph.tangent(outputs, i))
-        return all(graph.value(one) == 0 for one in slopes)
-
-    @cached_property
-    def _by_state(self) -> Kernel:
-        return self._derived(range(self.components))
-
-    @cached_property
-    def _by_parameters(self) -> Kernel:
-        first = self.components + len(self.points.given)
-        return self._derived(range(first, first + len(self.points.logs) + self._numbers))
-
-    def inputs(self, c: FloatArray, coefficients: Sequence[FloatArray]) -> FloatArray:
-        """Return what the integrand takes (varying, n) at coordinates, with the coefficients of all random fields.
-
-        The array holds until this is called again.
-        """
-        found = self._inputs
-        np.dot(self._flat, c, out=found[: self.components].reshape(-1))
-        for row, (number, log, slopes) in zip(
-            found[self._varying - len(self.points.logs) :], self.points.logs, strict=True
-        ):
-            row[:] = log + slopes @ coefficients[number]
-        return found
-
-    def states(self, c: FloatArray) -> FloatArray:
-        """Return the components (s, m, n) of the states at coordinates (s, N) of several samples."""
-        return np.asarray((c @ self._flat.T).reshape(len(c), self.components, -1))
-
-    def values(self, inputs: FloatArray, numbers: FloatArray) -> FloatArray:
-        """Return its outputs (k, n)."""
-        return self._values(inputs, numbers)
-
-    def at(self, c: FloatArray, parameters: FloatArray, level: Level) -> FloatArray:
-        """Return its outputs (s, k, n) at coordinates (s, N) and parameters (s, d) of several samples."""
-        found, at_rest = [], np.zeros(c.shape[1])
-        for point, components in zip(parameters, self.states(c), strict=True):
-            inputs = self.inputs(at_rest, level.coefficients(point))
-            inputs[: self.components] = components
-            found.append(self.values(inputs, level.numbers(point)))
-        return np.array(found)
-
-    def by_state(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return its outputs (k, n), and their derivatives (k, m, n) by the components of the state."""
-        found = self._by_state(inputs, numbers)
-        k = len(found) // (1 + self.components)
-        return found[:k], found[k:].reshape(k, self.components, -1)
-
-    def by_parameters(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return derivatives (k, f, n) of its outputs by the logarithms of its fields, and (k, p, n) by numbers."""
-        found = self._by_parameters(inputs, numbers)
-        logs = len(self.points.logs)
-        k = len(found) // (1 + logs + self._numbers)
-        slopes = found[k:].reshape(k, logs + self._numbers, -1)
-        return slopes[:, :logs], slopes[:, logs:]
 
 
 class Level:

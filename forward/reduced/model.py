@@ -20,7 +20,7 @@ from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, S
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
-from forward.reduced.together import TOGETHER, equilibria
+from forward.reduced.together import TOGETHER, TOLERANCE, equilibria
 
 
 class Estimate(NamedTuple):
@@ -63,6 +63,8 @@ class ReducedModel(OneByOne):
         Whether it is the nested larger model, which nothing estimates the errors of.
     tested
         Whether the stability of equilibria is tested. Without, those at many points are found in lockstep.
+    unbalanced
+        What may be left of the forces in lockstep, relative to what they would be if they did not cancel.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class ReducedModel(OneByOne):
         *,
         alone: bool = False,
         tested: bool = True,
+        unbalanced: float = TOLERANCE,
     ) -> None:
         self.data, self.parameters = data, parameters
         names = [output.name for output in data.outputs]
@@ -97,7 +100,7 @@ class ReducedModel(OneByOne):
         # Energies of displacements and pressures have no minimum.
         self.way: Way = under_tools if touched and not self.level.pressures else newton
         self.touched = touched
-        self._tolerance, self._full = tolerance, full
+        self._tolerance, self._full, self._unbalanced = tolerance, full, unbalanced
 
     @property
     def together(self) -> int:
@@ -129,7 +132,7 @@ class ReducedModel(OneByOne):
                 refused[i] = error
         good = [i for i in range(len(points)) if i not in refused]
         starts = np.array([self.first(wholes[i]) for i in good]).reshape(len(good), self.level.modes)
-        found, iterations = equilibria(self.level, wholes[good], starts, self._inverse)
+        found, iterations = equilibria(self.level, wholes[good], starts, self._inverse, self._unbalanced)
         ok = np.isfinite(found).all(axis=1)
         outputs = iter(self.level.outputs_together(found[ok], wholes[good][ok]))
         of = {i: (c, Work(residuals=n)) for i, c, n, fine in zip(good, found, iterations, ok, strict=True) if fine}
@@ -358,6 +361,12 @@ class ReducedSolution:
             return None
         c[larger.free] += change
         return c, change
+
+    @property
+    def corrected_state(self) -> FloatArray:
+        """Displacements (U,) of the nodes in the larger model where its step ends; NaN without one."""
+        fields = self._model.data.fields
+        return np.full(fields.shape[1], np.nan) if self._larger is None else self._larger[0] @ fields
 
     @cached_property
     def corrected_jacobian(self) -> FloatArray:

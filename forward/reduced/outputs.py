@@ -20,6 +20,7 @@ from forward.reduced.kernels import Kernel
 from forward.reduced.level import LENGTH
 
 NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
+IN_CELL = 0.9  # of the largest stress of their cell, that they have then too: neighbours of a peak are no peaks
 
 
 class Outputs:
@@ -111,11 +112,30 @@ class Outputs:
                 integrals += 1
         return tuple(found)
 
+    def places(self, state: FloatArray, parameters: FloatArray) -> NDArray[np.int64]:
+        """Return where the body in a state (U_local,) at parameters (d,) has its largest values.
+
+        Returns
+        -------
+        numpy.ndarray
+            For each output (m,) the number of a node or of a quadrature point; −1 for those that are no largest value.
+        """
+        equations = self._equations
+        equations.set_parameters(parameters)
+        equations.at_load(1.0)
+        equations.set_state(state)
+        return np.array(
+            [
+                functional.place() if isinstance(one, MaxDisplacement | MaxVonMises) else -1
+                for one, functional in self._pairs
+            ]
+        )
+
     def _near_peak(
         self, sampler: Sampler, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
     ) -> NDArray[np.int64]:
         """Number the points that are near the largest value in any snapshot, and those in cells kept in full."""
-        near = np.zeros(sampler.count, dtype=bool)
+        near, cells = np.zeros(sampler.count, dtype=bool), len(self._equations.layout.cells()[0])
         if kept is not None:
             near |= np.repeat(kept, sampler.count // len(kept))
         everywhere = sampler.points(np.zeros((0, states.shape[1])))
@@ -124,5 +144,7 @@ class Outputs:
         for state, point in zip(states, parameters, strict=True):
             inputs = sampler.inputs(sampler.components(state), everywhere, point)
             values = kernel(inputs, point[self._numbers])[0]
-            near |= values >= NEAR_PEAK * values.max()
+            of_cells = values.reshape(cells, -1)
+            high = (of_cells >= IN_CELL * of_cells.max(axis=1, keepdims=True)).ravel()
+            near |= high & (values >= NEAR_PEAK * values.max())
         return np.flatnonzero(near)

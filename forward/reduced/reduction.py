@@ -158,6 +158,14 @@ class Reduction:
         spread = np.array(data.about["spread"])
         return self._of_modes(modes, len(first), whole, parameters, sizes, spread, truncation, None)
 
+    def places(self, states: FloatArray, parameters: FloatArray) -> NDArray[np.int64]:
+        """Return where the body has its largest values (s, m) in states (s, U) at parameters (s, d).
+
+        Numbers of nodes or of quadrature points; −1 for outputs that are no largest value.
+        """
+        rows = self.equations.layout.scatter(states)
+        return np.array([self._outputs.places(row, point) for row, point in zip(rows, parameters, strict=True)])
+
     def _labels(self, cut: tuple[int, int, int] | Literal["regions"]) -> NDArray[np.int64]:
         """Return the block of each cell."""
         if cut != "regions":

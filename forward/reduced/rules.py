@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,8 @@ from forward.reduced.data import LevelData, Points
 from forward.reduced.integrands import Integrand, Sampler
 from forward.reduced.kernels import Kernel
 
-CANDIDATES = 20_000  # points among which a rule is chosen, of more a random part
+CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
+STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
 KEPT_WHOLE = 600  # points of a boundary that are all kept
 SEED = 7
 FINER = 3.0  # how many times less the points of the larger model miss
@@ -42,6 +43,12 @@ class Training:
     parameters: FloatArray
     before: int
     tests: int
+
+    def some(self, most: int) -> Training:
+        """Return an even part of the snapshots, at most so many."""
+        count = len(self.parameters)
+        few = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
+        return replace(self, coordinates=self.coordinates[few], parameters=self.parameters[few])
 
     def tested(self, modes: int) -> NDArray[np.int64]:
         """Return the coordinates on which works are tested: tests and the first modes."""
@@ -101,7 +108,7 @@ class Rules:
         kept
             Which cells are kept in full, with all their points; None for none.
         """
-        rows, before = training.rows, training.before
+        rows, before, training = training.rows, training.before, training.some(STATES)
         levels: list[LevelData] = []
         told: dict[str, Any] = {}
         in_full = [np.zeros(sampler.count, dtype=bool) for sampler in self._samplers]

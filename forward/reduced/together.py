@@ -11,19 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.reduced.level import Integrand, Level
+from forward.reduced.at_points import Integrand
+from forward.reduced.level import Level
 from forward.solvers.anderson import AndersonMixing
 
-TOGETHER = 16  # samples
+TOGETHER = 64  # samples
 WINDOW = 8  # differences that Anderson mixing keeps
 ITERATIONS = 40
 TOLERANCE = 1e-9  # of the forces, relative to what they would be if they did not cancel
 
 
 def equilibria(
-    level: Level, parameters: FloatArray, modes: FloatArray, inverse: FloatArray
+    level: Level, parameters: FloatArray, modes: FloatArray, inverse: FloatArray, tolerance: float = TOLERANCE
 ) -> tuple[FloatArray, list[int]]:
     """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes, with an inverse stiffness (n, n).
+
+    Parameters
+    ----------
+    level
+        The model.
+    parameters, modes, inverse
+        The samples, where they begin, and what corrects them.
+    tolerance
+        What may be left of the forces, relative to what they would be if they did not cancel.
 
     Returns
     -------
@@ -45,7 +55,7 @@ def equilibria(
         left = np.abs(R[:, free]).max(axis=1, initial=0.0)
         for i in active:
             iterations[i] += 1
-        done = left <= TOLERANCE * size
+        done = left <= tolerance * size
         found[active[done]] = c[active[done]]
         on = ~done & np.isfinite(R).all(axis=1)
         forces = R[on][:, free]
@@ -60,11 +70,12 @@ def equilibria(
 def _still(level: Level, parameters: FloatArray) -> FloatArray:
     """Forces (N,) that do not depend on the state."""
     numbers, coefficients = level.numbers(parameters), level.coefficients(parameters)
-    at_rest = np.zeros(level.count)
     R = level.proportional(parameters)
     for work in level.works:
         if work.dead:
-            R = R + work.values(work.inputs(at_rest, coefficients), numbers).ravel() @ work.weighted
+            inputs = work.without_state(coefficients)
+            inputs[: work.components] = 0
+            R = R + work.values(inputs, numbers).ravel() @ work.weighted
     return R
 
 
@@ -73,16 +84,14 @@ class _Moving:
 
     def __init__(self, work: Integrand, level: Level, parameters: FloatArray) -> None:
         self._work = work
-        at_rest = np.zeros(level.count)
         self._numbers = [level.numbers(point) for point in parameters]
-        self._inputs = np.array([work.inputs(at_rest, level.coefficients(point)).copy() for point in parameters])
+        self._inputs = np.array([work.without_state(level.coefficients(point)).copy() for point in parameters])
+        self._acting = np.empty((len(parameters), work.size, self._inputs.shape[2]))
 
     def forces(self, c: FloatArray, which: NDArray[np.int64]) -> FloatArray:
         """Return the forces (k, N) of the samples `which` (k,) at coordinates (k, N)."""
-        work = self._work
-        components = work.states(c)
-        acting = []
-        for i, of_state in zip(which, components, strict=True):
+        work, acting = self._work, self._acting[: len(which)]
+        for i, of_state, out in zip(which, work.states(c), acting, strict=True):
             self._inputs[i, : work.components] = of_state
-            acting.append(work.values(self._inputs[i], self._numbers[i]).ravel())
-        return np.asarray(np.array(acting) @ work.weighted)
+            work.values(self._inputs[i], self._numbers[i], out)
+        return np.asarray(acting.reshape(len(which), -1) @ work.weighted)

@@ -191,9 +191,9 @@ class Prediction:
         return lambda parameters: Guess(state + (self.coordinates.of(parameters) - here) @ slopes, reference)
 
 
-def company_of(samples: int) -> int:
-    """How many samples that begin from predictions are in one block, of so many in all."""
-    return min(COMPANY, max(samples // FEW, 1))
+def company_of(samples: int, most: int = COMPANY) -> int:
+    """How many samples that begin from predictions are in one block, of so many in all and at most."""
+    return min(most, max(samples // FEW, 1))
 
 
 @dataclass(frozen=True)
@@ -220,6 +220,8 @@ class Request:
         Whether the errors of the mesh in the outputs are estimated (`Solution.mesh_error`).
     saturations
         How many solves it may cost to find what calibrates these too (`Solution.saturation`); None if it is not wanted.
+    company
+        How many points at most go together in a block, of those that begin from predictions.
     """
 
     points: FloatArray
@@ -231,6 +233,7 @@ class Request:
     joint: JointSum | None = None
     mesh_errors: bool = False
     saturations: float | None = None
+    company: int = COMPANY
 
     def blocks(self, most: int | None = None) -> list[Request]:
         """Cut into blocks that depend only on the number of points, the size of rows, and `most`.
@@ -239,7 +242,7 @@ class Request:
         asked for, which is for many groups of ranks, there are several in each.
         """
         together, n = 1 if self.joint is None else self.joint.size, len(self.points)
-        company = company_of(n) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
+        company = company_of(n, self.company) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
         size = together * max(1, -(-n // (together * (most or BLOCKS))), -(-company // together))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 

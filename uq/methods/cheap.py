@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from forward.scalars import Mistake
 
+UNBALANCED = 1e-4  # part of the forces that a reduced model may leave: it errs by far more, and need only follow
 CORRECTIONS = 8  # of a solve from the tangent to the tolerance, by which few of them are cheaper
 
 
@@ -169,7 +170,7 @@ class ReducedModel(CheapModel):
     def of(self, spec: ModelSpec) -> ModelSpec:
         """Return the reduced model."""
         made: ModelSpec = named("forward.reduced.spec:Reduced")(
-            file=self.file, larger=self.larger, accept_unstable=True
+            file=self.file, larger=self.larger, accept_unstable=True, unbalanced=UNBALANCED
         )
         return made
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Group, subsets
 from uq.estimators.fidelities import Samples, ok_rows
-from uq.evaluation.evaluate import Evaluations, Recorder, Request
+from uq.evaluation.evaluate import COMPANY, Evaluations, Recorder, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.cheap import CheapModel
@@ -19,6 +19,7 @@ from uq.methods.stopping import TEXTBOOK
 from uq.surrogates.linearisation import Linearisation, linearise
 
 OWN_LABEL = "model"  # name in results of the model of the study
+CHEAP = 64  # points of a cheap model in a block, unless they cost more than those of the study's model
 PILOT = -1  # group of a pilot that does not count in estimates, in results
 
 
@@ -48,8 +49,10 @@ class Member:
 
     def solve(self, points: FloatArray, *, tangents: bool = False) -> Evaluations:
         """Solve at points (n, d)."""
-        start = self.centre.prediction
-        return self.evaluate(Request(points, tangents=tangents, start=start, iterations=self.stopped_after))
+        start, company = self.centre.prediction, min(CHEAP, int(COMPANY / self.cost))
+        return self.evaluate(
+            Request(points, tangents=tangents, start=start, iterations=self.stopped_after, company=company)
+        )
 
 
 @dataclass

@@ -62,6 +62,8 @@ class Reduce(Method):
         In how many rounds those are drawn.
     modes
         Number of modes; by default as many as `truncation` needs.
+    more
+        How many modes of states the nested larger model has besides, which tells errors and corrects gradients.
     blocks
         Into which blocks the body is cut, with modes of their own; by default modes are those of the whole body.
     truncation
@@ -81,6 +83,7 @@ class Reduce(Method):
     snapshots: Annotated[int, Field(ge=4)] = 96
     rounds: Annotated[int, Field(ge=0)] = 3
     modes: Annotated[int, Field(ge=1)] | None = None
+    more: Annotated[int, Field(ge=1)] = 120
     blocks: Blocks | None = None
     truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
     cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3

@@ -114,7 +114,7 @@ class _Making:
     ) -> None:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
         self._start = linearise(inputs, evaluate).prediction
-        self._sizes = Sizes(method.modes, method.truncation, method.cubature)
+        self._sizes = Sizes(method.modes, method.truncation, method.cubature, method.more)
         if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
             self._sizes = replace(self._sizes, more=max(self._sizes.more, OF_STATES * method.modes))
         if method.blocks is not None:
@@ -144,7 +144,7 @@ class _Making:
         seconds += time.process_time() - begin
         solving = float(sum(one.seconds.sum() for one in self._evaluate.log))
         self.seconds = {"snapshots": solving, "reduction": seconds}
-        return data, self._measured(data)
+        return data, self._measured(data, reduction)
 
     def _solved(self, points: FloatArray) -> Snapshots:
         """Solve at points (n, d); those without an answer are left out."""
@@ -176,7 +176,7 @@ class _Making:
             self._say(f"reduced: {said}; estimated errors up to {100 * finite.max():.2g} % of the spread of an output")
         return candidates[np.sort(chosen)]
 
-    def _measured(self, data: ReducedData) -> xr.Dataset:
+    def _measured(self, data: ReducedData, reduction: Reduction) -> xr.Dataset:
         """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
         method, inputs, names = self._method, self._inputs, list(self._model.outputs)
         found = xr.Dataset(coords={"output": names, "parameter": list(inputs.names)})
@@ -193,6 +193,7 @@ class _Making:
         errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
         estimated_state = np.full(n, np.nan)
         gradients = np.full((3, n, m, len(inputs.names)), np.nan)  # of the body, and what is off before and after
+        places = np.zeros((3, n, m))  # of largest values: of the body, and what the model says before and after
         for i, point in enumerate(points):
             state = next(states) if ok[i] else None
             try:
@@ -207,17 +208,16 @@ class _Making:
                 own = solution.adjoint(np.eye(m))
                 exact = full.tangents[i]
                 gradients[:, i] = np.array([exact, exact - own, exact - solution.corrected_jacobian]) * inputs.std
+                of_point = np.array([state, solution.state, np.nan_to_num(solution.corrected_state)])
+                places[:, i] = reduction.places(of_point, np.tile(point, (3, 1)))
         good = np.isfinite(errors).all(axis=1) & np.isfinite(estimates).all(axis=1)
         e, x, spread = errors[good], estimates[good], np.array(data.about["spread"])
         told: dict[str, Any] = {"unseen": int(good.sum())}
         if good.any():
             rms, left = np.sqrt((e**2).mean(axis=0)), np.sqrt(((e - x) ** 2).mean(axis=0))
             effectivity = (x * e).sum(axis=0) / np.maximum((e**2).sum(axis=0), 1e-300)
-            of_body, *off = np.sqrt((gradients[:, good] ** 2).sum(axis=3).mean(axis=1))
-            before, after = (one / np.maximum(of_body, 1e-300) for one in off)
+            told |= _of_gradients(names, gradients[:, good], places[:, good])
             told |= {
-                "errors of gradients": dict(zip(names, before.tolist(), strict=True)),
-                "errors of gradients after correction": dict(zip(names, after.tolist(), strict=True)),
                 "errors": dict(zip(names, (rms / spread).tolist(), strict=True)),
                 "errors after correction": dict(zip(names, (left / spread).tolist(), strict=True)),
                 "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),
@@ -245,3 +245,32 @@ class _Making:
                 f"{', '.join(off)}. Their sizes on these samples are what can be trusted."
             )
             add(found, Finding("warning", text))
+
+
+def _of_gradients(names: list[str], gradients: FloatArray, places: FloatArray) -> dict[str, Any]:
+    """Return errors of gradients by output, root mean square over samples relative to the gradients.
+
+    Where two places of a body have nearly the same largest value, that has a kink: a model may take the other place,
+    with another gradient. So they are told for all samples, and for those at which the place is the same.
+
+    Parameters
+    ----------
+    names
+        The outputs.
+    gradients
+        Those of the body, and what is off before and after correction (3, n, m, d).
+    places
+        Numbers (3, n, m) of the places of largest values, in the same order.
+    """
+    sizes = (gradients**2).sum(axis=3)
+    told: dict[str, Any] = {}
+    for k, which in ((1, ""), (2, " after correction")):
+        same = places[k] == places[0]
+        every, there = (
+            np.sqrt((sizes[k] * counted).sum(axis=0) / np.maximum((sizes[0] * counted).sum(axis=0), 1e-300))
+            for counted in (np.ones_like(same), same)
+        )
+        told[f"errors of gradients{which}"] = dict(zip(names, every.tolist(), strict=True))
+        told[f"errors of gradients{which}, at the same place"] = dict(zip(names, there.tolist(), strict=True))
+        told[f"share of samples at the same place{which}"] = dict(zip(names, same.mean(axis=0).tolist(), strict=True))
+    return told

@@ -147,6 +147,18 @@ def test_in_lockstep_the_equilibria_are_those_of_newtons_method(full, small, alo
         assert np.isnan(one.estimate.outputs).all() == alone
 
 
+def test_forces_may_be_left_out_of_balance_in_lockstep(full, small):
+    points = NOMINAL + SPREAD * np.random.default_rng(3).uniform(-1, 1, (4, 7))
+    exact, rough = (
+        list(ReducedModel(small, full.parameters, tested=False, unbalanced=part).solve_many(points))
+        for part in (1e-9, 1e-4)
+    )
+    spread = np.std([one.outputs for one in exact], axis=0)
+    for one, other in zip(exact, rough, strict=True):
+        assert 0 < other.work.residuals < one.work.residuals
+        assert (np.abs(other.outputs - one.outputs) < 0.02 * spread).all()
+
+
 def test_what_lockstep_does_not_find_newtons_method_does(full, small, monkeypatch):
     monkeypatch.setattr("forward.reduced.together.ITERATIONS", 2)
     model = ReducedModel(small, full.parameters, tested=False)
@@ -167,6 +179,21 @@ def test_estimates_see_the_errors_where_the_larger_model_holds_the_state(full, s
     effectivity = (e * x).sum(axis=0) / (e**2).sum(axis=0)
     assert (np.abs(effectivity[:2] - 1) < 0.3).all(), effectivity  # linear outputs: the corrected values are closer
     assert (np.linalg.norm(e - x, axis=0) < np.linalg.norm(e, axis=0))[[0, 1, 3, 4, 6]].all()
+
+
+def test_largest_values_have_places(full, snapshots, reduction, small):
+    """Those of a state of the body are where its displacements and stresses are largest."""
+    for state, point, outputs in zip(snapshots.states[:2], snapshots.parameters, snapshots.outputs, strict=False):
+        (place,) = reduction.places(state[None], point[None])
+        assert (place[[0, 1, 3, 4, 6]] == -1).all()
+        moved = np.linalg.norm(state.reshape(-1, 3), axis=1)
+        assert abs(moved[full.equations.layout.positions[place[2]]] - outputs[2]) < 1e-9 * outputs[2]
+        stress = full.functionals[5]
+        assert abs(stress.value() - outputs[5]) < 1e-9 * outputs[5]
+        assert stress.place() == place[5]
+    found = ReducedModel(small, full.parameters).solve(snapshots.parameters[0])
+    corrected = np.linalg.norm(found.corrected_state.reshape(-1, 3), axis=1).max()
+    assert abs(corrected - found.outputs[2] - found.estimate.outputs[2]) < 1e-9
 
 
 def test_gradients_are_corrected_too(full, snapshots, small):

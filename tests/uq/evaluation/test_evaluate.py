@@ -71,6 +71,15 @@ def test_blocks_cover_all_points_in_order(n):
     assert len(Request(points).blocks(n)) == n
 
 
+def test_points_that_begin_from_predictions_go_in_company():
+    points, start = np.zeros((10_000, 1)), object()
+    largest = [
+        max(len(one.points) for one in Request(points[:n], start=start, company=64).blocks()) for n in (100, 10_000)
+    ]
+    assert largest == [6, 79]  # no fewer than 16 blocks, no more than 128
+    assert max(len(one.points) for one in Request(points[:400], start=start).blocks()) == 16
+
+
 def test_checkpoint_returns_what_was_saved(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     request = Request(POINTS[:8], tangents=True)

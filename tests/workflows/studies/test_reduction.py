@@ -96,6 +96,8 @@ def test_the_command_makes_a_model_with_known_errors(folder, looked_at, chromium
     assert all(error < 1e-2 for error in told["errors"].values())
     assert set(told["effectivity"]) == {"u_max", "energy"}
     assert all(error < 0.02 for error in told["errors of gradients"].values())
+    assert told["share of samples at the same place"] == {"u_max": 1, "energy": 1}
+    assert told["errors of gradients, at the same place"] == told["errors of gradients"]
     assert (folder / "made" / "reduced.npz").read_bytes() == (folder / "model.npz").read_bytes()
     assert (folder / "made" / "report.html").exists()
     looked_at(folder / "made")
