@@ -29,13 +29,14 @@ POINTS = 20
 
 
 def main(options: Sequence[str] = ()) -> None:
-    """Print a table for each size; `--modes=40` for one of them, `--organ` for the organ."""
+    """Print a table for each size; `--modes=40` for one of them, `--more=320` for a larger larger one, `--organ`."""
     name = "organ" if "--organ" in options else "slab"
     sizes = [int(one.removeprefix("--modes=")) for one in options if one.startswith("--modes=")] or MODES[name]
     for modes in sizes:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / name
-            sets = [f"method.modes={modes}", *(OF_ORGAN if name == "organ" else ())]
+            more = [f"method.more={one.removeprefix('--more=')}" for one in options if one.startswith("--more=")]
+            sets = [f"method.modes={modes}", *more, *(OF_ORGAN if name == "organ" else ())]
             changes = [part for one in sets for part in ("--set", one)]
             command(["reduce", str(CONFIGS / f"{name}.toml"), "--out", str(out), "--quiet", "--no-report", *changes])
             told = json.loads((out / "summary.json").read_text())["reduced"]

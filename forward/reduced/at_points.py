@@ -68,11 +68,15 @@ class Integrand:
 
     def without_state(self, coefficients: Sequence[FloatArray]) -> FloatArray:
         """Return what the integrand takes (varying, n) with no meaning in the rows of the state, as `inputs` does."""
-        found = self._inputs
-        for row, (number, log, slopes) in zip(
-            found[self._varying - len(self.points.logs) :], self.points.logs, strict=True
-        ):
-            row[:] = log + slopes @ coefficients[number]
+        self._inputs[self._varying - len(self.points.logs) :] = self.logs([coefficients])[0]
+        return self._inputs
+
+    def logs(self, coefficients: Sequence[Sequence[FloatArray]]) -> FloatArray:
+        """Return the logarithms (s, f, n) of its fields, with the coefficients of all fields of several samples."""
+        points = self.points
+        found = np.empty((len(coefficients), len(points.logs), len(points.weights)))
+        for k, (number, log, slopes) in enumerate(points.logs):
+            found[:, k] = log + np.array([one[number] for one in coefficients]) @ slopes.T
         return found
 
     def states(self, c: FloatArray) -> FloatArray:
@@ -90,10 +94,11 @@ class Integrand:
 
     def at(self, c: FloatArray, parameters: FloatArray, level: Level) -> FloatArray:
         """Return its outputs (s, k, n) at coordinates (s, N) and parameters (s, d) of several samples."""
-        found = np.empty((len(c), self.size, self._inputs.shape[1]))
-        for out, point, components in zip(found, parameters, self.states(c), strict=True):
-            inputs = self.without_state(level.coefficients(point))
-            inputs[: self.components] = components
+        inputs, first = self._inputs, self._varying - len(self.points.logs)
+        found = np.empty((len(c), self.size, inputs.shape[1]))
+        logs = self.logs([level.coefficients(point) for point in parameters])
+        for out, point, components, log in zip(found, parameters, self.states(c), logs, strict=True):
+            inputs[: self.components], inputs[first:] = components, log
             self.values(inputs, level.numbers(point), out)
         return found
 

@@ -285,6 +285,9 @@ class _Integral(_OfDensity):
 
 
 class _Peak(_OfDensity):
+    def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        return np.asarray(self._density.at(c, parameters, self.level)[:, 0].max(axis=1))
+
     def _weights(self, values: FloatArray) -> FloatArray:
         weights = np.zeros(len(values))
         weights[int(np.argmax(values))] = 1.0

@@ -19,6 +19,7 @@ from forward.reduced.outputs import Outputs
 from forward.reduced.rules import Rules, Training
 from forward.reduced.snapshots import Snapshots
 
+OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
 OF_TANGENTS = 0.5  # weight of changes of the state by one standard deviation, beside the states
 KINDS = 3  # of modes in the mixed form: displacements, pressures, and their supports
 
@@ -36,7 +37,8 @@ class Sizes:
     cubature
         What the points may miss of the forces of the snapshots, relative.
     more
-        How many modes of states the nested larger model has besides, and as many of adjoints as the model has modes.
+        How many modes of states the nested larger model has besides; of adjoints it has as many as the model has modes,
+        and at least a third of these.
     cut
         Into how many blocks along each axis the body is cut, which have modes of their own; or its regions are blocks.
     full
@@ -133,7 +135,7 @@ class Reduction:
             n = min(n, len(modes))
             modes = modes[: n + sizes.more]
         adjoints = self.equations.layout.scatter(snapshots.adjoints)
-        modes = np.vstack([modes, self._of_adjoints(adjoints, modes, n)])
+        modes = np.vstack([modes, self._of_adjoints(adjoints, modes, max(n, sizes.more // OF_ADJOINTS))])
         spread = np.maximum(snapshots.outputs.std(axis=0), 1e-300)
         return self._of_modes(modes, n, rest, snapshots.parameters, sizes, spread, left, kept)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.reduced.at_points import Integrand
 from forward.reduced.level import Level
-from forward.solvers.anderson import AndersonMixing
+from forward.solvers.anderson import least_squares
 
 TOGETHER = 64  # samples
 WINDOW = 8  # differences that Anderson mixing keeps
@@ -45,7 +45,7 @@ def equilibria(
     found, iterations = np.full_like(c, np.nan), [0] * s
     moving = [_Moving(work, level, parameters) for work in level.works if not work.dead]
     still = np.array([_still(level, point) for point in parameters])
-    mixing = [AndersonMixing(WINDOW, level.modes, lambda values: values) for _ in range(s)]
+    mixing = _Mixing(s, level.modes)
     active = np.arange(s)
     for _ in range(ITERATIONS):
         parts = [still[active], *(one.forces(c[active], active) for one in moving)]
@@ -58,13 +58,38 @@ def equilibria(
         done = left <= tolerance * size
         found[active[done]] = c[active[done]]
         on = ~done & np.isfinite(R).all(axis=1)
-        forces = R[on][:, free]
-        for i, force, correction in zip(active[on], forces, forces @ inverse.T, strict=True):
-            c[i, free] = mixing[i].next(c[i, free], force, correction)
-        active = active[on]
+        active, forces = active[on], R[on][:, free]
         if not len(active):
             break
+        c[active, free] = mixing.next(active, c[active, free], forces, forces @ inverse.T)
     return found, iterations
+
+
+class _Mixing:
+    """Anderson mixing, as `forward.solvers.anderson.AndersonMixing` does it, of s samples of n coordinates at once."""
+
+    def __init__(self, s: int, n: int) -> None:
+        self._changes, self._misses = np.empty((2, s, WINDOW, n))
+        self._gram = np.zeros((s, WINDOW, WINDOW))
+        self._forces, self._targets = np.empty((2, s, n))
+        self._count = -1  # differences so far
+
+    def next(self, which: NDArray[np.int64], u: FloatArray, f: FloatArray, correction: FloatArray) -> FloatArray:
+        """Return the next iterates (k, n) of samples `which` (k,), the same or fewer each time."""
+        target, self._count = u - correction, self._count + 1
+        kept, slot = min(self._count, WINDOW), (self._count - 1) % WINDOW
+        if kept:
+            self._changes[which, slot] = f - self._forces[which]
+            self._misses[which, slot] = target - self._targets[which]
+        self._forces[which], self._targets[which] = f, target
+        if not kept:
+            return target
+        changes = self._changes[which, :kept]
+        row, right = np.matmul(changes, np.stack([changes[:, slot], f], axis=2)).transpose(2, 0, 1)
+        self._gram[which, slot, :kept] = row
+        self._gram[which, :kept, slot] = row
+        parts = least_squares(self._gram[which, :kept, :kept], right)
+        return np.asarray(target - np.matmul(parts[:, None], self._misses[which, :kept])[:, 0])
 
 
 def _still(level: Level, parameters: FloatArray) -> FloatArray:
