@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
+ENOUGH = 120  # modes of states that the larger model has besides then
 CANDIDATES = 8  # for each snapshot that is drawn where errors are large
 UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
@@ -128,7 +129,7 @@ class _Making:
         first = method.snapshots - in_rounds
         snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
         reduction = Reduction(self._model, inputs.mean, inputs.std)
-        rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature)
+        rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature, more=min(self._sizes.more, ENOUGH))
         seconds = 0.0
         for number in range(method.rounds):
             few = in_rounds // method.rounds + (number < in_rounds % method.rounds)
