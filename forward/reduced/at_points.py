@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray
 from forward.reduced.data import Points, Written
 from forward.reduced.kernels import Kernel
-
-if TYPE_CHECKING:
-    from forward.reduced.level import Level
 
 
 class Integrand:
@@ -92,14 +88,17 @@ class Integrand:
         """Number k of its outputs at a point."""
         return self._values.size
 
-    def at(self, c: FloatArray, parameters: FloatArray, level: Level) -> FloatArray:
-        """Return its outputs (s, k, n) at coordinates (s, N) and parameters (s, d) of several samples."""
+    def at(
+        self, c: FloatArray, coefficients: Sequence[Sequence[FloatArray]], numbers: Sequence[FloatArray]
+    ) -> FloatArray:
+        """Return its outputs (s, k, n) at coordinates (s, N), coefficients and numbers of several samples."""
         inputs, first = self._inputs, self._varying - len(self.points.logs)
         found = np.empty((len(c), self.size, inputs.shape[1]))
-        logs = self.logs([level.coefficients(point) for point in parameters])
-        for out, point, components, log in zip(found, parameters, self.states(c), logs, strict=True):
+        for out, of_sample, components, log in zip(
+            found, numbers, self.states(c), self.logs(coefficients), strict=True
+        ):
             inputs[: self.components], inputs[first:] = components, log
-            self.values(inputs, level.numbers(point), out)
+            self.values(inputs, of_sample, out)
         return found
 
     def by_state(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:

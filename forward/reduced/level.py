@@ -260,8 +260,13 @@ class _OfDensity(_Output):
         return float(self._weights(values) @ values)
 
     def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
-        found = self._density.at(c, parameters, self.level)[:, 0]
-        return np.array([self._weights(values) @ values for values in found])
+        return np.array([self._weights(values) @ values for values in self._at(c, parameters)])
+
+    def _at(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the values (s, n) of the density at the points."""
+        level = self.level
+        coefficients, numbers = zip(*((level.coefficients(p), level.numbers(p)) for p in parameters), strict=True)
+        return self._density.at(c, coefficients, numbers)[:, 0]
 
     def slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
@@ -286,7 +291,7 @@ class _Integral(_OfDensity):
 
 class _Peak(_OfDensity):
     def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
-        return np.asarray(self._density.at(c, parameters, self.level)[:, 0].max(axis=1))
+        return np.asarray(self._at(c, parameters).max(axis=1))
 
     def _weights(self, values: FloatArray) -> FloatArray:
         weights = np.zeros(len(values))
