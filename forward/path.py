@@ -18,14 +18,16 @@ from pydantic_core import CoreSchema
 from forward.fem.cost import Estimate, Times, sum_of
 from forward.hyperelastic import Hyperelastic
 from forward.model import Finding
+from forward.readable import scale
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.terms.displacement import too_far
 from forward.terms.steps import Block, label, lists
-from forward.words import with_unit
+from forward.words import number, with_unit
 
 LEAST = 2  # steps of a path
+LISTED = 6  # steps that are named
 BLOCKS: tuple[Block, ...] = ("loads", "displacements")  # whose numbers may have steps
 
 
@@ -184,9 +186,11 @@ class Path(Hyperelastic):
 
     def in_words(self, path: str) -> str:
         """The values of a number that has steps."""
-        values, unit = self.steps[path], self.unit_of(path)
-        listed = ", ".join(f"{value:g}" for value in values) if len(values) <= 6 else f"{values[0]:g} … {values[-1]:g}"
-        return f"{with_unit(listed, unit)} in {len(values)} steps"
+        values = self.steps[path]
+        one, unit = scale(max(map(abs, values)), self.unit_of(path))
+        said = [number(value / one) for value in values]
+        listed = ", ".join(said) if len(said) <= LISTED else f"from {said[0]} to {said[-1]}"
+        return f"{with_unit(listed, unit)} in {len(said)} steps"
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""

@@ -19,7 +19,7 @@ SIZES: dict[str, tuple[tuple[float, str], ...]] = {
     "m³": ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³")),
     "N/m": ((1e3, "kN/m"), (1.0, "N/m"), (1e-3, "mN/m")),
 }
-LEAD = ("loads", "material", "inclusions", "regions", "fields", "model")  # of paths, not said
+LEAD = ("loads", "displacements", "material", "inclusions", "regions", "fields", "model")  # of paths, not said
 ROUNDING = 1e-9  # of the largest coordinate of a place
 
 

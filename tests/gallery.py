@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FOLDER = Path(__file__).parents[1] / "docs" / "gallery"
-COLOURS = 200  # of a picture
+COLOURS = 256  # of a picture
 PHONE = 390
 PLACES = [f"inclusions.lump.{name}" for name in ("x", "y", "z", "radius")]
 SLIDE = """(() => { const s = document.querySelector('.slider input[type=range]');
@@ -95,7 +95,9 @@ def _film(page: Page, report: Path) -> None:
 
 
 def _save(png: bytes, name: str) -> None:
-    image = Image.open(io.BytesIO(png)).convert("RGB").quantize(COLOURS)
+    whole = Image.open(io.BytesIO(png)).convert("RGB")
+    # Dots between the colours of a palette look like gradients; without them colour scales have steps.
+    image = whole.quantize(palette=whole.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE))
     image.save(FOLDER / name, optimize=True)
     sys.stdout.write(f"{FOLDER / name}\n")
 

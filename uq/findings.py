@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from forward.model import Finding, Severity
@@ -55,6 +55,21 @@ def once_for_steps(dataset: xr.Dataset) -> None:
         kept.append(first._replace(text=first.text + also))
     if kept:
         dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
+
+
+def once_for_outputs(texts: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Say once what texts say of several outputs, given by their names, in the words of the first of them."""
+    known = re.compile(rf"(?<![\w.])({'|'.join(map(re.escape, names)) or '(?!)'})(?!\w|\.\w)")
+    groups: dict[str, list[tuple[str, str]]] = {}
+    for text in texts:
+        of = set(known.findall(text))
+        alike = _alike(known.sub("…", text)) if len(of) == 1 else text
+        groups.setdefault(alike, []).append((text, "".join(of)))
+    said = []
+    for (first, _), *others in groups.values():
+        also = f" The same, with other numbers, of {', '.join(name for _, name in others)}." if others else ""
+        said.append(first + also)
+    return said
 
 
 def _shorter(text: str, known: re.Pattern[str], places: Mapping[str, tuple[str, int]]) -> str:

@@ -41,7 +41,7 @@ def trustworthy(pareto_k: float, ess: float, count: int) -> bool:
 
 def worth(pareto_k: float, ess: float, count: int) -> str:
     """Say in words how good the weights of `count` points are."""
-    shape = "∞" if np.isinf(pareto_k) else f"{pareto_k:.2f}"
+    shape = "∞" if np.isinf(pareto_k) else f"{pareto_k:.2f}".replace("-", "−")
     return f"weights worth {ess:.0f} of {count} points, k̂ = {shape}"
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
 from uq.evaluation.evaluate import Evaluate, Request
-from uq.findings import findings
+from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
 
@@ -120,7 +120,8 @@ def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
         return Band.unknown(len(evaluate.outputs), error.reason)
     mean, mean_error, std, std_error = (found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error"))
     lower, upper = found["quantiles"].to_numpy()
-    said = tuple(one.text for one in findings(found) if one.severity != "note")
+    texts = [one.text for one in findings(found) if one.severity != "note"]
+    said = tuple(once_for_outputs(texts, evaluate.outputs))
     failed = int((~found["ok"]).sum())
     said += (f"{failed} of {samples} solves have no answer",) if failed else ()
     return Band(mean, mean_error, std, std_error, lower, upper, 1 + samples, said)

@@ -4,7 +4,7 @@ import pytest
 import xarray as xr
 
 from forward.model import Finding
-from uq.findings import add, findings, once_for_steps
+from uq.findings import add, findings, once_for_outputs, once_for_steps
 from workflows.run.run import exit_code
 
 pytestmark = pytest.mark.unit
@@ -68,3 +68,12 @@ def test_lists_of_many_steps_say_where_it_is_most(said, shorter):
     add(dataset, Finding("note", said))
     once_for_steps(dataset)
     assert findings(dataset) == [Finding("note", shorter)]
+
+
+def test_what_is_said_of_several_outputs_is_said_once():
+    said = "The error of {} is {}."
+    texts = [said.format("press.x", 0.3), "Of press.x and y.", said.format("press.x.1", 0.4), said.format("y", 0.5)]
+    expected = f"{texts[0]} The same, with other numbers, of y."
+    assert once_for_outputs(texts, ("press.x", "y")) == [expected, texts[1], texts[2]]
+    assert once_for_outputs(texts, ()) == texts
+    assert once_for_outputs((), ("y",)) == []

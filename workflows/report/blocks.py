@@ -131,11 +131,12 @@ class Answer:
 
 @dataclass(frozen=True)
 class Card(Block):
-    """The question of a study in words, and its answers side by side."""
+    """The question of a study in words, what forbids to believe the answers, and these side by side."""
 
     macro = "card"
     question: str
     answers: Sequence[Answer] = ()
+    errors: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -169,11 +170,12 @@ class Code(Block):
 
 @dataclass(frozen=True)
 class Folded(Block):
-    """Blocks that open when their title is clicked."""
+    """Blocks that open when their title is clicked, and on paper if they are `printed`."""
 
     macro = "folded"
     title: str
     blocks: Sequence[Block]
+    printed: bool = True
 
 
 @dataclass(frozen=True)

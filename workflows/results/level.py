@@ -38,7 +38,21 @@ def level(
     cells = starts[:, None] + corner_steps
     signs = values[cells] < 0
     cells = cells[signs.any(axis=1) & ~signs.all(axis=1)]
-    four = tetrahedra(cells, 12)
+    points, triangles = crossing(lattice, values, tetrahedra(cells, 12))
+    # Outward is where the function grows.
+    normal = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
+    middle, step = points[triangles].mean(axis=1), 1e-3 * float(np.linalg.norm(high - low))
+    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    ahead, behind = (np.asarray(distance(middle + s * step * normal / length)) for s in (1, -1))
+    triangles[ahead < behind] = triangles[ahead < behind][:, ::-1]
+    return points, triangles
+
+
+def crossing(nodes: FloatArray, values: FloatArray, four: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return the points (n, 3) and triangles (t, 3) where values at nodes (N, 3) are zero, linear in tetrahedra (m, 4).
+
+    The triangles are turned either way.
+    """
     inside = values[four] < 0
     counts = inside.sum(axis=1)
     pairs: list[IntArray] = []
@@ -55,12 +69,5 @@ def level(
     unique, inverse = np.unique(ends, axis=0, return_inverse=True)
     v = values[unique]
     share = v[:, 0] / (v[:, 0] - v[:, 1])
-    points = lattice[unique[:, 0]] + share[:, None] * (lattice[unique[:, 1]] - lattice[unique[:, 0]])
-    triangles = inverse.reshape(-1, 3)
-    # Outward is where the function grows.
-    normal = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
-    middle, step = points[triangles].mean(axis=1), 1e-3 * float(np.linalg.norm(high - low))
-    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    ahead, behind = (np.asarray(distance(middle + s * step * normal / length)) for s in (1, -1))
-    triangles[ahead < behind] = triangles[ahead < behind][:, ::-1]
-    return points, triangles
+    points = nodes[unique[:, 0]] + share[:, None] * (nodes[unique[:, 1]] - nodes[unique[:, 0]])
+    return points, inverse.reshape(-1, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,7 +134,10 @@ def _doubtful(dataset: xr.Dataset, order: list[str]) -> tuple[list[str], int]:
 
 
 def doubts_of_selection(
-    dataset: xr.Dataset, candidates: Mapping[str, Inputs], noise: Distribution | None
+    dataset: xr.Dataset,
+    candidates: Mapping[str, Inputs],
+    noise: Distribution | None,
+    units: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
 ) -> list[Finding]:
     """Say what is doubtful about the most probable candidate: its constants, its errors, outliers.
 
@@ -145,6 +149,8 @@ def doubts_of_selection(
         Their random constants, by name.
     noise
         Prior of the factor on the errors, if it was inferred.
+    units
+        SI units of the constants, by candidate and name.
     """
     from inverse.criticism import doubts as criticism
     from inverse.criticism.weights import resampled
@@ -159,8 +165,8 @@ def doubts_of_selection(
         weights = of["point_weight"].to_numpy()
         draws = of["point"].sel(parameter=names).transpose("point", "parameter").to_numpy()
         draws = draws[resampled(weights, DRAWS, 0)]
-        found = criticism.at_an_end(inputs.marginals, mode, draws)
-        found += criticism.far_from_prior(inputs.marginals, mode, mean, 0.0, 0.0)
+        found = criticism.at_an_end(inputs.marginals, mode, draws, units.get(best, {}))
+        found += criticism.far_from_prior(inputs.marginals, mode, mean, 0.0, 0.0, units.get(best, {}))
         here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
         rows = dataset.isel(output=here)
         values, sigma, factor = rows["measured"].to_numpy(), rows["sigma"].to_numpy(), 1.0

@@ -15,6 +15,7 @@ from forward.model import Finding
 from forward.registry import named
 from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.of_draws import findings_of_few
+from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from workflows.config.blocks import Parallel
 from workflows.config.mistakes import StudyError, refused
@@ -65,8 +66,9 @@ class PopulationStudy(StudyKind):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Say which specimens are known by few draws."""
-        every = self.posteriors.items() if self._there else ()
-        return tuple(found for name, draws in every for found in findings_of_few(draws, f" of {name}"))
+        every = self.posteriors if self._there else {}
+        few = [found.text for name, draws in every.items() for found in findings_of_few(draws, f" of {name}")]
+        return tuple(Finding("warning", text) for text in once_for_outputs(few, tuple(every)))
 
     @property
     def _there(self) -> bool:

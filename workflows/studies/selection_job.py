@@ -64,7 +64,8 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
-        doubts = doubts_of_selection(found, candidates, study.method.noise.factor)
+        units = {name: study.units_of(name) for name in candidates}
+        doubts = doubts_of_selection(found, candidates, study.method.noise.factor, units)
         wrong = {name: contradictions(study, name, make) for (name, _), make in makers.items()}
         add(found, *findings(found), *doubts, *(one for several in wrong.values() for one in several))
         return trusted_on_meshes(with_right_derivatives(found, [name for name, several in wrong.items() if several]))

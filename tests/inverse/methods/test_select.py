@@ -128,7 +128,7 @@ def doubts(values, kind, noise=None, **priors):
     noise = noise or Noise(relative=0.05, absolute=5e3)
     method = Select(samples=64, noise=noise)
     found = method.run({kind: Candidate(inputs)}, {"all": data}, lambda name, _: SerialEvaluate(model(name)))
-    return doubts_of_selection(found, {kind: inputs}, noise.factor)
+    return doubts_of_selection(found, {kind: inputs}, noise.factor, {kind: dict.fromkeys(inputs.names, "Pa")})
 
 
 def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
@@ -142,10 +142,10 @@ def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
     assert "not belong to the other 1" in doubt.text
     assert "by residuals in standard deviations: uniaxial at 2.9: −10" in doubt.text  # the largest is listed first
     doubt, *_ = doubts(values, "neo-hookean", C1=Normal(mean=1e5, std=1e4))
-    assert re.match(r"neo-hookean: the posterior of C1 .* prior deviations from the prior \(100,000\)", doubt.text)
+    assert re.match(r"neo-hookean: the posterior of C1 .* prior deviations from the prior \(100 kPa\)", doubt.text)
     assert doubt.severity == "error"
     doubt, *_ = doubts(values, "mooney-rivlin", C2=Uniform(lower=0.0, upper=1e3))
-    assert "C2 is at the upper end of its range (1,000)" in doubt.text
+    assert "C2 is at the upper end of its range (1 kPa)" in doubt.text
     noise = Noise(relative=1e-3, absolute=100, factor=LogUniform(lower=0.1, upper=1e3))
     found = doubts(values, "mooney-rivlin", noise)
     assert any(re.search(r"the inferred errors are [3-6]\d(\.\d)? times the stated ones", one.text) for one in found)

@@ -112,9 +112,10 @@ def test_a_comparison_of_methods_names_the_best(tmp_path):
         "a": [{"cost": 10, "cpu_seconds": 1.0, "error": 1e-3}],
         "b": [{"cost": 10, "cpu_seconds": 1.0, "error": 1e-5}],
     }
-    results = answer.Results(xr.Dataset(), {"methods": json.loads(json.dumps(rows))}, None)
-    card = answer.compared(results)
-    assert [one.name for one in card.answers if one.leads] == ["b"]
+    of = xr.Dataset({"unit": ("output", ["m"])}, {"output": ["tip"]})
+    card = answer.compared(answer.Results(of, {"methods": json.loads(json.dumps(rows))}, None))
+    assert "mean of tip" in card.question
+    assert [(one.name, one.value) for one in card.answers if one.leads] == [("b", "10\u00a0µm")]
 
 
 def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():

@@ -15,7 +15,7 @@ from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene,
 from workflows.report.scene.skin import skin, split
 from workflows.report.scene.sliders import sliders
 from workflows.report.scene.still import still
-from workflows.results.level import level, tetrahedra
+from workflows.results.level import crossing, level, tetrahedra
 
 pytestmark = pytest.mark.unit
 pyvista = pytest.importorskip("pyvista")
@@ -168,6 +168,19 @@ def test_stills_are_drawn_with_what_is_inside():
         for insides in ([], [Inside("ball", triangles, at, "inside")]):
             scene = Scene(points, cells, kind, np.eye(3)[2], 0.1 * points, [quantity], insides)
             assert still(scene, quantity).startswith(PNG)
+
+
+def test_stills_show_the_surface_that_the_viewer_begins_with():
+    points, cells, kind = lattice(12, 1)
+    grows = Quantity("stiffness", points[:, 0])
+    views = [Scene(points, cells, kind, np.eye(3)[2], 0 * points, [grows], cut=cut) for cut in ("", "v")]
+    assert len({still(scene, grows) for scene in views}) == 2
+    at, triangles = crossing(points, points[:, 0] - 1, tetrahedra(cells, kind))
+    np.testing.assert_allclose(at[:, 0], 1)
+    corners = at[triangles]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = np.prod(np.ptp(points[:, 1:], axis=0))
+    assert np.linalg.norm(sides, axis=1).sum() / 2 == pytest.approx(across)
 
 
 def test_sliders_have_the_distributions_of_parameters():

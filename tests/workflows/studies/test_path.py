@@ -58,7 +58,8 @@ def test_curves_are_the_same_on_any_number_of_ranks(tmp_path, looked_at):
     page = (tmp_path / "None" / "report.html").read_text()
     looked_at(tmp_path / "None")
     assert "Over the path" in page
-    assert "displacements.grip.x = 0.1, 0.2, -0.3 m in 3 steps" in page
+    assert "grip x: 10, 20, −30 cm in 3 steps" in page
+    assert "How large are force and narrow at the last step of the path" in page
 
 
 @pytest.mark.fem

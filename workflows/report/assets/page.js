@@ -28,6 +28,13 @@
     const axes = unit && /[²³]$/.test(unit[1]) ? (unit[1].endsWith("²") ? 2 : 3) : 1;
     return Number(found[1]) * 10 ** exponent * one ** axes;
   };
+  // A number and its unit stay on one line.
+  const unbroken = /(\d) (?=(?:%|±|[GMk]?Pa|[cmµnk]?m[²³]?|[kmµ]?[NJ]|s)(?![\wµ]))|(±) (?=\d)/g;
+  for (const element of document.querySelectorAll("p, li, dd, figcaption")) {
+    for (const node of element.childNodes) {
+      if (node.nodeType === Node.TEXT_NODE) node.data = node.data.replace(unbroken, "$1$2\u00a0");
+    }
+  }
   const sort = (table, column, head) => {
     const ascending = head.getAttribute("aria-sort") !== "ascending";
     for (const th of table.tHead.rows[0].cells) th.removeAttribute("aria-sort");
@@ -65,6 +72,13 @@
     table.parentElement.before(tools(button("CSV", `save the table of ${name} as CSV`, file)));
     table.csv = () => csv(table);
   }
+  // On paper nothing can be opened.
+  let closed = [];
+  addEventListener("beforeprint", () => {
+    closed = [...document.querySelectorAll("details[data-printed]:not([open])")];
+    for (const folded of closed) folded.open = true;
+  });
+  addEventListener("afterprint", () => { for (const folded of closed) folded.open = false; });
   for (const image of document.querySelectorAll("figure > img[src^='data:image/']")) {
     const kind = image.src.startsWith("data:image/svg") ? "svg" : "png";
     const words = `save the picture: ${image.alt}`;

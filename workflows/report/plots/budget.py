@@ -34,8 +34,10 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
     ax
         Where to draw.
     """
+    from matplotlib.ticker import LogLocator, NullLocator
+
     names, parts = names[:SHOWN], {name: np.asarray(values)[:SHOWN] for name, values in parts.items()}
-    ax = ax or axes(height=1.5 + (0.2 * len(parts) + 0.15) * len(names), width=7.6)
+    ax = ax or axes(height=1.5 + (0.2 * len(parts) + 0.15) * len(names))
     places = np.arange(len(names))[::-1]
     height = 0.8 / len(parts)
     positive = [float(v) for values in parts.values() for v in values if np.isfinite(v) and v > 0]
@@ -54,11 +56,13 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
                 xytext=(3, 0),
                 textcoords="offset points",
                 va="center",
-                fontsize=7,
+                fontsize=8,
                 color=DARK if end > left else PART_COLOURS[name],
             )
     ax.set_xscale("log")
     ax.set_xlim(left, 8 * largest)
+    ax.xaxis.set_major_locator(LogLocator(numticks=5))
+    ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(lambda x, _: f"{number(100 * x, 1)} %")
     ax.set_yticks(places, [text_of(name) for name in names])
     ax.set_ylim(-0.6, len(names) - 0.4)

@@ -45,6 +45,7 @@ def svg(ax: Axes) -> bytes:
     """Return the whole figure of axes as an SVG file; what has thousands of points is a picture within."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.collections import QuadMesh
 
     whole = ax.get_figure(root=True)
     assert whole is not None
@@ -53,7 +54,8 @@ def svg(ax: Axes) -> bytes:
     _lay_out(whole, FigureCanvasSVG.fixed_dpi)
     for each in whole.axes:
         for artist in (*each.collections, *each.lines):
-            artist.set_rasterized(_points(artist) > MANY_POINTS)
+            # Browsers leave gaps between the cells of a mesh, as colour bars are: stripes.
+            artist.set_rasterized(isinstance(artist, QuadMesh) or _points(artist) > MANY_POINTS)
     file = io.BytesIO()
     # Equal results give equal files: without a date and random names.
     with mpl.rc_context({"svg.hashsalt": "tissuq", "svg.fonttype": "path"}):

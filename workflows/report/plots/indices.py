@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,10 +56,10 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
     return ax
 
 
-def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw the first-order shares of parameters in the variance of outputs and of the field, as stacked bars."""
-    first = dataset["sobol_first"].transpose("output", "parameter").to_numpy()
-    names = [str(name) for name in dataset["output"].to_numpy()]
+def index_shares(dataset: xr.Dataset, outputs: Sequence[str] | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the first-order shares of parameters in the variance of outputs (all) and of the field, as stacked bars."""
+    names = [str(name) for name in dataset["output"].to_numpy()] if outputs is None else list(outputs)
+    first = dataset["sobol_first"].sel(output=names).transpose("output", "parameter").to_numpy()
     if "field_sobol_first" in dataset:
         first = np.vstack([first, dataset["field_sobol_first"].to_numpy()])
         names.append("displacement field")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import size
-from forward.words import named
+from forward.words import named, number
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span, text_of
 from workflows.report.plots.pairs import pairs
 
@@ -125,7 +125,7 @@ def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
         values = one["direction_stiffness"].isel(shown=i).to_numpy()
         n = int(one["shown_number"][i])
         largest = float(np.abs(values).max())
-        label = f"{n + 1}: λ = {float(one['eigenvalue'][n]):.3g}"
+        label = f"{n + 1}: λ = {number(float(one['eigenvalue'][n]), 3)}"
         _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
     for part in found[0].figure.axes:
         part.tick_params(labelsize="x-small")
@@ -188,6 +188,8 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.axhline(SEEN, color=PLAIN, linestyle="--", linewidth=1)
     ax.set_yscale("log")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if len(rows["all together"]) == 1:
+        ax.set_xlim(0, 2)
     ax.set_xlabel("direction")
     ax.set_ylabel("λ")
     ax.legend(fontsize="small", frameon=False)

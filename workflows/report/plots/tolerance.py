@@ -32,7 +32,7 @@ def tolerance_bars(told: Mapping[str, Any], ax: Axes | None = None) -> Axes:
         for name, of in list(told["outputs"].items())[:SHOWN]
         for estimate, parts in of.items()
     ]
-    ax = ax or axes(height=1.4 + 0.3 * len(rows), width=7.6)
+    ax = ax or axes(height=1.4 + 0.3 * len(rows))
     places = range(len(rows))[::-1]
     lefts = [0.0] * len(rows)
     for source in SOURCES:
@@ -44,7 +44,7 @@ def tolerance_bars(told: Mapping[str, Any], ax: Axes | None = None) -> Axes:
         lefts = [left + width for left, width in zip(lefts, widths, strict=True)]
     for place, left in zip(places, lefts, strict=True):
         ax.annotate(
-            f"{100 * left:.0f} %", (left, place), xytext=(3, 0), textcoords="offset points", va="center", fontsize=7
+            f"{100 * left:.0f} %", (left, place), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8
         )
     ax.axvline(1.0, color=DARK, linewidth=1)
     ax.set_yticks(places, [label for label, _ in rows])

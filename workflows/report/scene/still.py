@@ -11,7 +11,7 @@ from forward.model import FloatArray
 from forward.readable import scale
 from workflows.report.plots.figure import png_of
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
-from workflows.results.level import IntArray
+from workflows.results.level import IntArray, crossing, tetrahedra
 
 SIZE = (7.2, 4.8)  # inches
 DPI = 110
@@ -20,6 +20,7 @@ LEAST = 0.6  # brightness of a face that looks away from it
 CATEGORIES = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
 STILL = "#c9ced4"  # of nodes without a number
 TRANSPARENT = 0.28
+HALF = 0.5  # of the range of a quantity
 
 
 def still(scene: Scene, quantity: Quantity) -> bytes:
@@ -40,7 +41,8 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
         of_faces = values[:, 0] if quantity.names else values.mean(axis=1)
     rgb = np.where(np.isfinite(of_faces)[:, None], colours(norm(np.nan_to_num(of_faces)))[:, :3], _rgb(STILL))
     inner = [inside for inside in scene.insides if inside.shown and len(inside.triangles)]
-    hidden = any(inside.kind == "inside" for inside in inner)
+    equal = _equal(scene, quantity)
+    hidden = bool(len(equal[1])) or any(inside.kind == "inside" for inside in inner)
     faces = [
         _faces(
             (moved if inside.points is None else inside.points) @ view.T,
@@ -51,6 +53,10 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
         )
         for inside in inner
     ]
+    if len(equal[1]):
+        at, between = equal
+        paint = np.tile(colours(HALF)[:3], (len(between), 1))
+        faces.append(_faces(at @ view.T, between, paint, 1.0, culled=False))
     faces.append(_faces(moved @ view.T, triangles, rgb, TRANSPARENT if hidden else 1.0, culled=True))
     # From far to near; a transparent skin is in front of what is inside.
     layers = [faces[:-1], faces[-1:]] if hidden else [faces]
@@ -75,6 +81,15 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
     if quantity.names:
         bar.set_ticks(range(-1, len(quantity.names)), labels=["–", *(n.replace("$", r"\$") for n in quantity.names)])
     return png_of(figure, DPI)
+
+
+def _equal(scene: Scene, quantity: Quantity) -> tuple[FloatArray, IntArray]:
+    """Return the surface inside the body that the viewer begins with, if it does: where its quantity is half-way."""
+    if scene.cut != "v" or quantity is not scene.quantities[0]:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    low, high = ends(quantity)
+    above = quantity.values - (low + HALF * (high - low))
+    return crossing(scene.points, np.where(above == 0, 1e-300, above), tetrahedra(scene.cells, scene.kind))
 
 
 def _rgb(colour: str) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
 from workflows.report.sections.error_budget import counting, parts_of
+from workflows.report.sections.findings import gravest
 from workflows.report.sections.posterior import measured_kind
 from workflows.report.sections.reduced import card as reduced
 from workflows.studies.findings_selection import bayes_factor, by_probability, grade
@@ -56,7 +58,7 @@ class AnswerFirst(Section):
         ):
             if has in dataset or has in dataset.dims:
                 found = card(results)
-                yield Card(found.question, found.answers[:TILES])
+                yield Card(found.question, found.answers[:TILES], gravest(results))
                 if len(found.answers) > TILES:
                     yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
                 return
@@ -68,20 +70,17 @@ def forward(results: Results) -> Card:
     sampled = "mean" in of
     names = [spoken(str(name)) for name in of["parameter"].values] if "parameter" in of.coords else []
     path = " at the last step of the path" if "step" in of.coords else ""
-    verb = "is" if len(names) == 1 else "are"
-    uncertain = f"{listed(names)} {verb} uncertain"
+    asked = listed([called(results, output) for output in results.drawn])
+    be = "is" if len(results.drawn) == 1 else "are"
+    uncertain = f"{listed(names)} {'is' if len(names) == 1 else 'are'} uncertain"
     if not names and sampled:
-        question = (
-            f"How large {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}, by all candidates?"
-        )
+        question = f"How large {be} {asked}{path}, by all candidates?"
     elif not names:
-        question = f"What {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}?"
+        question = f"What {be} {asked}{path}?"
     elif sampled:
-        question = (
-            f"How large {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}, if {uncertain}?"
-        )
+        question = f"How large {be} {asked}{path}, if {uncertain}?"
     else:
-        question = f"How do {listed(names)} change {listed(results.drawn)}{path}?"
+        question = f"How do {listed(names)} change {asked}{path}?"
     counts = dict(
         zip(results.outputs, counting(results) if meshed(results) else np.ones(len(results.outputs)), strict=True)
     )
@@ -92,7 +91,7 @@ def forward(results: Results) -> Card:
         value, unit = float(one[name]), results.unit(output)
         errors = {source: float(e[results.outputs.index(output)]) for source, e in parts_of(results, name).items()}
         if not counts[output]:
-            answers.append(Answer(output, "0", ("zero but for rounding",)))
+            answers.append(Answer(called(results, output), "0", ("zero but for rounding",)))
             continue
         itself = model_errors(results).get(output)
         if itself is not None:
@@ -106,8 +105,13 @@ def forward(results: Results) -> Card:
             lines.append(f"corrected for the mesh: {and_error(better, left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
         curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
-        answers.append(Answer(output, quantity(value, error, unit), lines, curve, inside, ends))
+        answers.append(Answer(called(results, output), quantity(value, error, unit), lines, curve, inside, ends))
     return Card(question, answers)
+
+
+def called(results: Results, output: str) -> str:
+    """Return the name of an output; along a path, where all are those of the last step, without its number."""
+    return str(results.dataset["output_of"].sel(output=output).item()) if "step" in results.dataset.coords else output
 
 
 def meshed(results: Results) -> bool:
@@ -239,7 +243,7 @@ def inversion(results: Results) -> Card:
     data = int(np.isfinite(of["measured"]).sum())
     kind = "values" if of.attrs.get("quantity") == "output" else "displacements"
     what = "What is inside" if kind == "displacements" else "Which parameters explain"
-    whose = sets[0] if len(sets) == 1 else f"each of {len(sets)} specimens"
+    whose = sets[0].replace("-", "\N{NON-BREAKING HYPHEN}") if len(sets) == 1 else f"each of {len(sets)} specimens"
     if kind == "displacements":
         question = f"{what} {whose}, given {data:,} measured {measured_kind(of, results.study)}?"
     else:
@@ -251,12 +255,31 @@ def inversion(results: Results) -> Card:
     one = of.isel(data_set=0)
     answers = [_unknown(one.sel(parameter=name), str(name), units.get(str(name), "1")) for name in one.parameter.values]
     if "stiffness_mean" in one and "draw" not in one:
+        # The one number beside the values at the nodes is the mean of their logarithm.
+        answers = [
+            replace(answer, name=answer.name.replace("stiffness mean", "mean of ln stiffness")) for answer in answers
+        ]
         answers.insert(0, _stiffness(one))
     if "prediction_share" in one:
         goals = [str(name) for name in one["goal"].values]
-        question += f" And what {'is' if len(goals) == 1 else 'are'} {listed(goals)}, which nobody measured?"
-        answers = [*(_predicted(one.sel(goal=name), name) for name in goals[:GOALS]), *answers]
+        told = [_goal(name) for name in goals]
+        question += f" And what {'is' if len(goals) == 1 else 'are'} {listed(told)}, which nobody measured?"
+        answers = [*(_predicted(one.sel(goal=name), _goal(name)) for name in goals[:GOALS]), *answers]
     return Card(question, answers)
+
+
+def _goal(name: str) -> str:
+    """Name what is predicted: `press.target.0.x` is target x in press, `press.energy` is energy in press."""
+    case, *parts = name.split(".")
+    match parts:
+        case [output]:
+            return f"{output} in {case}"
+        case [place, "0", component]:
+            return f"{place} {component} in {case}"
+        case [place, number_, component]:
+            return f"{place} {number_} {component} in {case}"
+        case _:
+            return name
 
 
 def _predicted(at: xr.Dataset, name: str) -> Answer:
@@ -305,7 +328,7 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     narrower = wide / std if std > 0 else np.inf
     lines = [
         f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}",
-        f"before the data {and_error(before, wide, unit)}: "
+        f"before the data {and_error(before, wide, unit, like=mean)}: "
         + (f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"),
     ]
     if np.isfinite(one["true"]):
@@ -390,9 +413,10 @@ def _trimmed(values: FloatArray) -> FloatArray:
 
 
 def compared(results: Results) -> Card:
-    """What each method takes for the smallest error that all reach."""
+    """The smallest error of each method in the mean of the first output, and what it takes."""
+    output = results.outputs[0]
     found = {name: rows for name, rows in results.summary["methods"].items() if rows}
-    question = "Which method needs the least time for the same error?"
+    question = f"Which method finds the mean of {output} most exactly for its time?"
     best = {name: min(rows, key=lambda row: row["error"]) for name, rows in found.items()}
     order = sorted(best, key=lambda name: best[name]["error"] ** 2 * best[name]["cpu_seconds"])
     return Card(
@@ -400,7 +424,7 @@ def compared(results: Results) -> Card:
         [
             Answer(
                 name,
-                f"{number(best[name]['error'], 2)}",
+                size(best[name]["error"], results.unit(output)),
                 (f"error with {number(best[name]['cost'], 4)} solves, {duration(best[name]['cpu_seconds'])}",),
                 leads=rank == 0,
             )
@@ -412,9 +436,10 @@ def compared(results: Results) -> Card:
 def made(results: Results) -> Card:
     """How many data were made."""
     counts = np.isfinite(results.dataset["values"].to_numpy()).sum(axis=1)
-    names = [str(name) for name in results.dataset["data_set"].values]
+    name = str(results.summary["study"])
+    names = [name] if len(counts) == 1 else [f"{name}-{k}" for k in range(1, len(counts) + 1)]
     return Card(
-        "What would be measured, if the truth were known?",
+        "What would be measured of a specimen that is known?",
         [Answer(name, f"{n:,} data", ("in the folder data",)) for name, n in zip(names, counts, strict=True)],
     )
 

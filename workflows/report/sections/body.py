@@ -34,6 +34,8 @@ class Body(Section):
             return bool(results.dataset["ok"].any()) and "cell_nodes" in results.dataset
         if _file(results) is not None:
             return True
+        if "estimator" in results.dataset.dims:  # a comparison of methods, which is not about the body
+            return False
         return "nominal" in results.dataset and (bool(results.study.spec.meshed) or "cell_nodes" in results.dataset)
 
     def content(self, results: Results) -> Iterator[Block]:

@@ -19,6 +19,7 @@ WORTH = {
     "predictions": "Share of the predictions' variances that they take away",
     "models": "Expected ln Bayes factor of the true model (nat)",
 }
+FIRST = 5  # observations on the card
 
 
 class ChosenObservations(Section):
@@ -61,7 +62,13 @@ class ChosenObservations(Section):
             yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
         if "posterior_std" in found:
             rows = [
-                (name, *(size(float(one[f"{which}_std"]), unit, 4) for which in ("prior", "posterior")))
+                (
+                    name,
+                    *(
+                        size(float(one[f"{which}_std"]), unit, 3, like=float(one["prior_std"]))
+                        for which in ("prior", "posterior")
+                    ),
+                )
                 for name in results.leading(found["posterior_std"] / found["prior_std"])
                 for one, unit in [(found.sel(parameter=name), results.parameter_unit(name))]
             ]
@@ -73,11 +80,16 @@ def card(results: Results) -> Card:
     """The first of the chosen observations, and what all are worth."""
     found, design = results.dataset, results.summary["design"]
     together = f"{number(float(found['information'][-1]), 3)} nat"
-    answers = [Answer(f"{found.sizes['choice']} observations", together, (against_random(design),))]
-    for k, one in enumerate(design["chosen"], start=1):
+    lines = [against_random(design)]
+    if "log_bayes_factor" not in found:
+        lines.append("with 1 nat one unknown, or a combination of them, is known e = 2.7 times better")
+    if found.sizes["choice"] > FIRST:
+        lines.append(f"the first {FIRST} are shown here, all in the table below")
+    answers = [Answer(f"{found.sizes['choice']} observations", together, lines)]
+    for k, one in enumerate(design["chosen"][:FIRST], start=1):
         where = [] if None in one["place"] else [f"at ({place(one['place'])})"]
         case = [f"load case {one['case']}"] if one["case"] else []
-        answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 3)} nat", [*case, *where]))
+        answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 2)} nat", [*case, *where]))
     return Card("Which observations tell most of what is not known?", answers)
 
 
@@ -87,5 +99,5 @@ def _table(results: Results) -> Table:
         where = NONE if None in one["place"] else place(one["place"])
         cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
         rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
-    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost")
+    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
     return Table(head, rows, text=frozenset({1, 2, 3, 4}))

@@ -25,7 +25,7 @@ class ErrorAgainstCost(Section):
         yield Heading("Error against cost")
         yield Text(
             "The reference, with its own standard errors; the error due to the tolerance of the solver (against the "
-            "textbook solver, on some draws); the error of the mesh, by estimate or (`mesh_error` of the method) by a "
+            "textbook solver, on some draws); the error of the mesh, by estimate or (method.mesh_error) by a "
             "mesh of twice the cells in each direction at the mean parameters."
         )
         yield references(results)

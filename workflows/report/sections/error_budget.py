@@ -39,7 +39,7 @@ class ErrorBudget(Section):
         shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
         yield Heading("Error budget")
         yield Text(sentence(results, shown[0]))
-        counts = counting(results)
+        counts = counting(results) & np.isin(results.outputs, results.drawn)
         outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
         budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
         if budgets and outputs:
@@ -104,6 +104,8 @@ def sentence(results: Results, name: str) -> str:
         return f"The error of the mesh {why}: the numbers after ± do not include it."
     words, zero = [], []
     for i, (output, counts) in enumerate(zip(results.outputs, counting(results), strict=True)):
+        if output not in results.drawn:
+            continue
         known = {source: float(errors[i]) for source, errors in found.items() if np.isfinite(errors[i])}
         if not counts:
             zero.append(output)

@@ -20,7 +20,7 @@ class Header(Section):
         """Title, method and number of solves."""
         summary = results.summary
         yield Heading(f"Study {summary['study']}", level=1)
-        yield Text(str(type(results.study.method).__doc__).partition("\n")[0], "lead")
+        yield Text(str(type(results.study.method).__doc__).partition("\n")[0].replace("`", ""), "lead")
         sets, failed = len(summary.get("data_sets", ())), f"{summary['failed']:,} failed"
         if sets > 1:
             yield Text(f"{sets} data sets, {failed}; {counted(results.solves)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from forward.path import Path
+from forward.readable import spoken
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Text
 from workflows.report.plots import path as plots
 from workflows.report.section import Results, Section
@@ -24,10 +25,10 @@ class Curve(Section):
         along = spec.leading
         unit = spec.unit_of(along)
         yield Heading("Over the path")
-        yield Text(f"{along} = {spec.in_words(along)}; every step is solved from the one before.")
+        yield Text(f"{spoken(along)}: {spec.in_words(along)}; every step is solved from the one before.")
         drawn = []
         for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
-            caption = f"{output} over the path."
+            caption = f"Over the path: {output}."
             drawn.append(Picture.drawn(plots.curve(dataset, output, along, unit), caption))
             if "sobol_total" in dataset:
                 caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from forward.readable import scale, spoken
-from forward.words import named, number, with_error, with_unit
+from forward.readable import interval, quantity, scale, spoken
+from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import population as plots
 from workflows.report.section import Results, Section
@@ -98,8 +98,6 @@ def specimens(results: Results) -> Table:
 
 
 def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
-    """Write a median with the ends of an interval."""
-    values = [float(x) for x in quantiles.to_numpy()]
-    one, name = scale(values[1], unit)
-    lower, middle, upper = (number(x / one) for x in values)
-    return f"{with_unit(middle, name)} ({lower} to {upper})"
+    """Write a median, to the place of a deviation, with the ends of an interval."""
+    lower, middle, upper = (float(x) for x in quantiles.to_numpy())
+    return f"{quantity(middle, (upper - lower) / 4, unit)} ({interval(lower, upper, unit, middle)})"

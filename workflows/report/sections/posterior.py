@@ -30,6 +30,7 @@ SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
 PAIRABLE = 20  # draws from which on densities are drawn
 CASES_DRAWN = 24  # load cases and parameters that a map has
+LEAST = 0.005  # of a component that is not written as 0
 DRAWN = 8  # data sets that have more than a row in the table
 
 
@@ -236,7 +237,7 @@ def directions(one: xr.Dataset) -> Table:
                 f"{i + 1}",
                 number(value, 3),
                 number((1 + value) ** -0.5, 2),
-                *(f"{x:+.2f}".replace("-", "−") for x in vector),
+                *(f"{x:+.2f}".replace("-", "−") if abs(x) >= LEAST else "0" for x in vector),
             )
         )
     return Table(("direction", "λ", "posterior over prior width", *map(spoken, names)), rows)
@@ -253,7 +254,7 @@ def iterations(one: xr.Dataset) -> Block:
         for row in steps
     ]
     table = Table([name.replace("_", " ") for name in names], rows, text=frozenset())
-    return Folded("Iterations of the search for the mode", [table])
+    return Folded("Iterations of the search for the mode", [table], printed=False)
 
 
 def _shown(value: Any, digits: int = 4) -> str:

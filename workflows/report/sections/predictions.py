@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import and_error, between, size
-from forward.words import NONE, number
+from forward.readable import and_error, interval, percent, size
+from forward.words import NONE
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
 
@@ -61,9 +61,9 @@ def table(one: xr.Dataset) -> Table:
             (
                 str(goal),
                 and_error(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
-                between(lower, upper, unit),
+                interval(lower, upper, unit, float(at["prediction_mean"])),
                 and_error(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
-                f"{number(100 * share, 3)} %" if np.isfinite(share) else NONE,
+                NONE if np.isnan(share) else percent(share) if share >= 0 else "none",
                 size(mesh, unit) if np.isfinite(mesh) else "not estimated",
             )
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator
 
-from forward.words import settings
+from forward.words import NONE, settings
 from workflows.report.blocks import Block, Heading, Table
 from workflows.report.section import Results, Section
 
@@ -37,4 +37,5 @@ def priors(results: Results) -> Table:
     noise = config["method"].get("noise")
     if noise is not None:
         rows.append(("factor on all sigma", f"{noise['kind']}: {settings(noise, 'kind')}", "1"))
+    rows = [(unknown, prior, NONE if unit == "1" else unit) for unknown, prior, unit in rows]
     return Table(("unknown", "prior", "unit"), rows, text=frozenset(range(3)))

@@ -21,7 +21,7 @@ class Provenance(Section):
         """Pairs, and the whole study."""
         yield Heading("Provenance")
         yield Pairs([(word, [text]) for word, text in provenance(results)])
-        yield Folded("The study, complete with defaults", [Code(results.dataset.attrs["config"])])
+        yield Folded("The study, complete with defaults", [Code(results.dataset.attrs["config"])], printed=False)
 
 
 def provenance(results: Results) -> Iterator[tuple[str, str]]:

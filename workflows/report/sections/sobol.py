@@ -35,7 +35,7 @@ class SobolIndices(Section):
                 pictures.append(Picture.drawn(plots.index_convergence(dataset, output), caption))
             yield Pictures(pictures)
         caption = "Shares of the variance: parameters alone, and the rest."
-        yield Pictures([Picture.drawn(plots.index_shares(dataset), caption)])
+        yield Pictures([Picture.drawn(plots.index_shares(dataset, results.drawn), caption)])
 
 
 def sobol(results: Results, output: str) -> Table:

@@ -25,9 +25,10 @@ class Tolerance(Section):
         told = results.summary["accuracy"]
         worst = f"the {told['worst']['of']} of {told['worst']['output']}"
         yield Heading("Tolerance")
+        asked, reached = number(100 * told["tolerance"]), number(100 * told["reached"], 2)
         yield Text(
-            f"Asked for: {told['tolerance']:g} of every mean and standard deviation, all errors together, at 95 %. "
-            f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {told['reached']:.2g}, no other less well.",
+            f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
+            f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
             tone="lead" if told["kept"] else "warning",
         )
         if told["mesh"] is not None and not told["mesh"]["estimated"]:
