@@ -150,8 +150,10 @@ def _gains(rows: FloatArray, plain: FloatArray, per_solve: float, off_line: floa
     middle = means.mean(axis=0)
     scatter = means.std(axis=0, ddof=1) if n > 1 else np.full(len(outputs), np.nan)
     claimed = np.sqrt((errors**2).mean(axis=0))
-    # The mean of all studies is uncertain itself, and each is a part of it.
-    held = (np.abs(means - middle) <= 1.96 * errors * np.sqrt(1 - 1 / n)).mean(axis=0)
+    # Against the mean of the other studies, which is uncertain itself; their errors differ.
+    others = (n * middle - means) / max(n - 1, 1)
+    of_others = ((errors**2).sum(axis=0) - errors**2) / max(n - 1, 1) ** 2
+    held = (np.abs(means - others) <= 1.96 * np.sqrt(errors**2 + of_others)).mean(axis=0)
     for j, name in enumerate(outputs):
         error = scatter[j] if n >= 16 else claimed[j]
         gain = spread[j] ** 2 / error**2 * per_solve / cpu
