@@ -13,7 +13,7 @@ TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the f
 ALONE = 1.5  # the same of a mesh without an estimate of its own, where none of these is: with it the order shows best
 SHARE = 0.2  # of what a study takes without its solves
 OF_ALONE = 0.35  # the same for that mesh: without any, half of what is seen would be in doubt
-AROUND = 0.15  # processor time (s) of what estimates need besides: forms to be loaded, a longer report
+AROUND = 0.3  # processor time (s) of what estimates need besides: forms, places of nodes, a longer report
 
 
 class Finer(NamedTuple):
@@ -63,13 +63,15 @@ def richer(spec: Any) -> float:
 
 def finer(spec: Any, spare: float = math.inf) -> Finer | None:
     """Return a body on the finest mesh that is affordable; None where any takes too much."""
-    allowed = allowance(spec, spare)
+    allowed, of_alone = allowance(spec, spare), allowance(spec, spare, OF_ALONE)
+    if of_alone <= 0:
+        return None
     for times in TIMES:
         found = _there(spec, times, estimated=True)
         if found is not None and found.seconds <= allowed:
             return found
     found = _there(spec, ALONE, estimated=False)
-    return found if found is not None and found.seconds <= allowance(spec, spare, OF_ALONE) else None
+    return found if found is not None and found.seconds <= of_alone else None
 
 
 def _there(spec: Any, times: float, *, estimated: bool) -> Finer | None:

@@ -40,7 +40,7 @@ STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 5e-3  # relative tolerance of the same solves
-CLOSER = 0.1  # that of further steps, which change a tenth
+CLOSER = 0.1  # that of further steps, which change a tenth, and the part of their energy that these may miss
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
 BENT_MIXED = 1e-6  # the same with pressures, whose part of the work has the other sign
@@ -321,7 +321,7 @@ class Enriched:
         """
         found = None
         if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
-            found = self._solve_by_smoothing(solution, right, transpose=transpose)
+            found = self._solve_by_smoothing(solution, right, max(close, SETTLED), transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
             found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
         if found is None:
@@ -329,10 +329,13 @@ class Enriched:
             found = self.equations.back_substitute(right, transpose=transpose)
         return found
 
-    def _solve_by_smoothing(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray | None:
+    def _solve_by_smoothing(
+        self, solution: Solved, right: FloatArray, missing: float, *, transpose: bool
+    ) -> FloatArray | None:
         """Solve by steps of conjugate gradients and, before and after, with the stiffness of the body.
 
-        The solve afterwards corrects what affects outputs most: it makes the residual orthogonal to V_h.
+        The former may miss such a part of the energy. The solve afterwards corrects what affects outputs most: it makes
+        the residual orthogonal to V_h.
         """
         inverse = self._preconditioner(solution)
         if inverse is None:
@@ -348,7 +351,7 @@ class Enriched:
         for i, b in enumerate(right):
             residual = b - multiply(found[i]) if found[i].any() else b
             if inverse.weights is None:
-                change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, SETTLED, STEPS)
+                change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, missing, STEPS)
             else:
                 change, _, settled = minimised(
                     multiply, inverse.apply, residual, inverse.weights, equations.total, LEFT, STEPS

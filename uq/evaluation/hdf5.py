@@ -168,19 +168,31 @@ def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dic
 def _variables(part: Any) -> dict[str, Variable]:
     """Variables of a group, in the order in which they were made where that is kept."""
     found = {}
-    for name, one in part.items():
-        if not isinstance(one, h5py.Dataset):
+    places: dict[int, str] = {}  # names of scales: to look one up takes as long as to read a variable
+    for name in part:
+        one = part[name]
+        if not isinstance(one, h5py.Dataset) or NO_VARIABLE in bytes(one.attrs.get("NAME", b"")):
             continue
-        attributes = dict(one.attrs)
-        if NO_VARIABLE in bytes(attributes.get("NAME", b"")):
-            continue
-        dims = tuple(Path(dim[0].name).name if len(dim) else "" for dim in one.dims)
+        about = {key: _plain(one.attrs[key]) for key in one.attrs if key not in OF_FORMAT}
         texts = h5py.check_string_dtype(one.dtype) is not None
         values = one.asstr()[()] if texts else one[()]
         coordinate = h5py.h5ds.is_scale(one.id) and np.ndim(values) == 1  # its own dimension
-        about = {key: _plain(value) for key, value in attributes.items() if key not in OF_FORMAT}
-        found[name.removeprefix(OTHER)] = Variable(values, (name,) if coordinate else dims, about)
+        dims = (name,) if coordinate else tuple(_dimension(one.id, axis, places) for axis in range(one.ndim))
+        found[name.removeprefix(OTHER)] = Variable(values, dims, about)
     return found
+
+
+def _dimension(of: Any, axis: int, places: dict[int, str]) -> str:
+    """Name of a dimension of a variable; empty if it has none."""
+    scales: list[Any] = []
+    if h5py.h5ds.get_num_scales(of, axis):
+        h5py.h5ds.iterate(of, axis, scales.append, 0)
+    if not scales:
+        return ""
+    at = h5py.h5o.get_info(scales[0]).addr
+    if at not in places:
+        places[at] = Path(h5py.h5i.get_name(scales[0]).decode()).name
+    return places[at]
 
 
 def _plain(value: Any) -> Any:

@@ -127,7 +127,7 @@ class Regression:
         """
         if of is None and not self.inputs.independent:
             return self._dependent()
-        return _estimates(self.fit, self.largest.indices, self.data, self.rest(), of or coefficient_moments)
+        return _estimates(self.fit, self.largest.indices, self.data, self.missing(), of or coefficient_moments)
 
     def _dependent(self) -> dict[str, FloatArray]:
         """Moments and, of few parameters, Shapley effects."""
@@ -136,9 +136,9 @@ class Regression:
         draws = self.inputs.draws
         assert draws is not None
         if len(draws.names) > MOST:
-            return _estimates(self.fit, self.largest.indices, self.data, self.rest(), moments)
+            return _estimates(self.fit, self.largest.indices, self.data, self.missing(), moments)
         of = Shapley.of(self.largest, draws)
-        found = _estimates(self.fit, self.largest.indices, self.data, self.rest(), of.analysis)
+        found = _estimates(self.fit, self.largest.indices, self.data, self.missing(), of.analysis)
         of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
 
@@ -242,7 +242,9 @@ def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, F
     return plain, np.sqrt(draws.weights @ left**2)
 
 
-def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis) -> dict[str, FloatArray]:
+def _estimates(
+    fit: Fit, largest: IntArray, data: Data, missing: FloatArray | None, of: Analysis
+) -> dict[str, FloatArray]:
     """Moments and indices by output, with standard errors from the jackknife over samples and the residual variance.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. If functions were selected, each of
@@ -260,8 +262,9 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
     they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
 
     In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have tails,
-    its norm, the `rest`, is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the mean,
-    whose error is the jackknife's.
+    the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for
+    the mean, whose error is the jackknife's. What the fit leaves where samples are, λ, is no such error of the standard
+    deviation: it is known by samples, as of bounded parameters.
 
     Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
     """
@@ -271,8 +274,9 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
     groups, n = len(fit.without), len(fit.unseen)
     seen = _unseen(fit, largest, data)
     trusted = fit.relative <= TRUSTED
-    cautious = rest is not None
-    tails = np.zeros_like(fit.loo) if rest is None else rest
+    cautious = missing is not None
+    beyond_samples = np.zeros_like(fit.loo) if missing is None else missing
+    tails = np.maximum(fit.loo, beyond_samples) if cautious else beyond_samples
     bias = shares(fit.loo**2, 2 * central["std"])
     whole: FloatArray = np.where(trusted, central["std"], seen["std"])
     share = shares(fit.loo**2, whole**2)
@@ -283,7 +287,7 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
             + (seen["mean"] - central["mean"]) ** 2 / 4
             + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
         ),
-        "std": np.sqrt(np.maximum(tails, unsure) ** 2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
+        "std": np.sqrt(beyond_samples**2 + unsure**2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
     }
     for name, values in left_out.items():
         spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))

@@ -141,7 +141,7 @@ class Study(Sourced, StudyKind):
         """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
         return self.method.planned(len(self.inputs.names))
 
-    @property
+    @cached_property
     def estimates(self) -> int:
         """Number of estimates of the error of the mesh with the planned solves: none of models without one.
 
@@ -167,15 +167,18 @@ class Study(Sourced, StudyKind):
     @cached_property
     def _too_large(self) -> float | None:
         """Memory (MiB) that an estimate of the error of the mesh and its calibration take, if that is too much."""
-        cost = self.spec.mesh_error_cost(self.spare)
-        needed = 0.0 if cost is None else (cost.bytes + cost.calibration_bytes) / MIB
+        needed = self._bytes_of_estimates / MIB
         return needed if needed > self.accuracy.memory else None
+
+    @cached_property
+    def _bytes_of_estimates(self) -> float:
+        cost = self.spec.mesh_error_cost(self.spare)
+        return 0.0 if cost is None else cost.bytes + cost.calibration_bytes
 
     @property
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
-        estimating = self.spec.mesh_error_cost(self.spare) if self.estimates else None
-        return super().memory + (0.0 if estimating is None else estimating.bytes + estimating.calibration_bytes)
+        return super().memory + (self._bytes_of_estimates if self.estimates else 0.0)
 
     @property
     def growth(self) -> tuple[float, str]:
