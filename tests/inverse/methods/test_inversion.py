@@ -290,7 +290,7 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_synthetic_data_say_what_they_are_of(folder):
+def test_synthetic_data_say_what_they_are_of(folder, looked_at):
     text = (folder / "data" / "made-2.csv").read_text()
     assert "# truth.inclusions.lump.contrast = 4.0\n" in text
     assert text.startswith("# Synthetic: 3 × 3 × 3 cells (hexahedron, degree 1), errors relative 0.02, seed 1.")
@@ -298,6 +298,7 @@ def test_synthetic_data_say_what_they_are_of(folder):
     counts = [len(set(map(tuple, m.observations.places))) for m in study.measurements]
     assert counts == [28, round(0.3 * 28)]
     assert study.measurements[0].truth["material.mu"] == 1e4
+    looked_at(folder / "made")
     page = (folder / "made" / "report.html").read_text()
     assert all(text in page for text in (">made-1</h2>", ">made-2</h2>", "largest standard error"))
 

@@ -359,7 +359,7 @@ def results(tmp_path):
     return dataset, tmp_path
 
 
-def test_summary_and_report(results, monkeypatch):
+def test_summary_and_report(results, monkeypatch, looked_at):
     dataset, directory = results
     methods = json.loads((directory / "summary.json").read_text())["methods"]
     assert list(methods) == ["monte-carlo", "q", "monte-carlo, textbook solver"]
@@ -382,6 +382,7 @@ def test_summary_and_report(results, monkeypatch):
     page = write_report(directory).read_text()
     for text in ("Error against cost", "monte-carlo, textbook solver", "gain over the textbook", "uy_max: mean"):
         assert text in page
+    looked_at(directory)
     assert len(drawn) == 8
     against_solves, against_time = drawn[:2]
     labels = against_solves.get_legend_handles_labels()[1]

@@ -15,7 +15,7 @@ from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from uq.methods.chaos import Chaos
 from uq.surrogates.expansion import Expansion
-from workflows.report.blocks import Heading, Table
+from workflows.report.blocks import Folded, Heading, Table, Text
 from workflows.report.page import render, write_report
 from workflows.report.scene.scene import Quantity, Scene
 from workflows.report.scene.sliders import sliders
@@ -172,6 +172,18 @@ def test_numbers_of_different_units_are_sorted(page, tmp_path):
     page.run("document.querySelector('th button').click()")
     order = page.run("[...document.querySelector('table').tBodies[0].rows].map((r) => r.cells[1].textContent)")
     assert order == ["3", "5", "2", "0", "1", "4"]  # in SI units; what is missing stays below
+
+
+def test_folded_notes_are_printed_and_units_stay_with_their_numbers(page, tmp_path):
+    folded = [Folded("a", [Text("12 mm ± 3 % of 5 moons")]), Folded("b", [Text("y")], printed=False)]
+    (tmp_path / "report.html").write_text(render("x", [("x", [Heading("x", 1), *folded])]))
+    page.open(tmp_path / "report.html")
+    opened = "[...document.querySelectorAll('details')].map((d) => d.open)"
+    page.run("dispatchEvent(new Event('beforeprint'))")
+    assert page.run(opened) == [True, False]
+    page.run("dispatchEvent(new Event('afterprint'))")
+    assert page.run(opened) == [False, False]
+    assert page.run("document.querySelector('p').textContent") == "12\u00a0mm ±\u00a03\u00a0% of 5 moons"
 
 
 def test_the_keyboard_reaches_all_controls(page, reports):
