@@ -67,8 +67,9 @@ class PopulationStudy(StudyKind):
     def findings(self) -> tuple[Finding, ...]:
         """Say which specimens are known by few draws."""
         every = self.posteriors if self._there else {}
-        few = [found.text for name, draws in every.items() for found in findings_of_few(draws, f" of {name}")]
-        return tuple(Finding("warning", text) for text in once_for_outputs(few, tuple(every)))
+        few = [found for name, draws in every.items() for found in findings_of_few(draws, f" of {name}")]
+        said = once_for_outputs([found.text for found in few], tuple(every))
+        return tuple(few[0]._replace(text=text) for text in said)
 
     @property
     def _there(self) -> bool:
