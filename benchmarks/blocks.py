@@ -16,7 +16,8 @@ from forward.model import FloatArray
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise
 from workflows.config.study import load

@@ -23,7 +23,8 @@ from forward.fem.specimen import SpecimenModel
 from forward.specimen import Specimen
 from inverse.criticism.calibration import Kind, calibrate
 from inverse.low_dimensional.posterior import Posterior
-from uq.evaluation.evaluate import Prediction, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Prediction
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
 

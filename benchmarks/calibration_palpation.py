@@ -24,7 +24,9 @@ from forward.fem.finer import extrapolated
 from forward.model import FloatArray, Guess, SolveError
 from inverse.methods.invert import Invert
 from inverse.methods.shared_expansion import expanded_finer
-from uq.evaluation.evaluate import Evaluate, Evaluations, OfEvaluate, Request, SerialEvaluate, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import OfEvaluate, SerialEvaluate
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from workflows.config.study import load

@@ -17,7 +17,9 @@ from scipy.linalg import cho_solve
 from benchmarks.beams import CONFIG
 from forward.model import WORK, FloatArray, ForwardModel, FunctionModel, displacements
 from uq.estimators.indices import coefficient_moments
-from uq.evaluation.evaluate import Evaluations, Merger, Request, SerialEvaluate
+from uq.evaluation.block import Merger
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Evaluations, Request
 from uq.inputs.distributions import Beta, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points

@@ -13,7 +13,7 @@ import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
 from uq.estimators.moments import half_width
-from uq.evaluation.evaluate import Evaluations, Failure, Request
+from uq.evaluation.request import Evaluations, Failure, Request
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

@@ -26,7 +26,8 @@ from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.design import Design
 from inverse.methods.synthesize import SyntheticNoise
-from uq.evaluation.evaluate import Prediction, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Prediction
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load
 from workflows.studies.design_job import values_of

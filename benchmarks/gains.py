@@ -20,7 +20,8 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.model import FloatArray
-from uq.evaluation.evaluate import OWN, Recorder, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import OWN
 from uq.findings import findings
 from uq.methods.multifidelity import Multifidelity
 from workflows.__main__ import main as command

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.chaos import quiet_openturns
 from benchmarks.coverage import CASES, Case, Vectorised, truth
 from forward.model import FloatArray
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

@@ -12,7 +12,8 @@ from mpi4py import MPI
 from benchmarks.beams import beam
 from benchmarks.throughput import resident
 from forward.model import FloatArray, SolveError
-from uq.evaluation.evaluate import Evaluate, Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
 from uq.surrogates.basis import orthonormal

@@ -21,7 +21,8 @@ from mpi4py import MPI
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from forward.reduced.stream import begin, local
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise
 from workflows.__main__ import main as command

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from forward.model import FloatArray, ForwardModel, Solution
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
 
 ROOT = CONFIG.parent.parent
 PICTURE = ROOT / "docs" / "scaling.png"
@@ -43,7 +43,7 @@ from mpi4py import MPI
 from forward.model import FunctionModel
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.turns import counter as shared_counter
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 
 mode, world = sys.argv[1], MPI.COMM_WORLD
 if mode == "counter":
@@ -114,9 +114,11 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
     """Measure the constants on the published beam, and times of its solves with the inputs as published and wide."""
     from mpi4py import MPI
 
+    from uq.evaluation.block import Merger
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.claims import Claims
-    from uq.evaluation.evaluate import Merger, Request, SerialEvaluate
+    from uq.evaluation.evaluate import SerialEvaluate
+    from uq.evaluation.request import Request
     from uq.inputs.sampling import random_points
     from uq.surrogates.linearisation import linearise
     from workflows.config.study import load

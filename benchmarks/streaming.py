@@ -18,7 +18,7 @@ from mpi4py import MPI
 from benchmarks.beams import field_beam
 from benchmarks.throughput import resident
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 from uq.surrogates.linearisation import linearise
 from uq.methods.monte_carlo import _JointMoments
 from uq.inputs.sampling import random_points

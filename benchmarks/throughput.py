@@ -20,7 +20,7 @@ import sys, time
 from mpi4py import MPI
 from benchmarks.beams import beam
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 from uq.surrogates.linearisation import linearise
 from uq.inputs.sampling import random_points
 
@@ -98,7 +98,8 @@ def memory_over(realisations: int) -> list[float]:
 
 def memory_together(realisations: int) -> list[float]:
     """Return the resident memory (MiB) after each tenth of many realisations as studies solve them, in lockstep."""
-    from uq.evaluation.evaluate import Request, SerialEvaluate
+    from uq.evaluation.evaluate import SerialEvaluate
+    from uq.evaluation.request import Request
     from uq.inputs.sampling import random_points
 
     model, inputs, prediction = _coarse()

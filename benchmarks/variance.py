@@ -7,7 +7,8 @@ import time
 from mpi4py import MPI
 
 from benchmarks.beams import beam
-from uq.evaluation.evaluate import Evaluations, Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Evaluations, Request
 from uq.methods.monte_carlo import SensitivityMonteCarlo
 
 SAMPLES = 256

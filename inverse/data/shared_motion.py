@@ -24,7 +24,7 @@ from forward.model import FloatArray, SolveError
 from inverse.data.approximation_error import Whitening
 from inverse.data.registration import Rigid, UncertainMotion, slopes
 from inverse.fields.low_rank import Spectrum
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 
 STEP = 1e-4  # of the extent of the points: how far they are moved for derivatives
 DETERMINED = 1.0  # eigenvalue from which on data say more about a motion than the registration

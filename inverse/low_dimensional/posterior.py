@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
-from uq.evaluation.evaluate import Evaluate, Request, Start
+from uq.evaluation.request import Evaluate, Request, Start
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 

@@ -18,7 +18,7 @@ from forward.model import WORK, FloatArray, SolveError
 from inverse.criticism.weights import effective_sample_size, normalised
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from uq.evaluation.evaluate import Evaluations, Failure, Request
+from uq.evaluation.request import Evaluations, Failure, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs

@@ -25,7 +25,8 @@ from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Inverted, inverted
 from inverse.methods.record import Data
-from uq.evaluation.evaluate import Evaluate, Evaluations, OfEvaluate, Recorder, Request, SerialEvaluate
+from uq.evaluation.evaluate import OfEvaluate, Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import Linearisation, linearise
 

@@ -28,7 +28,7 @@ from inverse.designs.greedy import Choice, choose
 from inverse.designs.linearised import Linearised, scaled
 from inverse.designs.of_mesh import with_mesh_errors
 from inverse.methods.synthesize import SyntheticNoise
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

@@ -41,7 +41,8 @@ from inverse.methods.record import (
     of_prior,
     of_test,
 )
-from uq.evaluation.evaluate import Evaluate, Recorder, Request, SerialEvaluate, Start
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import linearise

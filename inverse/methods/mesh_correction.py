@@ -19,7 +19,7 @@ from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, para
 from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, along, uncertain
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior

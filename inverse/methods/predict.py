@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise

@@ -26,7 +26,7 @@ from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import MeshTreatment, Treatment, before_few, corrected_few
-from uq.evaluation.evaluate import Evaluate
+from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
 from uq.surrogates.linearisation import linearise
 

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from forward.model import FloatArray, FunctionModel, SolveError
 from inverse.criticism.finer import Finer, Solved
 from inverse.methods.invert import LEAST_SHARED
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis

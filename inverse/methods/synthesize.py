@@ -12,7 +12,7 @@ from forward.model import FloatArray, SolveError
 from forward.settings import Settings
 from inverse.data.registration import Given, Rigid
 from inverse.data.units import factor
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from forward.model import Finding, FloatArray
 from forward.readable import told as in_words
 from uq.estimators.rounding import only_rounding
-from uq.evaluation.evaluate import Evaluations
+from uq.evaluation.request import Evaluations
 
 if TYPE_CHECKING:
     import xarray as xr

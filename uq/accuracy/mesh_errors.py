@@ -19,7 +19,8 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution
 from uq.estimators.indices import shares
-from uq.evaluation.evaluate import Evaluate, Evaluations, Request, merge
+from uq.evaluation.block import merge
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import latin_points, sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, Stability
-from uq.evaluation.evaluate import Evaluations
+from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
 
 SHOWN = 0.1  # weight of a parameter in a direction, relative to the largest, from which it is named

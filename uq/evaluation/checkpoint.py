@@ -22,8 +22,8 @@ import numpy as np
 
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
-from uq.evaluation.evaluate import Evaluations, Failure
 from uq.evaluation.hdf5 import creation, image, in_memory
+from uq.evaluation.request import Evaluations, Failure
 
 OPTIONAL = ("mesh_errors", "saturations")  # arrays that evaluations have on request
 HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest

@@ -20,8 +20,10 @@ import numpy as np
 
 from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError
+from uq.evaluation.block import BlockSolver, Merger
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger, OfModel, Request
+from uq.evaluation.evaluate import OfModel
+from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
 
 if TYPE_CHECKING:

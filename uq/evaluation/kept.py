@@ -27,9 +27,11 @@ from forward.model import (
     gathered,
     scattered,
 )
+from uq.evaluation.block import BlockSolver, merge
 from uq.evaluation.checkpoint import HEAD
-from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, Request, merge
+from uq.evaluation.evaluate import OfModel
 from uq.evaluation.hdf5 import creation, image, in_memory, stored_array
+from uq.evaluation.request import Evaluations, Failure, Request
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint

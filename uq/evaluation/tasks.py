@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from forward.model import SolveError
+from uq.evaluation.block import merge
 from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, read, write
 from uq.evaluation.claims import FinishedElsewhere
-from uq.evaluation.evaluate import Evaluations, merge
 from uq.evaluation.hdf5 import File, holds, netcdf
+from uq.evaluation.request import Evaluations
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -23,7 +23,8 @@ from pydantic import Field
 
 from forward.model import FloatArray, SolveError
 from uq.estimators.moments import student
-from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
 from uq.methods.chaos import LARGEST, Chaos, Expanded, Probability

@@ -19,7 +19,9 @@ from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.indices import coefficient_moments, shares
 from uq.estimators.moments import Quantiles, Z, quantiles, student
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

@@ -22,7 +22,7 @@ from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import rate, score
-from uq.evaluation.evaluate import OWN, Evaluate, Request
+from uq.evaluation.request import OWN, Evaluate, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points

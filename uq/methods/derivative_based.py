@@ -38,7 +38,8 @@ from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
 from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
 from uq.estimators.tails import counted
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.distributions import (
     Beta,

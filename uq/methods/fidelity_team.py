@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Group, subsets
 from uq.estimators.fidelities import Samples, ok_rows
-from uq.evaluation.evaluate import COMPANY, Evaluations, Recorder, Request
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import COMPANY, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.cheap import CheapModel

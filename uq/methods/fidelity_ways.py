@@ -26,7 +26,7 @@ from uq.estimators.moments import (
     term,
 )
 from uq.estimators.tails import of_influences, unseen
-from uq.evaluation.evaluate import Evaluations
+from uq.evaluation.request import Evaluations
 from uq.findings import add
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Team

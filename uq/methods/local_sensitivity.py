@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from forward.model import ModelError
-from uq.evaluation.evaluate import Evaluate
+from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import Method
 from uq.surrogates.linearisation import linearise, local_dataset

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Self
 from forward.registry import Kinds
 from forward.scalars import Mistake
 from forward.settings import Settings
-from uq.evaluation.evaluate import OWN
+from uq.evaluation.request import OWN
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec, Times
     from uq.accuracy.goal import Goal
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
     from uq.inputs.random_parameters import Inputs
 
 MESH = "mesh "  # how the names of models begin that are the same on finer meshes, of which a report has a table

@@ -25,7 +25,9 @@ from uq.estimators.moments import (
     quantiles,
 )
 from uq.estimators.tails import counted, influences
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs

@@ -19,7 +19,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.model import ModelError
 from forward.registry import OfKind
-from uq.evaluation.evaluate import OWN, Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import OWN, Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.cheap import CHEAP, CheapModel

@@ -19,7 +19,8 @@ from uq.estimators.moments import (
     ESTIMATES,
     ratio,
 )
-from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED

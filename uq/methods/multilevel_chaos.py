@@ -24,7 +24,8 @@ from pydantic import Field
 from forward.model import WORK, FloatArray
 from uq.estimators.indices import coefficient_moments
 from uq.estimators.moments import Moments, estimate, monomials, ratio
-from uq.evaluation.evaluate import Evaluate, Evaluations, Prediction, Recorder, Request, Start
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.chaos import Expanded, Probability, expansion_dataset, objection

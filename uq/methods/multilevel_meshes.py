@@ -28,7 +28,7 @@ from uq.estimators.moments import (
     ratio,
     term,
 )
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Request
+from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.method import MESH

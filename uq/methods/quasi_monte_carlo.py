@@ -32,7 +32,8 @@ from uq.estimators.moments import (
     student,
 )
 from uq.estimators.tails import counted, influences, of_influences, skewed
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Request, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points

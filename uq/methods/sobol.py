@@ -26,7 +26,8 @@ from uq.estimators.indices import (
     partial_variances,
     shares,
 )
-from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uq.evaluation.evaluate import Evaluate
+from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:

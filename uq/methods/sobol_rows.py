@@ -32,7 +32,7 @@ from uq.estimators.indices import (
 )
 from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
 from uq.estimators.tails import counted
-from uq.evaluation.evaluate import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

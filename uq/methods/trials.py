@@ -10,7 +10,9 @@ import numpy as np
 
 from forward.model import Finding, FloatArray, SolveError
 from uq.estimators.moments import ESTIMATES, half_width
-from uq.evaluation.evaluate import Evaluate, Evaluations, OfEvaluate, Recorder, Request, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import OfEvaluate, Recorder
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import findings
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
 from uq.estimators.indices import partial_variances, shares
-from uq.evaluation.evaluate import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
 from uq.surrogates.candidates import candidates_of, rows_of

@@ -15,7 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError, scattered
-from uq.evaluation.evaluate import CompactSum, Evaluate, Evaluations, FieldSum, OfEvaluate, Request, Start, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import OfEvaluate
+from uq.evaluation.request import CompactSum, Evaluate, Evaluations, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, hyperbolic, hyperbolic_count, orthonormal
 from uq.surrogates.candidates import ROWS_PER_TERM, Candidate, Candidates

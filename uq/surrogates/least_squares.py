@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from uq.evaluation.evaluate import Evaluations
+from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, IntArray
 from uq.surrogates.candidates import FULL, ROWS_PER_TERM, Candidate, Candidates

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluation.evaluate import Evaluate, Evaluations, Prediction, Request
+from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
 

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution
 from uq.inputs.quadrature import panels

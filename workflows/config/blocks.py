@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from forward.settings import Settings
-from uq.evaluation.evaluate import BLOCKS
+from uq.evaluation.request import BLOCKS
 
 
 class Correlation(Settings):

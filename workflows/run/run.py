@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_whole
 from forward.model import SolveError
-from uq.evaluation.evaluate import Evaluations
+from uq.evaluation.request import Evaluations
 from uq.findings import add
 from workflows.config.mistakes import StudyError
 from workflows.config.source import KEPT

@@ -18,7 +18,7 @@ from workflows.run.version import commit, versions
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from uq.evaluation.tasks import Outcome
     from workflows.studies.job import Job
     from workflows.studies.study import StudyKind

@@ -15,7 +15,8 @@ from forward.model import Finding
 from forward.scalars import Mistake
 from uq.estimators import branch
 from uq.estimators.averaged import averaged
-from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.config.mistakes import lines
 from workflows.config.source import STACKED
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
     from uq.inputs.random_parameters import Inputs

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uq.evaluation.evaluate import Evaluate, Evaluations, Prediction, Request
+from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request
 from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate, Evaluations
+    from uq.evaluation.request import Evaluate, Evaluations
     from uq.evaluation.tasks import Outcome
     from workflows.studies.design import DesignStudy
     from workflows.studies.design_of_models import DesignOfModels

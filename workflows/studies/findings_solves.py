@@ -11,7 +11,7 @@ from workflows.config.priors import ranges
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from workflows.studies.sampling import Study
 
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study

@@ -11,12 +11,12 @@ from forward.model import SolveError
 from forward.settings import one_line
 from inverse.criticism.finer import Finer, Solved
 from inverse.data.measured_model import MeasuredModel
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
     from forward.fem.finer import FinerMeshes
     from forward.model import FloatArray, ForwardModel
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
 
 FINER = "finer mesh"  # in names of models
 

@@ -17,8 +17,9 @@ from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.evaluation.evaluate import Recorder
 from uq.evaluation.kept import KeptEvaluate, KeptModel
+from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.results.directory import write_text

@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

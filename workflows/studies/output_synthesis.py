@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from forward.model import Finding
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
 
 SHARED = ("inclusions.", "material.", "regions.")  # numbers that files state in any case
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band, Record
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
     from workflows.config.predict import Predict
     from workflows.studies.inversion import InversionStudy
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.turns import Progress
     from workflows.studies.population import PopulationStudy

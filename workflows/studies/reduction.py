@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
     from workflows.studies.job import Job
 
 FILE = "reduced.npz"

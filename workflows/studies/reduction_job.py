@@ -16,7 +16,8 @@ from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
-from uq.evaluation.evaluate import Evaluate, Recorder, Request
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
 from uq.inputs.sampling import random_points, sobol_points
 from uq.surrogates.linearisation import linearise

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from uq.inputs.draws import Draws
     from workflows.studies.job import Job
 

@@ -15,7 +15,9 @@ from forward.registry import named
 from uq.accuracy.budget import spare_for
 from uq.estimators import branch
 from uq.estimators.rounding import settled
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
+from uq.evaluation.block import merge
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, once_for_steps
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised

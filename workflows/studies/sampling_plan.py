@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Linear
 from forward.machine import MIB, compiled_forms
-from uq.evaluation.evaluate import OWN, company_of
+from uq.evaluation.request import OWN, company_of
 from workflows.config.priors import ranges
 from workflows.studies import tolerance_asked
 from workflows.studies.predictions import duration, never_estimable, times_of

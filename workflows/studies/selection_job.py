@@ -7,7 +7,8 @@ from functools import cache, partial
 from typing import TYPE_CHECKING
 
 from inverse.criticism.finer import Finer
-from uq.evaluation.evaluate import Evaluate, Recorder, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.studies.findings_selection import (
     contradictions,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.request import Evaluations
     from uq.inputs.random_parameters import Inputs
     from workflows.config.blocks import Parallel
     from workflows.config.report import Report

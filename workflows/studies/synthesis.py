@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from forward.model import Finding, FloatArray
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.request import Evaluate
 
 
 class SynthesisStudy(StudyKind):

@@ -28,7 +28,8 @@ from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
 from uq.estimators.moments import Z
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset

@@ -14,7 +14,8 @@ from forward.model import Finding, FloatArray, SolveError
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.goal import Goal
 from uq.estimators.moments import half_width
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import Evaluate, Evaluations
 from uq.findings import add
 from uq.surrogates.linearisation import linearise
 from workflows.studies.sampling_job import told_of

@@ -13,7 +13,8 @@ from forward.model import Stability
 from tests.bodies import loaded_body
 from tests.launch import run_script
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo, _JointMoments

@@ -14,7 +14,8 @@ from forward.external.own_modules import sources
 from forward.model import ModelError, SolveError
 from tests import functions
 from tests.launch import ROOT
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.results.directory import read_summary

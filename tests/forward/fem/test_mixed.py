@@ -8,7 +8,8 @@ from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import MIXED, unloaded_body
 from tests.launch import run_script
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.monte_carlo import SensitivityMonteCarlo

@@ -16,7 +16,8 @@ from forward.solvers import stability
 from forward.solvers.rotations import turn
 from forward.solvers.steps import finish, plain
 from uq.estimators import branch
-from uq.evaluation.evaluate import Evaluations, Failure, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Evaluations, Failure
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise

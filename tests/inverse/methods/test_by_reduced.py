@@ -11,7 +11,8 @@ from inverse.methods.by_reduced import Agreement, Corrected, invert_by_reduced
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_by_group
 from tests import launch
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.__main__ import main

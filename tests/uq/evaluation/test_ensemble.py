@@ -17,7 +17,8 @@ from mpi4py import MPI
 from forward.model import FunctionModel, SolveError
 from uq.inputs.distributions import Uniform
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.random_parameters import Inputs
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 

@@ -9,7 +9,8 @@ import pytest
 from forward.model import FunctionModel, ModelError, SolveError
 from uq.evaluation.checkpoint import Checkpoint, DamagedError
 from uq.evaluation.checkpoint import load as load_evaluations
-from uq.evaluation.evaluate import BLOCKS, Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import BLOCKS, Request
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.chaos import Chaos

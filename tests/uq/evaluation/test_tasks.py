@@ -12,7 +12,8 @@ from forward.model import FunctionModel, SolveError
 from tests.launch import ROOT, environment, run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Recorder, Request, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Request
 from uq.evaluation.tasks import Outcome, run_tasks
 
 NAMES = tuple("abcdefg")

@@ -13,7 +13,8 @@ from forward.model import FunctionModel, SolveError
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.findings import findings
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -415,7 +416,7 @@ def test_blocks_change_no_bit_and_keep_states_only(beam, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluate.model, "together", 1)
     method = Chaos(samples=7)
     expected = method.run(inputs, evaluate)
-    monkeypatch.setattr("uq.evaluation.evaluate.BLOCKS", 3)
+    monkeypatch.setattr("uq.evaluation.request.BLOCKS", 3)
     assert method.run(inputs, evaluate).identical(expected)
     ensemble = Ensemble.split(MPI.COMM_SELF)
     for _ in range(2):  # the second finds the blocks of the first

@@ -5,7 +5,8 @@ import pytest
 from scipy.special import roots_jacobi
 
 from forward.model import FunctionModel, SolveError
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.local_sensitivity import LocalSensitivity

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from forward.model import FunctionModel, SolveError
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from uq.estimators.moments import combine, estimate, monomials, term
-from uq.evaluation.evaluate import Evaluations, Recorder, Request, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluations, Request
 from uq.findings import findings
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs

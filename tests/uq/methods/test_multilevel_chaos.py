@@ -9,7 +9,8 @@ import pytest
 from forward.model import FunctionModel, Guess, OneByOne, SolveError, Stability, Work
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Beta, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods import chaos

@@ -10,7 +10,8 @@ import xarray as xr
 from forward.model import FunctionModel, OneByOne, Solution, SolveError
 from tests.launch import run_script
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.request import Request
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points

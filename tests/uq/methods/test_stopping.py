@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.chaos import Chaos

@@ -7,7 +7,8 @@ import pytest
 from mpi4py import MPI
 
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
-from uq.evaluation.evaluate import OfEvaluate, Prediction, SerialEvaluate
+from uq.evaluation.evaluate import OfEvaluate, SerialEvaluate
+from uq.evaluation.request import Prediction
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods import monte_carlo

@@ -24,7 +24,7 @@ from forward.external.models import Value
 from forward.scalars import Scalar
 from forward.settings import Settings
 from forward.spec import ModelSpec
-from uq.evaluation.evaluate import Request
+from uq.evaluation.request import Request
 from uq.methods.stopping import Amount
 from uq.methods.monte_carlo import MonteCarlo
 

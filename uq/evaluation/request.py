@@ -1,0 +1,264 @@
+"""What methods ask of a model at many points, and what they are told: requests and evaluations.
+
+Work is cut into blocks of fixed size; sums of fields are formed in index order inside a block and the blocks are added
+in order. So the result does not depend on which rank computed which block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import (
+    FloatArray,
+    ForwardModel,
+    Guess,
+    ReferenceSolution,
+    Solution,
+    scattered,
+)
+from uq.inputs.coordinates import Coordinates
+
+OWN = ""  # name of the first model of an evaluation
+COMPANY, FEW = 16, 16  # points in a block that begin from predictions, and blocks that there are before it is so large
+BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A point without an answer, and why: the model is not defined there, or no solution was found."""
+
+    index: int
+    parameters: tuple[float, ...]
+    reason: str
+    history: tuple[str, ...] = ()
+    inadmissible: bool = False
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Outputs of a model at n points.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    outputs
+        Outputs (n, m); NaN in the rows that failed, but for what was known before they did (`SolveError.reached`).
+    tangents
+        dψ/dω (n, m, d) if requested, NaN where a solve failed.
+    failures
+        The points that failed, by index.
+    seconds
+        Processor time (n,) of each point on one rank group, times the ranks of the group.
+    work
+        Numbers (n, k) of the operations in `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Whether the states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
+    stability
+        Whether the stability of each state (n,) was counted or screened, or refused: `forward.model.Stability`.
+    fields
+        Sum over the points that did not fail of the rows (k, U) of the requested field sum; in a block of a
+        `CompactSum`, the rows of these points themselves, one point after the other.
+    sketches
+        What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are merged.
+    mesh_errors
+        Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
+    saturations
+        What calibrates estimated errors (n, 3m + 2), where it was asked for: factors of outputs, what is added then,
+        and how far that may be wrong; the factor of the state; whether they were measured here (1) or are typical
+        ones (0). NaN where there is none.
+    """
+
+    points: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray | None
+    failures: tuple[Failure, ...]
+    seconds: FloatArray
+    work: NDArray[np.int64]
+    residuals: FloatArray
+    converged: NDArray[np.bool_]
+    stability: NDArray[np.int8]
+    fields: FloatArray
+    sketches: FloatArray | None = None
+    mesh_errors: FloatArray | None = None
+    saturations: FloatArray | None = None
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which points (n,) have an answer."""
+        good = np.ones(len(self.points), dtype=bool)
+        good[[failure.index for failure in self.failures]] = False
+        return good
+
+
+class FieldSum(Protocol):
+    """A quantity of each realisation's state that is summed while realisations are computed."""
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
+
+
+@runtime_checkable
+class CompactSum(FieldSum, Protocol):
+    """A sum whose terms have many rows that follow from a few rows of each realisation: blocks hold those few.
+
+    `on` returns these few; the sum is formed when blocks are added, so that files and messages stay small.
+    """
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, r, U)."""
+
+    def sketch(self, rows: FloatArray) -> FloatArray | None:
+        """Return a few numbers (n, r, k) to be kept of the rows (n, r, U) of some realisations; or None."""
+
+
+class JointSum(Protocol):
+    """A quantity of the states of several consecutive points, summed while these rows of points are computed.
+
+    Blocks hold whole rows; a row with a failed solve adds nothing.
+    """
+
+    @property
+    def size(self) -> int:
+        """Number K of points in a row."""
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        """Return the function states (K, U_local) → rows (k, U_local) to be summed, for one group's model."""
+
+
+class Start(Protocol):
+    """A prediction of the state: initial guess of the solver at every point, with the reference that corrects it.
+
+    A dataclass; its fields are part of the keys of the blocks that were started from it.
+    """
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction of the state that is linear in the coordinates, with the factor at `point`.
+
+    Attributes
+    ----------
+    point
+        Parameters (d,) of the expansion.
+    state
+        State (U,) there, in canonical order.
+    slopes
+        Derivatives (d, U) of the state along the coordinates; empty (0, U) if the solver starts from the state at
+        `point`.
+    coordinates
+        The coordinates.
+    spread
+        Standard deviations (d,) of the parameters, for the screen of stability.
+    """
+
+    point: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+    coordinates: Coordinates
+    spread: FloatArray | None = None
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
+        state, slopes = scattered(model, self.state[None, :])[0], scattered(model, self.slopes)
+        reference = ReferenceSolution(self.point, state, self.spread)
+        if len(slopes) == 0:
+            return lambda _: Guess(state, reference)
+        here = self.coordinates.of(self.point)
+        return lambda parameters: Guess(state + (self.coordinates.of(parameters) - here) @ slopes, reference)
+
+
+def company_of(samples: int, most: int = COMPANY) -> int:
+    """How many samples that begin from predictions are in one block, of so many in all and at most."""
+    return min(most, max(samples // FEW, 1))
+
+
+@dataclass(frozen=True)
+class Request:
+    """What an evaluation is asked for.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    tangents
+        Whether the derivatives of the outputs are computed.
+    fields
+        Sum over the states.
+    start
+        Initial guesses of the solver.
+    iterations
+        Iterations of the solver after which its state is accepted as it is, see `ForwardModel.solve`.
+    model
+        Name of one of the models of the evaluation; `Evaluate.on` sets it.
+    joint
+        Sum over the states of consecutive points, instead of `fields`.
+    mesh_errors
+        Whether the errors of the mesh in the outputs are estimated (`Solution.mesh_error`).
+    saturations
+        How many solves it may cost to find what calibrates these too (`Solution.saturation`); None if it is not wanted.
+    company
+        How many points at most go together in a block, of those that begin from predictions.
+    """
+
+    points: FloatArray
+    tangents: bool = False
+    fields: FieldSum | None = None
+    start: Start | None = None
+    iterations: int | None = None
+    model: str = OWN
+    joint: JointSum | None = None
+    mesh_errors: bool = False
+    saturations: float | None = None
+    company: int = COMPANY
+
+    def blocks(self, most: int | None = None) -> list[Request]:
+        """Cut into blocks that depend only on the number of points, the size of rows, and `most`.
+
+        Points that are predicted from a reference are cheaper in company: as long as no more blocks than usual are
+        asked for, which is for many groups of ranks, there are several in each.
+        """
+        together, n = 1 if self.joint is None else self.joint.size, len(self.points)
+        company = company_of(n, self.company) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
+        size = together * max(1, -(-n // (together * (most or BLOCKS))), -(-company // together))
+        return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
+
+
+class Evaluate(Protocol):
+    """A model as seen by a sampling method: points in, evaluations out."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the start of a state, see `NodalSpace.displacements`."""
+
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """Share (n_nodes,) of the body that each node represents in integrals; None if all nodes count equally."""
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+
+    def on(self, model: str) -> Evaluate:
+        """Return the evaluation of another model (mesh, solver), by name; the first one is `OWN`."""
