@@ -170,10 +170,17 @@ def _parser() -> argparse.ArgumentParser:
 def _load(options: argparse.Namespace) -> StudyKind:
     """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
     from forward.machine import reserve_for_linear_algebra
+    from workflows.config.mistakes import StudyError
     from workflows.config.study import load
 
     reserve_for_linear_algebra()
     study = load(options.study, options.set)
+    if study.recorded:
+        message = (
+            f"{options.study}: records a study without its data, expected the study that was run; the same command as "
+            "then, with the same --out, goes on with it"
+        )
+        raise StudyError(message)
     if study.modules:
         from forward.external.own_modules import make_visible
 

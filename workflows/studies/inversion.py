@@ -221,6 +221,11 @@ class InversionStudy(StudyKind):
         """
         raise NotImplementedError
 
+    @property
+    def recorded(self) -> bool:
+        """As in every study: its data sets are named, and not read."""
+        return bool(self.data.sets) and not self.measurements
+
     def with_data(self, folder: Path) -> Self:
         """Return the same with its files read.
 

@@ -103,6 +103,11 @@ class StudyKind(Settings):
         """Number of evaluations that ranks share, plus one."""
 
     @property
+    def recorded(self) -> bool:
+        """Whether this is the record of a study that ran, without the contents of its data files."""
+        return False
+
+    @property
     def solves(self) -> int:
         """Number of solves, as counted for the progress."""
         return self.planned

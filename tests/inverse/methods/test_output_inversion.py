@@ -120,7 +120,7 @@ def test_a_linear_model_has_its_exact_posterior(folder, looked_at):
     assert "oad case" not in page
 
 
-def test_tables_are_data_sets_side_by_side(folder, looked_at):
+def test_tables_are_data_sets_side_by_side(folder, looked_at, capsys):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     files = "data={files='data', noise={relative=0.1}}"
     assert ran(folder / "stated.toml", folder / "batch", files, report=True) == 3
@@ -136,6 +136,8 @@ def test_tables_are_data_sets_side_by_side(folder, looked_at):
     assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
     assert "All data sets" in (folder / "batch" / "report.html").read_text()
     looked_at(folder / "batch")
+    assert main(["check", str(folder / "batch" / "study.toml")]) == 2  # a record, which names its data
+    assert "records a study without its data, expected the study that was run" in capsys.readouterr().err
 
 
 def test_a_wrong_jacobian_is_named(folder):
