@@ -37,7 +37,7 @@ class ByReduced(Settings):
 
 
 class Invert(MeshTreatment, Settings):
-    """Inversion of measured displacements: the most probable interior, its uncertainty, and what the data leave open.
+    """Inversion of measurements: the most probable parameters or interior, their uncertainty, and what stays open.
 
     Parameters
     ----------

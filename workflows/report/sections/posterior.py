@@ -141,9 +141,10 @@ def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str
     seen = int((one["eigenvalue"] > plots.SEEN).sum())
     yield "directions about which the data say more than the prior", f"{seen} of {directions:,}"
     yield "directions determined", number(float(one["determined"]), 3)
-    if np.isfinite(one["log_evidence_error"]):
-        yield "ln Z", with_error(float(one["log_evidence"]), float(one["log_evidence_error"]))
-    yield "ln Z by Laplace", number(float(one["laplace_log_evidence"]), 7)
+    by_laplace, error = float(one["laplace_log_evidence"]), float(one["log_evidence_error"])
+    if np.isfinite(error):
+        yield "ln Z", with_error(float(one["log_evidence"]), error)
+    yield "ln Z by Laplace", rounded(by_laplace, error) if np.isfinite(error) else number(by_laplace, 6)
     square, degrees = (number(float(one[f"residual_{name}"]), 4) for name in ("square", "degrees"))
     chance = number(float(one["residual_probability"]), 2)
     yield "residuals", f"|r|² = {square} where {degrees} is expected: probability {chance} of larger ones"
@@ -279,11 +280,15 @@ def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
 def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Measurements of each output, and predictions with the most probable parameters."""
     rows = []
-    for k in np.flatnonzero(np.isfinite(one["measured"].to_numpy())):
-        of = one.isel(datum=k)
+    known = np.flatnonzero(np.isfinite(one["measured"].to_numpy()))
+    outputs = [str(one.case.values[k]) for k in one["datum_case"].to_numpy()[known].astype(int)]
+    largest: dict[str, float] = {}  # by unit: a column of one quantity is read in one unit
+    for output, value in zip(outputs, np.abs(one["measured"].to_numpy()[known]).tolist(), strict=True):
+        largest[units.get(output, "1")] = max(value, largest.get(units.get(output, "1"), 0.0))
+    for k, output in zip(known, outputs, strict=True):
+        of, unit = one.isel(datum=k), units.get(output, "1")
         pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        output = str(one.case.values[int(of["datum_case"])])
-        shown = [and_error(float(of[value]), float(of[error]), units.get(output, "1")) for value, error in pairs]
+        shown = [and_error(float(of[value]), float(of[error]), unit, largest[unit]) for value, error in pairs]
         rows.append((output, *shown, _shown(of["residual"], 3)))
     return Table(("output", "measured", "predicted", "residual over its error"), rows)
 
