@@ -98,6 +98,15 @@ def test_small_densities_are_densities():
     np.testing.assert_allclose(scaled, stats.norm(5, 2).pdf(at), atol=0.02)
 
 
+def test_a_small_density_holds_an_interval_that_reaches_beyond_its_samples():
+    at, curve = np.linspace(2.0, 4.0, 5), np.array([0.0, 1.0, 2.0, 1.0, 0.0])
+    drawn, inside, ends = answer._curve(at, curve, (1.0, 3.5), "m", 3.0)
+    assert inside == pytest.approx((0.0, 2.5 / 3))
+    assert ends == ("1.0", "4.0\N{NO-BREAK SPACE}m")
+    assert drawn[0] == 0
+    assert np.argmax(drawn) / (len(drawn) - 1) == pytest.approx(2 / 3, abs=0.02)
+
+
 @pytest.mark.parametrize("kind", ["local-sensitivity", "sobol", "derivative-based", "monte-carlo"])
 def test_every_kind_answers(tmp_path, kind):
     case = study_of({"kind": kind} if kind == "local-sensitivity" else {"kind": kind, "samples": 64})

@@ -188,7 +188,10 @@ def density(one: xr.Dataset, unit: str) -> tuple[Sequence[float], tuple[float, f
 def _curve(
     at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str, value: float
 ) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
-    low, high = float(at[0]), float(at[-1])
+    low, high = min(float(at[0]), inside[0]), max(float(at[-1]), inside[1])
+    if (low, high) != (float(at[0]), float(at[-1])):  # draws of weighted points may reach less far than their interval
+        lattice = np.linspace(low, high, CURVE)
+        at, curve = lattice, np.interp(lattice, at, curve, left=0.0, right=0.0)
     a, b = (float(np.clip((x - low) / (high - low), 0, 1)) for x in inside)
     words = interval(low, high, unit, value)
     cut = " to " if " to " in words else "–"
