@@ -40,7 +40,7 @@ USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh boun
 ORDERS = np.linspace(HIGHEST, LOWEST, 400)
 OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
 LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
-THOROUGH = {False: 5e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
+THOROUGH = {False: 2e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
 
 
 class Limit(NamedTuple):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.reduced.at_points import Integrand
 from forward.reduced.level import Level
-from forward.solvers.anderson import least_squares
+from forward.solvers.anderson import NEGLIGIBLE
 
 TOGETHER = 64  # samples
 WINDOW = 8  # differences that Anderson mixing keeps
@@ -88,8 +88,19 @@ class _Mixing:
         row, right = np.matmul(changes, np.stack([changes[:, slot], f], axis=2)).transpose(2, 0, 1)
         self._gram[which, slot, :kept] = row
         self._gram[which, :kept, slot] = row
-        parts = least_squares(self._gram[which, :kept, :kept], right)
+        parts = _least_squares(self._gram[which, :kept, :kept], right)
         return np.asarray(target - np.matmul(parts[:, None], self._misses[which, :kept])[:, 0])
+
+
+def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations (s, k, k) of scaled columns, as `AndersonMixing` does, of s samples at once."""
+    size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+    size = np.where(size == 0, 1.0, size)
+    values, vectors = np.linalg.eigh(gram / (size[:, :, None] * size[:, None, :]))
+    good = values > NEGLIGIBLE * values[:, -1:]
+    inverse = np.where(good, 1 / np.where(good, values, 1.0), 0.0)
+    along = np.matmul(vectors.swapaxes(1, 2), (right / size)[..., None]) * inverse[..., None]
+    return np.asarray(np.matmul(vectors, along)[..., 0] / size)
 
 
 def _still(level: Level, parameters: FloatArray) -> FloatArray:

@@ -63,18 +63,17 @@ class AndersonMixing:
         changes = self._changes[:kept]
         row, right = self._total(np.array([changes[slot], f]) @ changes.T)
         self._gram[slot, :kept] = self._gram[:kept, slot] = row
-        return target - least_squares(self._gram[:kept, :kept], right) @ self._misses[:kept]
+        return target - _least_squares(self._gram[:kept, :kept], right) @ self._misses[:kept]
 
 
-def least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations (..., k, k) of scaled columns, without directions that are rounding."""
-    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
-    size = np.where(size == 0, 1.0, size)
-    values, vectors = np.linalg.eigh(gram / (size[..., :, None] * size[..., None, :]))
-    good = values > NEGLIGIBLE * values[..., -1:]
-    inverse = np.where(good, 1 / np.where(good, values, 1.0), 0.0)
-    along = np.matmul(vectors.swapaxes(-2, -1), (right / size)[..., None]) * inverse[..., None]
-    return np.asarray(np.matmul(vectors, along)[..., 0] / size)
+def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations (k, k) of scaled columns, without directions that are rounding."""
+    size = np.sqrt(np.diag(gram))
+    size[size == 0] = 1
+    values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+    good = values > NEGLIGIBLE * values[-1]
+    vectors = vectors[:, good]
+    return np.asarray((vectors / values[good]) @ (vectors.T @ (right / size)) / size)
 
 
 def block_galerkin(
