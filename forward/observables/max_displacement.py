@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES
 from forward.model import FloatArray
@@ -49,13 +50,13 @@ class _Extreme:
     def place(self) -> int:
         """Number of the node of this rank at which it is largest."""
         candidates = self._candidates()
-        return int(np.argmax(candidates >= candidates.max(initial=0.0) * (1 - 1e-10)))
+        return int(_tied(candidates, candidates.max(initial=0.0))[0])
 
     def gradient(self) -> FloatArray:
         from forward.fem import ranks
 
         candidates, top = self._candidates(), self.value()
-        ties = np.flatnonzero(candidates >= top * (1 - 1e-10))
+        ties = _tied(candidates, top)
         position = self._equations.layout.positions[ties]
         first = ranks.smallest(self._equations.comm, float(position.min(initial=np.iinfo(np.int64).max)))
         g = np.zeros((len(candidates), 3))
@@ -70,3 +71,8 @@ class _Extreme:
 
     def partial(self) -> FloatArray:
         return np.zeros(len(self._equations.parameters))
+
+
+def _tied(candidates: FloatArray, top: float) -> NDArray[np.intp]:
+    """Number the nodes at which candidates (n,) are the largest but for rounding."""
+    return np.flatnonzero(candidates >= top * (1 - 1e-10))

@@ -67,7 +67,8 @@ def netcdf(
     with in_memory(creation(head, ordered=True)) as file:
         _write(file, dataset)
         for name, part in (groups or {}).items():
-            _write(h5py.Group(h5py.h5g.create(file.id, name.encode(), gcpl=_ordered_group())), part)
+            made = h5py.h5g.create(file.id, name.encode(), gcpl=_ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE)))
+            _write(h5py.Group(made), part)
         more(file)
         return image(file)
 
@@ -88,8 +89,7 @@ def _write(group: Any, dataset: xr.Dataset) -> None:
         h5py.h5ds.set_scale(scales[dim].id, NO_VARIABLE + f"{sizes[dim]:10}".encode())
     for name, one in encoded.items():
         texts = one.dtype.kind in "OU"
-        fill = one.attrs.pop("_FillValue", None)
-        kind = h5py.string_dtype() if texts else one.dtype
+        kind, fill = h5py.string_dtype() if texts else one.dtype, one.attrs.get("_FillValue")
         made = _data_set(group, OTHER + name if name in scales else name, kind, one.shape, fill)
         if made.size:
             made[...] = one.values.astype(object) if texts else one.values
@@ -98,7 +98,7 @@ def _write(group: Any, dataset: xr.Dataset) -> None:
             h5py.h5ds.set_scale(made.id, name.encode())
         else:
             written.append((made, one.dims))
-        _attributes(made, one.attrs if fill is None else {"_FillValue": fill} | one.attrs)
+        _attributes(made, one.attrs)
     for number, dim in enumerate(sizes):
         _attributes(scales[dim], {"_Netcdf4Dimid": np.int32(number)})
     for made, dims in written:
@@ -121,10 +121,6 @@ def _attributes(to: Any, values: Mapping[str, Any]) -> None:
         several = np.atleast_1d(value)
         texts = several.astype(h5py.string_dtype()) if several.dtype.kind == "U" else several
         to.attrs.create(name, value if isinstance(value, str) else texts)
-
-
-def _ordered_group() -> Any:
-    return _ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE))
 
 
 def _ordered(properties: Any) -> Any:
