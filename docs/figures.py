@@ -18,7 +18,7 @@ HERE = Path(__file__).parent / "theory"
 def contact_law() -> None:
     """Draw the pressure over the gap and its complementarity, in units of the width."""
     g = np.linspace(-1.5, 1.2, 400)
-    left, right = grid(2, columns=2, height=2.8, width=3.4)
+    left, right = grid(2, 2, (3.4, 2.8))
     left.plot(g, pressure(NUMPY, g, 1.0, 1.0), color=CONTROLLED, label="p, as it is computed")
     left.plot(g, np.maximum(-g, 0), color=DARK, linestyle="--", linewidth=1, label="εg without the smooth part")
     left.axvspan(-0.5, 0.5, color=PLAIN, alpha=0.15, linewidth=0)
@@ -38,7 +38,7 @@ def extrapolation() -> None:
     """Draw how two meshes with their own estimates tell the limit, for an error h^1.5 of which e sees 0.65."""
     from matplotlib.ticker import NullLocator
 
-    (ax,) = grid(1, columns=1, height=3.0, width=4.6)
+    (ax,) = grid(1, 1, (4.6, 3.0))
     h, order, seen = np.array([1.0, 0.5]), 1.5, 0.65
     exact = 1.0
     coarse = exact - 0.2 * h**order

@@ -24,6 +24,11 @@ def number(value: float | None, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):,.10g}".replace("-", "−")
 
 
+def power_of_ten(power: int) -> str:
+    """Write a power of ten: 10⁻³."""
+    return f"10{str(power).translate(_SUPERSCRIPTS)}"
+
+
 def places(error: float) -> int:
     """Return to how many decimal places an error is written, by the rule of the Particle Data Group.
 
@@ -119,4 +124,4 @@ def _power(value: float) -> int:
 
 
 def _scaled(text: str, power: int) -> str:
-    return f"{text} × 10{str(power).translate(_SUPERSCRIPTS)}".replace("-", "−")
+    return f"{text} × {power_of_ten(power)}".replace("-", "−")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.readable import SIZES, is_path, scale, spoken
+from forward.words import number, power_of_ten
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
 LOW, HIGH = "#0b6bb8", "#d1622b"
 MANY_POINTS = 3000
+LEGEND = 0.35  # inches that a legend below all panels takes
 COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
 
 
@@ -77,23 +79,49 @@ def in_fitting_units(figure: Any) -> None:
 
     Axes stay in SI units, so that lines can be added; only what is written beside them changes.
     """
-    from matplotlib.ticker import FixedLocator
+    from matplotlib.ticker import FixedLocator, LogFormatterSciNotation, StrMethodFormatter
 
-    for axis in (
-        one for ax in figure.axes for one in (ax.xaxis, ax.yaxis, *([ax.zaxis] if hasattr(ax, "zaxis") else []))
-    ):
+    for axis in (one for ax in figure.axes for one in (ax.xaxis, ax.yaxis)):
+        if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatterSciNotation):
+            axis.set_major_formatter(_of_powers())
+            axis.set_minor_formatter(_of_powers())
         found = re.search(r"\(([^()]+)\)$", axis.get_label_text())
-        if found is None or found[1] not in SIZES or axis.get_scale() != "linear":
+        plain = isinstance(axis.get_major_formatter(), StrMethodFormatter)  # of a logarithmic axis, without powers
+        if found is None or found[1] not in SIZES or (axis.get_scale() != "linear" and not plain):
             continue
         one, name = scale(float(np.abs(axis.get_view_interval()).max()), found[1])
         if isinstance(axis.get_major_locator(), FixedLocator):
             continue
         axis.set_label_text(axis.get_label_text()[: found.start()] + f"({name})")
-        axis.set_major_formatter(_ticks(one))
+        axis.set_major_formatter(_plain(one) if plain else _ticks(one))
         other = axis.axes.yaxis
         if axis is axis.axes.xaxis and other.get_label_text().endswith(f"(1/{found[1]})"):  # a density over it
             other.set_label_text(other.get_label_text().removesuffix(f"(1/{found[1]})") + f"(1/{name})")
             other.set_major_formatter(_ticks(1 / one))
+
+
+def _of_powers() -> Any:
+    """Return a formatter of logarithmic ticks in plain letters: formulas would be set by a parser of their own."""
+    from matplotlib.ticker import LogFormatter
+
+    class Powers(LogFormatter):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            if not super().__call__(x, pos):  # which ticks have room for a label
+                return ""
+            power = int(np.floor(np.log10(x) + 1e-9))
+            first = round(x / 10.0**power, 6)
+            if power in (0, 1):
+                return f"{x:.6g}"
+            return power_of_ten(power) if first == 1 else f"{first:g} × {power_of_ten(power)}"
+
+    return Powers()
+
+
+def _plain(one: float) -> Any:
+    """Return a formatter of logarithmic ticks in a unit, as numbers."""
+    from matplotlib.ticker import FuncFormatter
+
+    return FuncFormatter(lambda x, _: number(x / one))
 
 
 def _ticks(one: float) -> Any:
@@ -137,15 +165,38 @@ def axes(height: float = 3.2, width: float = 5.4) -> Axes:
     return ax
 
 
-def grid(count: int, columns: int, height: float = 3.0, width: float = 2.8) -> list[Axes]:
-    """Return axes side by side on a new figure as from `axes`; height and width (inches) are those of each."""
+def grid(
+    count: int,
+    columns: int,
+    size: tuple[float, float] = (2.8, 3.0),
+    inside: tuple[float, float, float, float] = (0.65, 0.5, 0.15, 0.3),
+    below: float = 0.0,
+) -> list[Axes]:
+    """Return axes side by side on a new figure; all lengths are inches.
+
+    Their places are given by hand: a layout that measures every label takes longer than to draw the picture.
+
+    Parameters
+    ----------
+    count, columns
+        Number of panels, and of those in a row.
+    size
+        Width and height of each panel.
+    inside
+        What its labels take, within it: to the left, below, to the right, above.
+    below
+        Height that is left free under all of them, for a legend.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    rows, (width, height), (left, bottom, right, top) = -(-count // columns), size, inside
+    whole = width * columns, height * rows + below
+    figure = Figure(figsize=whole)
     FigureCanvasAgg(figure)
-    return [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    places = [(width * (i % columns) + left, whole[1] - height * (i // columns + 1) + bottom) for i in range(count)]
+    extent = (width - left - right) / whole[0], (height - bottom - top) / whole[1]
+    return [figure.add_axes((x / whole[0], y / whole[1], *extent)) for x, y in places]
 
 
 def quantity(dataset: xr.Dataset, output: str) -> str:

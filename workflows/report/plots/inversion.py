@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.readable import size
 from forward.words import named, number
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span, text_of
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LEGEND, PLAIN, axes, grid, span, text_of
 from workflows.report.plots.pairs import pairs
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ CURVE, PRIOR = 160, 200  # points of curves
 PAIRED = 6  # parameters that are drawn in pairs
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
+AROUND_SLICE = 0.65, 0.15, 0.15, 0.3  # inches: to the left, below (its colours take of it what they need), right, above
+AROUND_DENSITY = 0.15, 0.6, 0.15, 0.25
 SEEN = 1.0  # λ above which the data say more about a direction than the prior
 Density = tuple[FloatArray, FloatArray]
 _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
@@ -96,7 +98,7 @@ def panels(one: xr.Dataset) -> dict[str, FloatArray]:
 
 def left_of_prior(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw on a plane the standard deviation over the prior's: 1 where the data say nothing."""
-    (ax,) = grid(1, columns=1, width=4.5)
+    (ax,) = grid(1, 1, (4.5, 3.0), AROUND_SLICE)
     std, prior = (one[name].to_numpy() for name in ("stiffness_std", "stiffness_prior_std"))
     left = np.divide(std, prior, out=np.ones_like(std), where=prior > 0)
     _draw(ax, cut, left, "standard deviation over the prior's", "plasma", (0.0, 1.0))
@@ -109,7 +111,7 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
     shown = [values for name, values in drawn.items() if "deviation" not in name]
     ends = min(float(v.min()) for v in shown), max(float(v.max()) for v in shown)
     widest = max(float(values.max()) for name, values in drawn.items() if "deviation" in name)
-    found = grid(len(drawn), columns=2)
+    found = grid(len(drawn), 2, (2.9, 3.3), AROUND_SLICE)
     for ax, (name, values) in zip(found, drawn.items(), strict=True):
         spread = "deviation" in name
         limits = (0.0, widest) if spread else ends
@@ -120,7 +122,7 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
 def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw directions of a field on a plane."""
     shown = [i for i, n in enumerate(one["shown_number"].to_numpy()) if n >= 0]
-    found = grid(len(shown), columns=4, height=2.7, width=2.1)
+    found = grid(len(shown), 4, (2.1, 2.7), AROUND_SLICE)
     for ax, i in zip(found, shown, strict=True):
         values = one["direction_stiffness"].isel(shown=i).to_numpy()
         n = int(one["shown_number"][i])
@@ -129,6 +131,7 @@ def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
         _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
     for part in found[0].figure.axes:
         part.tick_params(labelsize="x-small")
+        part.locator_params(axis="x", nbins=2)
     return found[0]
 
 
@@ -137,7 +140,7 @@ def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
     drawn = {str(case): one["alone_stiffness_std"].sel(case=case).to_numpy() for case in one.case.values}
     drawn["all together"] = one["stiffness_std"].to_numpy()
     widest = float(one["stiffness_prior_std"].max())
-    found = grid(len(drawn), columns=2)
+    found = grid(len(drawn), 2, (2.9, 3.3), AROUND_SLICE)
     for ax, (name, values) in zip(found, drawn.items(), strict=True):
         _draw(ax, cut, values, name, "plasma", (0.0, widest))
     return found[0]
@@ -166,7 +169,7 @@ def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, limi
     ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(3))
-    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9)
+    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9, pad=0.22, fraction=0.2, aspect=15)
     bar.ax.xaxis.set_major_locator(MaxNLocator(4))
 
 
@@ -205,7 +208,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
     names = [str(one.parameter.values[i]) for i in chosen]
-    found = grid(2 * len(names), columns=4 if len(names) > 1 else 2, height=2.0, width=2.1)
+    found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, LEGEND)
     for close, whole, name in zip(found[::2], found[1::2], names, strict=True):
         of = one.sel(parameter=name)
         draws = of["draw"].to_numpy()
@@ -307,7 +310,7 @@ def _legend(found: list[Axes]) -> None:
     figure = found[0].get_figure(root=True)
     assert figure is not None
     columns = 4 if figure.get_figwidth() > 5 else 2
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small", frameon=False)
+    figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize="small", frameon=False)
 
 
 def node_marginals(one: xr.Dataset) -> Axes:
@@ -316,7 +319,7 @@ def node_marginals(one: xr.Dataset) -> Axes:
     before = one["stiffness_prior_std"].to_numpy()
     centre = float(one["prior_mean"][0])
     nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
-    found = grid(len(nodes), columns=len(nodes), height=2.6, width=2.2)
+    found = grid(len(nodes), len(nodes), (2.2, 2.2), AROUND_DENSITY, LEGEND)
     for ax, node in zip(found, nodes, strict=True):
         x = np.linspace(*_span(np.zeros(0), mean[node], std[node], float(one["stiffness_true"][node])), 300)
         ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)

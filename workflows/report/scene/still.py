@@ -10,10 +10,12 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import scale
 from workflows.report.plots.figure import png_of
+from workflows.report.plots.view import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
 from workflows.results.level import IntArray, crossing, tetrahedra
 
 SIZE = (7.2, 4.8)  # inches
+PLACE, BAR = (0.01, 0.01, 0.84, 0.98), (0.86, 0.15, 0.025, 0.7)  # left, bottom, width and height, of the picture
 DPI = 110
 LIGHT = np.array([0.25, 0.5, 0.83])  # from the viewer
 LEAST = 0.6  # brightness of a face that looks away from it
@@ -29,8 +31,8 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=SIZE, layout="constrained")
-    ax = figure.add_subplot()
+    figure = Figure(figsize=SIZE)
+    ax = figure.add_axes(PLACE)
     view, skin = looking(scene.up), scene.skin
     one, unit = scale(float(np.nanmax(np.abs(quantity.values), initial=0.0)), quantity.unit)
     colours, norm = _colours(quantity, one)
@@ -75,7 +77,7 @@ def still(scene: Scene, quantity: Quantity) -> bytes:
     margin = 0.03 * (high - low).max()
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     ax.axis("off")
-    bar = figure.colorbar(mpl.cm.ScalarMappable(norm, colours), ax=ax, shrink=0.7, pad=0.02)
+    bar = figure.colorbar(mpl.cm.ScalarMappable(norm, colours), cax=figure.add_axes(BAR))
     bar.set_label((quantity.name + ("" if unit == "1" else f" ({unit})")).replace("$", r"\$"), fontsize=8)
     bar.ax.tick_params(labelsize=8)
     if quantity.names:
@@ -126,13 +128,3 @@ def _faces(
 
 def _far_first(layer: Sequence[tuple[FloatArray, FloatArray]]) -> IntArray:
     return np.argsort(np.concatenate([corners[:, :, 2].mean(axis=1) for corners, _ in layer]), kind="stable")
-
-
-def looking(up: FloatArray) -> FloatArray:
-    """Return the directions (3, 3) to the right, up and towards the viewer, who is in front, to the right and above."""
-    right = np.eye(3)[1 if up[0] else 0]
-    towards = np.cross(right, up) + 0.6 * right + 0.4 * up
-    towards /= np.linalg.norm(towards)
-    side = np.cross(up, towards)
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(towards, side), towards])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
-from forward.words import duration, number, with_error
+from forward.words import duration, number, power_of_ten, with_error
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
@@ -382,7 +382,7 @@ def selection(results: Results) -> Card:
 
 def _odds(ln_B: float) -> str:
     if ln_B > 13:
-        return f"10{str(int(ln_B / np.log(10))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))} to 1"
+        return f"{power_of_ten(int(ln_B / np.log(10)))} to 1"
     return f"{number(float(np.exp(ln_B)), 2)} to 1"
 
 
