@@ -44,6 +44,12 @@ def completed(blocks: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**blocks, "method": {**method, "samples": most}}
 
 
+def most(study: Study) -> int:
+    """Return how many solves there may be, by accuracy.solves or by the method's own number of samples."""
+    samples = getattr(study.method, "samples", None)
+    return min(study.accuracy.solves, samples or study.accuracy.solves)
+
+
 def goal(study: Study) -> Goal:
     """Return what the tolerance asks of estimates, before anything is known of the mesh."""
     from uq.accuracy.goal import Goal
@@ -126,11 +132,15 @@ def findings(study: Study) -> Iterator[Finding]:
 def plan(study: Study) -> Iterator[str]:
     """Say what is held, and what is decided by it."""
     accuracy = study.accuracy
-    chosen = "the method, the" if study.method.kind == AUTOMATIC else "the"
-    mesh = "and the mesh " if study.estimates else ""
+    parts = [
+        *(["the method"] if study.method.kind == AUTOMATIC else []),
+        f"the number of solves (up to {most(study):,})",
+    ]
+    parts += ["the mesh"] if study.estimates else []
     yield f"tolerance   {accuracy.tolerance:g} of every mean and standard deviation, all errors together, at 95 %"
-    yield f"            {chosen} number of solves (up to {accuracy.solves:,}) {mesh}follow from it"
+    listed = " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
+    yield f"            {listed} follow{'s' if len(parts) == 1 else ''} from it"
     if study.estimates:
-        most = f"accuracy.memory = {accuracy.memory:,.0f} MiB for each group of ranks"
-        yield f"            the mesh {refinement(study)[1]}, up to {most}"
+        limit = f"accuracy.memory = {accuracy.memory:,.0f} MiB for each group of ranks"
+        yield f"            the mesh {refinement(study)[1]}, up to {limit}"
         yield "            times and memory are those of the given one"

@@ -21,6 +21,7 @@ from uq.surrogates.linearisation import linearise
 from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance import Found, doubts, history
 from workflows.studies.tolerance_asked import goal as asked
+from workflows.studies.tolerance_asked import most
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -198,12 +199,17 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
     taken = ", ".join(f"{source} {100 * shares[source]:.2g} %" for source in SOURCES[:-1] if shares[source] > 0)
     if told["kept"]:
         return
-    text = (
-        f"accuracy.tolerance = {told['tolerance']:g} is not reached: {of} is known to {told['reached']:.2g} "
-        f"(of the tolerance: {taken})."
-    )
+    reached = f"{of} is known to {told['reached']:.2g}"
+    asked_for = f"accuracy.tolerance = {told['tolerance']:g}"
+    text = f"{asked_for} is not reached: {reached} (of the tolerance: {taken})."
     if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
-        why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else " The error of the mesh is not known."
+        if told["mesh"]["tried"]:
+            why = f" {told['reasons'][0]}"
+        else:
+            text, why = f"{asked_for} is not reached.", f" The error of the mesh is not known; but for it, {reached}."
     else:
-        why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."
+        limits = f"accuracy.solves = {study.accuracy.solves:,}"
+        if most(study) < study.accuracy.solves:
+            limits += f" and method.samples = {most(study):,}"
+        why = f" More solves than {limits} would be needed."
     yield Finding("error", text + why)  # a script that asked for it would go on with less

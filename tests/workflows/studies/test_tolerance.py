@@ -56,7 +56,7 @@ def test_a_method_that_is_given_is_kept(method, samples):
     study = load(TINY, [f"method={method}", "accuracy={tolerance=1e-2, solves=500}"])
     assert study.method.samples == samples
     assert parse(document(study)) == study
-    assert any("up to 500" in line for line in plan(study))
+    assert any(f"up to {samples}" in line for line in plan(study))
 
 
 @pytest.mark.unit
@@ -396,6 +396,20 @@ def test_too_few_solves_are_said(tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert not summary["accuracy"]["kept"]
     assert any("accuracy.solves = 16" in one["text"] for one in summary["findings"])
+
+
+@pytest.mark.unit
+def test_a_number_of_samples_of_the_method_is_the_limit_that_is_named(tmp_path):
+    study = without_method(1e-9, solves=100)
+    wide = {"kind": "uniform", "lower": 1e5, "upper": 1e6}
+    blocks = {"parameters": document(study)["parameters"] | {"E": wide}, "method": {"kind": "chaos", "samples": 8}}
+    found = parse(document(study) | blocks)
+    assert any("the number of solves (up to 8)" in line for line in plan(found))
+    found.run(tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert any(
+        "More solves than accuracy.solves = 100 and method.samples = 8" in one["text"] for one in summary["findings"]
+    )
 
 
 @pytest.mark.unit
