@@ -36,14 +36,19 @@ POINTS, LOCKSTEP = 20, 48
 
 
 def main(options: Sequence[str] = ()) -> None:
-    """Print a table for each size; `--modes=40` for one of them, `--more=320` for a larger larger one, `--organ`."""
+    """Print a table for each size; `--modes=40` for one of them, `--more=320` for a larger larger one, `--organ`.
+
+    `--snapshots=40`, `--unseen=50` and `--cubature=1e-3` too are those of the method; with `--keep=FOLDER` a model that
+    is there already is taken.
+    """
     name = "organ" if "--organ" in options else "slab"
-    sizes = [int(one.removeprefix("--modes=")) for one in options if one.startswith("--modes=")] or MODES[name]
+    given = dict(one[2:].split("=", 1) for one in options if "=" in one)
+    sizes = [int(given["modes"])] if "modes" in given else MODES[name]
+    others = [f"method.{key}={value}" for key, value in given.items() if key not in {"modes", "keep"}]
     for modes in sizes:
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / name
-            more = [f"method.more={one.removeprefix('--more=')}" for one in options if one.startswith("--more=")]
-            sets = [f"method.modes={modes}", *more, *(OF_ORGAN if name == "organ" else ())]
+            out = Path(given.get("keep", folder)) / f"{name}-{modes}"
+            sets = [f"method.modes={modes}", *(OF_ORGAN if name == "organ" else ()), *others]
             if name == "organ" and "--mixed" not in options:
                 sets.append("model.formulation=displacement")
             changes = [part for one in sets for part in ("--set", one)]

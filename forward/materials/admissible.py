@@ -9,6 +9,7 @@ chains of a Gent material have a positive length). Stability at large strains is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -183,15 +184,16 @@ class Admission:
         InadmissibleError
             With the number and the reason.
         """
-        for path, value in zip(self._parameters, values, strict=True):
+        given = dict(zip(self._parameters, np.asarray(values, dtype=float).tolist(), strict=True))
+        for path, value in given.items():
             scalar = self._scalars.get(path)
             if scalar is not None:
-                objection = scalar.objection(float(value))
+                objection = scalar.objection(value)
             else:
-                objection = None if np.isfinite(value) else "input should be a finite number"
+                objection = None if math.isfinite(value) else "input should be a finite number"
             if objection is not None:
                 message = f"{path} = {value:.6g} is not admissible: {objection}"
                 raise InadmissibleError(message)
-        objection = self._materials.objection(dict(zip(self._parameters, map(float, values), strict=True)))
+        objection = self._materials.objection(given)
         if objection is not None:
             raise InadmissibleError(objection)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from forward.model import FloatArray
 from forward.reduced.data import Points, Written
@@ -13,17 +14,28 @@ from forward.reduced.kernels import Kernel
 
 
 class Integrand:
-    """An integrand at points, and its derivatives by what it takes."""
+    """An integrand at points, and its derivatives by what it takes.
 
-    def __init__(self, written: Written, points: Points, numbers: int) -> None:
-        self._written, self.points = written, points
+    Parameters
+    ----------
+    written, points
+        What it is, and where.
+    numbers
+        How many numbers it takes.
+    real
+        In what precision it is evaluated.
+    """
+
+    def __init__(self, written: Written, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:
+        self._written, self.points, self.real = written, points, real
         m, n, count = points.fields.shape
         self.components, self._varying = m, m + len(points.given) + len(points.logs)
-        self.fields = points.fields
-        self._flat = points.fields.reshape(m * n, count)
-        self.weighted = np.ascontiguousarray((points.weights[:, None] * points.fields).reshape(m * n, count))
+        self.fields = points.fields.astype(real, copy=False)
+        self._flat = self.fields.reshape(m * n, count)
+        weighted = (points.weights[:, None] * points.fields).reshape(m * n, count)
+        self.weighted = np.ascontiguousarray(weighted, real)
         self._numbers = numbers
-        self._inputs = np.empty((self._varying, n))  # filled again and again: what is given never changes
+        self._inputs = np.empty((self._varying, n), real)  # filled again and again: what is given never changes
         self._inputs[m : m + len(points.given)] = points.given
 
     def _derived(self, along: Sequence[int]) -> Kernel:
@@ -31,7 +43,7 @@ class Integrand:
         graph, outputs = self._written.tape.graph()
         slopes = [graph.tangent(outputs, i) for i in along]
         by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
-        return Kernel(graph.tape([*outputs, *by_output]), self._varying)
+        return Kernel(graph.tape([*outputs, *by_output]), self._varying, self.real)
 
     @cached_property
     def _values(self) -> Kernel:
@@ -59,7 +71,7 @@ class Integrand:
         The array holds until this or `without_state` is called again.
         """
         found = self.without_state(coefficients)
-        np.dot(self._flat, c, out=found[: self.components].reshape(-1))
+        np.dot(self._flat, c.astype(self.real, copy=False), out=found[: self.components].reshape(-1))
         return found
 
     def without_state(self, coefficients: Sequence[FloatArray]) -> FloatArray:
@@ -77,7 +89,7 @@ class Integrand:
 
     def states(self, c: FloatArray) -> FloatArray:
         """Return the components (s, m, n) of the states at coordinates (s, N) of several samples."""
-        return np.asarray((c @ self._flat.T).reshape(len(c), self.components, -1))
+        return np.asarray((c.astype(self.real, copy=False) @ self._flat.T).reshape(len(c), self.components, -1))
 
     def values(self, inputs: FloatArray, numbers: FloatArray, out: FloatArray | None = None) -> FloatArray:
         """Return its outputs (k, n), in an array that is given or a new one."""
@@ -93,7 +105,7 @@ class Integrand:
     ) -> FloatArray:
         """Return its outputs (s, k, n) at coordinates (s, N), coefficients and numbers of several samples."""
         inputs, first = self._inputs, self._varying - len(self.points.logs)
-        found = np.empty((len(c), self.size, inputs.shape[1]))
+        found = np.empty((len(c), self.size, inputs.shape[1]), self.real)
         for out, of_sample, components, log in zip(
             found, numbers, self.states(c), self.logs(coefficients), strict=True
         ):

@@ -10,6 +10,7 @@ import ctypes
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from forward.model import FloatArray
 from forward.native import library
@@ -18,11 +19,7 @@ from forward.reduced.graph import CODES, SELECT, Tape
 _INFIX = {"add": "+", "mul": "*", "div": "/"}
 _NAMES = {"ln": "log", "abs": "fabs"}
 
-# Several points in the lanes of a processor at once, where the library of C has such functions.
-_IN_LANES = [
-    f'__attribute__((simd("notinbranch"))) double {name};'
-    for name in ("log(double)", "exp(double)", "pow(double, double)")
-]
+_REALS = {8: ("double", ""), 4: ("float", "f")}  # of so many bytes: in C, and how functions and constants of it end
 
 _APART = "#pragma GCC ivdep"  # what one point writes no other reads
 
@@ -53,22 +50,24 @@ class Kernel:
         The operations.
     varying
         How many of its inputs vary.
+    real
+        In what precision it calculates.
     """
 
-    def __init__(self, tape: Tape, varying: int) -> None:
-        self.tape, self._varying = tape, varying
+    def __init__(self, tape: Tape, varying: int, real: DTypeLike = np.float64) -> None:
+        self.tape, self._varying, self._real = tape, varying, np.dtype(real)
         self.size = len(tape.outputs)
-        self._function = _compiled(_source(tape, varying), "at_points")
+        self._function = _compiled(*_source(tape, varying, *_REALS[self._real.itemsize]), "at_points")
 
     def __call__(self, points: FloatArray, numbers: FloatArray, out: FloatArray | None = None) -> FloatArray:
         """Return the outputs (m, n) at points (varying, n) and numbers (the other inputs,), in `out` if it is given."""
         n = points.shape[1]
-        out = np.empty((self.size, n)) if out is None else out
+        out = np.empty((self.size, n), self._real) if out is None else out
         if self._function is None:
             for row, one in zip(out, self.tape([*points, *numbers.tolist()]), strict=True):
                 row[:] = one
             return out
-        points, numbers = np.ascontiguousarray(points), np.ascontiguousarray(numbers)
+        points, numbers = (np.ascontiguousarray(one, self._real) for one in (points, numbers))
         self._function(n, points.ctypes.data, numbers.ctypes.data, out.ctypes.data)
         return out
 
@@ -89,24 +88,31 @@ _found: dict[str, Any] = {}
 
 def _spread() -> Any | None:
     if "spread" not in _found:
-        _found["spread"] = _compiled(_SPREAD, "spread")
+        _found["spread"] = _compiled(_SPREAD, "", "spread")
     return _found["spread"]
 
 
-def _source(tape: Tape, varying: int) -> str:
-    """Return C for a tape."""
+def _in_lanes(real: str, end: str) -> str:
+    """Declare functions for several points in the lanes of a processor at once; not every library of C has them."""
+    functions = (f"log{end}({real})", f"exp{end}({real})", f"pow{end}({real}, {real})")
+    return "".join(f'__attribute__((simd("notinbranch"))) {real} {one};\n' for one in functions)
+
+
+def _source(tape: Tape, varying: int, real: str, end: str) -> tuple[str, str]:
+    """Return C for a tape, and what it can do without."""
     first = tape.inputs + len(tape.constants)
     moving = {*range(varying)}  # nodes that vary
     names = [f"p[{i} * n + q]" if i < varying else f"c[{i - varying}]" for i in range(tape.inputs)]
     names += [
-        f"({value!r})" if np.isfinite(value) else f"({'-' * (value < 0)}INFINITY)" for value in tape.constants.tolist()
+        f"({value!r}{end})" if np.isfinite(value) else f"({'-' * (value < 0)}INFINITY)"
+        for value in tape.constants.tolist()
     ]
     outside: list[str] = []
     inside: list[str] = []
     used = {int(i) for row in tape.arguments for i in row if 0 <= i < varying}
     used |= {int(i) for i in tape.outputs if i < varying}
     for i in sorted(used):
-        inside.append(f"const double x{i} = {names[i]};")
+        inside.append(f"const {real} x{i} = {names[i]};")
         names[i] = f"x{i}"
     for k, (code, row) in enumerate(zip(tape.codes.tolist(), tape.arguments.tolist(), strict=True)):
         given = [i for i in row if i >= 0]
@@ -117,17 +123,18 @@ def _source(tape: Tape, varying: int) -> str:
         elif name in _INFIX:
             value = f"{text[0]} {_INFIX[name]} {text[1]}"
         else:
-            value = f"{_NAMES.get(name, name)}({', '.join(text)})"
+            value = f"{_NAMES.get(name, name)}{end}({', '.join(text)})"
         varies = any(i in moving for i in given)
         if varies:
             moving.add(first + k)
-        (inside if varies else outside).append(f"const double t{k} = {value};")
+        (inside if varies else outside).append(f"const {real} t{k} = {value};")
         names.append(f"t{k}")
     inside += [f"out[{m} * n + q] = {names[i]};" for m, i in enumerate(tape.outputs.tolist())]
-    head = "void at_points(long n, const double *restrict p, const double *restrict c, double *restrict out)"
+    head = f"void at_points(long n, const {real} *restrict p, const {real} *restrict c, {real} *restrict out)"
+    in_lanes = _in_lanes(real, end)
     lines = [
         "#include <math.h>",
-        *_IN_LANES,
+        *in_lanes.splitlines(),
         head,
         "{",
         *outside,
@@ -137,12 +144,12 @@ def _source(tape: Tape, varying: int) -> str:
         "}",
         "}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n", in_lanes
 
 
-def _compiled(source: str, name: str) -> Any | None:
-    """Return a function of C; None without a compiler, or if it fails."""
-    found = library(source, against=("-lmvec", "-lm")) or library(source.replace("\n".join(_IN_LANES), ""))
+def _compiled(source: str, spare: str, name: str) -> Any | None:
+    """Return a function of C, if need be without a part of it; None without a compiler, or if it fails."""
+    found = library(source, against=("-lmvec", "-lm")) or library(source.replace(spare, ""))
     if found is None:
         return None
     function = getattr(found, name)

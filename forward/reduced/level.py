@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from forward.model import FloatArray
 from forward.reduced.at_points import Integrand
@@ -30,15 +31,21 @@ class Level:
         Which of its levels.
     which
         Numbers (m,) of the outputs; None for all.
+    real
+        In what precision integrands are evaluated.
     """
 
-    def __init__(self, data: ReducedData, level: LevelData, which: Iterable[int] | None = None) -> None:
+    def __init__(
+        self, data: ReducedData, level: LevelData, which: Iterable[int] | None = None, real: DTypeLike = np.float64
+    ) -> None:
         self.integrals = level.integrals
         self.data, self.modes = data, level.modes
         self.before = data.before
         self.count = self.before + level.modes
         p = len(data.numbers)
-        self.works = [Integrand(written, points, p) for written, points in zip(data.works, level.works, strict=True)]
+        self.real = real
+        pairs = zip(data.works, level.works, strict=True)
+        self.works = [Integrand(written, points, p, real) for written, points in pairs]
         outputs = data.outputs if which is None else [data.outputs[i] for i in which]
         self._outputs = [_of_output(output, self, p) for output in outputs]
         self.free = slice(self.before, self.count)
@@ -218,7 +225,8 @@ class _Largest(_Output):
     def _rows(self) -> FloatArray:
         axes = range(3) if self.output.which == LENGTH else (self.output.which,)
         n = 3 * len(self.level.data.places)
-        return np.ascontiguousarray([self.level.data.fields[: self.level.count, axis:n:3].T for axis in axes])
+        level = self.level
+        return np.ascontiguousarray([level.data.fields[: level.count, axis:n:3].T for axis in axes], level.real)
 
     def _there(self, c: FloatArray) -> tuple[int, FloatArray]:
         u = self._rows @ c
@@ -230,6 +238,7 @@ class _Largest(_Output):
         return float(np.linalg.norm(self._there(c)[1]))
 
     def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        c = c.astype(self.level.real, copy=False)
         squares = np.sum([(c @ rows.T) ** 2 for rows in self._rows], axis=0)
         return np.asarray(np.sqrt(squares.max(axis=1)))
 
@@ -248,7 +257,7 @@ class _OfDensity(_Output):
     def __init__(self, output: Output, level: Level, points: Points, numbers: int) -> None:
         super().__init__(output, level)
         assert output.density is not None
-        self._density = Integrand(output.density, points, numbers)
+        self._density = Integrand(output.density, points, numbers, level.real)
 
     def _weights(self, values: FloatArray) -> FloatArray:
         raise NotImplementedError

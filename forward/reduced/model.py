@@ -20,7 +20,7 @@ from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, S
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
-from forward.reduced.together import TOGETHER, TOLERANCE, equilibria
+from forward.reduced.together import SINGLE, TOGETHER, TOLERANCE, equilibria
 
 
 class Estimate(NamedTuple):
@@ -118,6 +118,13 @@ class ReducedModel(OneByOne):
             yield from self._solve_together(points[i : i + self.together])
 
     @cached_property
+    def _together(self) -> Level:
+        """The equations in the precision that lockstep needs."""
+        if self._unbalanced < SINGLE:
+            return self.level
+        return Level(self.data, self.data.levels[-1 if self.alone else 0], self.which, np.float32)
+
+    @cached_property
     def _inverse(self) -> FloatArray:
         """Inverse (n, n) of the stiffness at the equilibrium of the nominal parameters."""
         free = self.level.free
@@ -132,9 +139,9 @@ class ReducedModel(OneByOne):
                 refused[i] = error
         good = [i for i in range(len(points)) if i not in refused]
         starts = np.array([self.first(wholes[i]) for i in good]).reshape(len(good), self.level.modes)
-        found, iterations = equilibria(self.level, wholes[good], starts, self._inverse, self._unbalanced)
+        found, iterations = equilibria(self._together, wholes[good], starts, self._inverse, self._unbalanced)
         ok = np.isfinite(found).all(axis=1)
-        outputs = iter(self.level.outputs_together(found[ok], wholes[good][ok]))
+        outputs = iter(self._together.outputs_together(found[ok], wholes[good][ok]))
         of = {i: (c, Work(residuals=n)) for i, c, n, fine in zip(good, found, iterations, ok, strict=True) if fine}
         for i, point in enumerate(points):
             if i in refused:

@@ -2,7 +2,8 @@
 
 Corrections u ← u − K̄⁻¹R(u) by the stiffness of one equilibrium, with Anderson mixing: about ten residuals in place of
 four assemblies with factorisations. What is read from memory, the values of the modes at the points, is read once for
-all samples.
+all samples. Where more of the forces may be left than single precision leaves of them, that is what integrands are
+evaluated in.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ TOGETHER = 64  # samples
 WINDOW = 8  # differences that Anderson mixing keeps
 ITERATIONS = 40
 TOLERANCE = 1e-9  # of the forces, relative to what they would be if they did not cancel
+SINGLE = 1e-5  # from which on single precision is enough
 
 
 def equilibria(
@@ -122,7 +124,7 @@ class _Moving:
         self._work = work
         self._numbers = [level.numbers(point) for point in parameters]
         self._inputs = np.array([work.without_state(level.coefficients(point)).copy() for point in parameters])
-        self._acting = np.empty((len(parameters), work.size, self._inputs.shape[2]))
+        self._acting = np.empty((len(parameters), work.size, self._inputs.shape[2]), work.real)
 
     def forces(self, c: FloatArray, which: NDArray[np.int64]) -> FloatArray:
         """Return the forces (k, N) of the samples `which` (k,) at coordinates (k, N)."""

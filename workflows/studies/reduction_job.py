@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
 ENOUGH = 120  # modes of states that the larger model has besides then
-CANDIDATES = 8  # for each snapshot that is drawn where errors are large
+CANDIDATES = 32  # for each snapshot that is drawn where errors are large
+LOST = 4  # of so many snapshots that are drawn, one may be where the reduced model has no answer
+UNBALANCED = 1e-4  # forces that may be left at candidates
 UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
 TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be taken for the errors
@@ -162,21 +164,21 @@ class _Making:
         return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
 
     def _worst(self, data: ReducedData, candidates: FloatArray, few: int) -> FloatArray:
-        """Return the candidates (few, d) at which the estimated error of any output is largest."""
-        model = ReducedModel(data, data.parameters)
-        spread = np.array(data.about["spread"])
-        sizes = np.full(len(candidates), np.inf)  # where there is no reduced answer either
-        for i, point in enumerate(candidates):
-            try:
-                sizes[i] = np.nan_to_num(np.abs(model.reduced(point).estimate.outputs / spread).max(), nan=np.inf)
-            except SolveError:
-                continue
-        chosen = np.argsort(-sizes, kind="stable")[:few]
+        """Return the candidates (few, d) where the model and the larger one differ most, in any output."""
+        both = (
+            ReducedModel(data, data.parameters, alone=alone, tested=False, unbalanced=UNBALANCED)
+            for alone in (False, True)
+        )
+        outputs = [[_outputs(one, len(self._model.outputs)) for one in model.solve_many(candidates)] for model in both]
+        sizes = np.abs((np.array(outputs[1]) - np.array(outputs[0])) / np.array(data.about["spread"])).max(axis=1)
+        known = np.isfinite(sizes)
+        lost = np.flatnonzero(~known)[: few // LOST]
+        worst = np.argsort(np.where(known, -sizes, np.inf), kind="stable")[: min(few - len(lost), known.sum())]
         said = f"{len(data.snapshots)} snapshots, {data.about['modes']} modes, {data.about['points']} points"
-        finite = sizes[np.isfinite(sizes)]
-        if len(finite):
-            self._say(f"reduced: {said}; estimated errors up to {100 * finite.max():.2g} % of the spread of an output")
-        return candidates[np.sort(chosen)]
+        if known.any():
+            largest = 100 * sizes[known].max()
+            self._say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
+        return candidates[np.sort(np.concatenate([lost, worst]))]
 
     def _measured(self, data: ReducedData, reduction: Reduction) -> xr.Dataset:
         """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
@@ -247,6 +249,11 @@ class _Making:
                 f"{', '.join(off)}. Their sizes on these samples are what can be trusted."
             )
             add(found, Finding("warning", text))
+
+
+def _outputs(solution: Solution | SolveError, count: int) -> FloatArray:
+    """Return the outputs (count,) of a solution; NaN without one."""
+    return np.full(count, np.nan) if isinstance(solution, SolveError) else np.asarray(solution.outputs)
 
 
 def _of_gradients(names: list[str], gradients: FloatArray, places: FloatArray) -> dict[str, Any]:

@@ -60,6 +60,10 @@ def test_compiled_and_numpy_agree_also_for_what_is_the_same_at_all_points(monkey
     monkeypatch.setattr(kernels, "_compiled", lambda *_: None)
     by_numpy = Kernel(tape, 2)
     np.testing.assert_allclose(compiled(points, numbers), by_numpy(points, numbers), rtol=1e-14)
+    monkeypatch.undo()
+    single = Kernel(tape, 2, np.float32)(points, numbers)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, compiled(points, numbers), rtol=2e-6)
 
 
 def test_spread_is_a_product_at_every_point(monkeypatch):

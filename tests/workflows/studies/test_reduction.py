@@ -153,12 +153,15 @@ cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "re
 
 
 def test_the_model_and_its_nested_larger_one_are_cheap_models(folder):
+    few = [*SIZES[:2], *(part for one in ("unseen=0", "rounds=0", "modes=2") for part in ("--set", f"method.{one}"))]
+    reduced = ["reduce", folder / "body.toml", *few, "--out", folder / "few", "--output", folder / "few.npz"]
+    assert main([*map(str, reduced), "--quiet", "--no-report"]) == 0
     method = """
 [method]
 kind = "multifidelity"
 samples = 40
 control = "tangent"
-cheap = [{ kind = "reduced", file = "model.npz" }, { kind = "reduced", file = "model.npz", larger = true, cost = 0.5 }]
+cheap = [{ kind = "reduced", file = "few.npz" }, { kind = "reduced", file = "few.npz", larger = true, cost = 0.5 }]
 """
     (folder / "both.toml").write_text(BODY + method)
     assert main(["run", str(folder / "both.toml"), "--out", str(folder / "both"), "--quiet", "--no-report"]) == 0
@@ -166,7 +169,7 @@ cheap = [{ kind = "reduced", file = "model.npz" }, { kind = "reduced", file = "m
     assert list(found["fidelity"].values) == ["model", "reduced", "larger reduced"]
     assert 0 < float(found["fidelity_cost"][1]) < float(found["fidelity_cost"][2]) == 0.5
     left = 1 - found["fidelity_correlation"].values[:, 1:] ** 2
-    assert (left[:, 1] <= left[:, 0]).all()
+    assert (left[:, 1] < 0.1 * left[:, 0]).all()
     assert (left < 1e-2).all()
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 
