@@ -159,6 +159,11 @@ class SpecimenModel(OneByOne):
             ]
         return self._enriched_observations[degree]
 
+    def observed_of(self, fields: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return what is observed (n, k) of fields (k, U) of each case; of other outputs 0; collective."""
+        parts = zip(self.models, self.observations, fields, strict=True)
+        return [case.equations.total((B @ case.space.scatter(rows).T).T).T for case, B, rows in parts]
+
     @property
     def equations(self) -> Discretisation:
         """Those of the first case; all share the mesh."""

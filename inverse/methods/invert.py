@@ -24,16 +24,21 @@ class ByReduced(Settings):
     Parameters
     ----------
     file
-        What `tissuq reduce` has made of the body, over the priors.
+        What `tissuq reduce` has made of the body, over the priors; of a specimen, a file for each of its load cases.
     solves
         Draws of each posterior that are solved in full.
     digest
         Hash of the file, kept with results: another file of the same name is refused.
     """
 
-    file: str
+    file: str | dict[str, str]
     solves: Annotated[int, Field(ge=8)] = 24
-    digest: str | None = None
+    digest: str | dict[str, str] | None = None
+
+    @property
+    def files(self) -> str:
+        """The file, or all of them."""
+        return self.file if isinstance(self.file, str) else ", ".join(self.file.values())
 
 
 class Invert(MeshTreatment, Settings):
@@ -67,7 +72,8 @@ class Invert(MeshTreatment, Settings):
         Solves of an expansion of the outputs over the prior that all data sets share: they are then inverted with it,
         in about a second each, whatever a solve takes. By default every data set has solves of its own.
     reduced
-        A reduced model that searches and samples in place of the body: "FILE", or { file = "FILE", solves = 24 }. One
+        A reduced model that searches and samples in place of the body: "FILE", or { file = "FILE", solves = 24 }; of a
+        specimen one for each load case: { file = { shear = "FILE", compression = "FILE" } }. One
         full solve corrects it at the mode, others check the posterior at its draws and correct it further.
     mesh_check
         An older name: false is mesh_error = false.

@@ -105,8 +105,10 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
             blocks = blocks | {"method": {**blocks["method"], key: _beside(file, folder)}}
     reduced = method.get("reduced") if isinstance(method, Mapping) else None
     block = {"file": reduced} if isinstance(reduced, str) else reduced
-    if isinstance(block, Mapping) and isinstance(block.get("file"), str):
-        blocks = blocks | {"method": {**blocks["method"], "reduced": {**block, "file": _beside(block["file"], folder)}}}
+    if isinstance(block, Mapping) and isinstance(block.get("file"), str | Mapping):
+        blocks = blocks | {
+            "method": {**blocks["method"], "reduced": {**block, "file": _all_beside(block["file"], folder)}}
+        }
     blocks = _with_draws(blocks, folder)
     cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
     if isinstance(cheap, list):
@@ -120,6 +122,13 @@ def _beside(file: str, folder: Path) -> str:
     """Return the full path of a file beside a study, or in the working directory."""
     place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
     return str(place.resolve())
+
+
+def _all_beside(file: Any, folder: Path) -> Any:
+    """Return the full path of a file, or of each of several by name, as `_beside`."""
+    if isinstance(file, Mapping):
+        return {name: _all_beside(one, folder) for name, one in file.items()}
+    return _beside(file, folder) if isinstance(file, str) else file
 
 
 def _has(block: Any, key: str) -> bool:
@@ -233,8 +242,10 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """
     before, after = (dict(_leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
     for digest, file in _FILES.items():
-        if before.get(digest) == after.get(digest) is not None:
-            after |= {file: before[file]}
+        for place in [one for one in before if one == digest or one.startswith(f"{digest}.")]:
+            if before[place] == after.get(place):
+                own = file + place.removeprefix(digest)  # of one file, or of one of several
+                after |= {own: before[own]}
     places = [*before, *(place for place in after if place not in before)]
     return [
         f"{place}: {before.get(place, 'absent')} → {after.get(place, 'absent')}"

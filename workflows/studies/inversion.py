@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
@@ -19,7 +19,7 @@ from forward.settings import nearest
 from forward.specimen import Specimen
 from inverse.data.observations import distinct, files
 from inverse.data.table import DataError
-from inverse.methods.invert import Invert, names_of
+from inverse.methods.invert import ByReduced, Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
@@ -38,6 +38,7 @@ from workflows.studies.study import StudyKind, measures_outputs
 
 if TYPE_CHECKING:
     from forward.model import FloatArray
+    from forward.reduced.spec import Reduced
     from forward.spec import ModelSpec
     from inverse.data.observations import Components
     from inverse.data.shared_motion import SharedMotion
@@ -345,6 +346,23 @@ class Inversion(InversionStudy):
             f"the absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case).",
         )
 
+    @cached_property
+    def reduced(self) -> tuple[Reduced, ...]:
+        """The reduced models that stand for the load cases; none where the specimen is asked itself.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If a file cannot be used.
+        """
+        asked = self.method.reduced
+        if asked is None:
+            return ()
+        assert isinstance(asked.file, dict)
+        digests = asked.digest if isinstance(asked.digest, dict) else {}
+        made: Any = named("forward.reduced.spec:Reduced")
+        return tuple(made(file=asked.file[name], digest=digests.get(name)) for name in self.parts)
+
     @property
     def field(self) -> bool:
         """Whether values of a field at the vertices are what is unknown."""
@@ -419,6 +437,28 @@ class Inversion(InversionStudy):
             message = "data sets of a specimen are observed at places of their own, expected outputs of another model"
             yield ("method", "expansion"), message, self.method.expansion
         if self.method.reduced is not None:
-            message = "a specimen has no reduced model yet, expected outputs of a body"
-            yield ("method", "reduced"), message, self.method.reduced.file
+            yield from self._mistakes_of_reduced(self.method.reduced)
         yield from super()._mistakes()
+
+    def _mistakes_of_reduced(self, given: ByReduced) -> Iterator[Mistake]:
+        if self.field:
+            message = "a field of nodal values has no reduced model, expected few parameters, or the modes of a field"
+            yield ("method", "reduced"), message, given.files
+            return
+        if not isinstance(given.file, dict) or set(given.file) != set(self.parts):
+            example = ", ".join(f'{name} = "FILE"' for name in self.parts)
+            message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
+            yield ("method", "reduced", "file"), message, given.file
+            return
+        try:
+            found = dict(zip(self.parts, self.reduced, strict=True))
+        except ValidationError as error:
+            yield ("method", "reduced"), str(error.errors()[0]["msg"]), given.files
+            return
+        object.__setattr__(given, "digest", {name: one.digest for name, one in found.items()})
+        unknown = (*self.parameters, *self.model.coefficients)
+        for case in self.specimen.cases:
+            body = self.specimen.loaded(case)
+            known = {*body.scalars, *body.coefficients}
+            for said in found[case.name].differences(body, [path for path in unknown if path in known]):
+                yield ("method", "reduced", "file", case.name), said, given.file[case.name]

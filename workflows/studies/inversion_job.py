@@ -233,8 +233,9 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         solving.append(kept)
         data = study.measured(number)
         if reduced is not None:
-            by_reduced = named("inverse.methods.by_reduced:invert_by_reduced")
-            posterior: xr.Dataset = by_reduced(study.inputs, kept, reduced, data, method, errors, finer, ensemble.say)
+            _alone(shared)
+            cheap, by_reduced = reduced(observed), named("inverse.methods.by_reduced:invert_by_reduced")
+            posterior: xr.Dataset = by_reduced(study.inputs, kept, cheap, data, method, errors, finer, ensemble.say)
             return posterior
         return invert_by_group(
             study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say, shared
@@ -351,12 +352,36 @@ def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | No
     return Finer(None, why) if model is None else solved(model)
 
 
-def _reduced(study: InversionStudy) -> ForwardModel | None:
-    """Load the reduced model that stands for the body; None where the body is asked itself."""
-    if not isinstance(study, OutputInversion) or study.reduced is None:
+def _reduced(study: InversionStudy) -> Callable[[ForwardModel], ForwardModel] | None:
+    """Load what stands for a model with which data are compared; None where that is asked itself.
+
+    What it returns is collective over the ranks of that model.
+    """
+    if study.method.reduced is None:
         return None
-    found: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
-    return found
+    if isinstance(study, OutputInversion):
+        assert study.reduced is not None
+        body: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
+        return lambda observed: body
+    assert isinstance(study, Inversion)
+    bodies = [study.specimen.loaded(case) for case in study.specimen.cases]
+    acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
+    models = tuple(made.standing_for(*one) for made, *one in zip(study.reduced, bodies, acting, strict=True))
+    made = named("forward.reduced.specimen:ReducedSpecimen")
+    return lambda observed: cast("ForwardModel", made.of(observed, models))
+
+
+def _alone(shared: Shared | None) -> None:
+    """Refuse errors that data share: a reduced model would have to know what moved points do.
+
+    Raises
+    ------
+    SolveError
+        If there are any.
+    """
+    if shared is not None:
+        message = "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
+        raise SolveError(message)
 
 
 def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
@@ -366,6 +391,7 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
     there = made.finer(observed)
     recorders: dict[str, Recorder] = {}
     reduced = _reduced(study)
+    cheap = None if reduced is None else reduced(observed)
     others: dict[str, Callable[[], ForwardModel]] = {}
     model = None if there is None else there[0]
     if model is not None:
@@ -382,9 +408,10 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
         finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
         errors = study.data.errors
         shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
-        if reduced is not None:
+        if cheap is not None:
+            _alone(shared)
             by_reduced = named("inverse.methods.by_reduced:invert_by_reduced")
-            found = by_reduced(study.inputs, recorders["/"], reduced, data, study.method, errors, finer, say)
+            found = by_reduced(study.inputs, recorders["/"], cheap, data, study.method, errors, finer, say)
         else:
             full = recorders["/"]
             found = invert_by_all(study.inputs, full, data, study.method, made.look, errors, finer, say, shared)

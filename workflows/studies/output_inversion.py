@@ -246,6 +246,9 @@ class OutputInversion(InversionStudy):
         if self.method.expansion is not None:
             message = "stands for the body in place of a reduced model, expected one of both"
             yield ("method", "expansion"), message, self.method.expansion
+        if not isinstance(reduced.file, str):
+            yield ("method", "reduced", "file"), "a body has one reduced model, expected a file", reduced.files
+            return
         if self.model.kind != "hyperelastic":
             message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
             yield ("method", "reduced"), message, reduced.file

@@ -14,6 +14,7 @@ from forward.scalars import Mistake
 from forward.settings import Settings
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import Method
+from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.predictions import duration, times_of
 from workflows.studies.sampling import Study
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec
+    from forward.specimen import Specimen
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
 FILE = "reduced.npz"
 OF_DATA = ("data", "predict")  # blocks of an inversion that a reduced model does not depend on
+ALWAYS = {"name": "largest", "kind": "max-displacement"}  # output of a load case in which displacements are measured
 OTHER_METHOD = "method={ kind = 'reduce' }"  # an assignment that makes such a study of one that samples
 
 
@@ -55,6 +58,8 @@ class Reduce(Method):
 
     Parameters
     ----------
+    case
+        Which load case of a specimen is reduced, with those parameters that act in it.
     snapshots
         Solves of which it is made. Half of them fill the distribution evenly; the others are, round by round, those of
         many candidates at which the estimated error of any output is largest.
@@ -80,6 +85,7 @@ class Reduce(Method):
     """
 
     kind: Literal["reduce"] = "reduce"
+    case: str | None = None
     snapshots: Annotated[int, Field(ge=4)] = 96
     rounds: Annotated[int, Field(ge=0)] = 3
     modes: Annotated[int, Field(ge=1)] | None = None
@@ -105,6 +111,8 @@ class Reduce(Method):
         if spec.kind != "hyperelastic":
             yield ("model", "kind"), "only a body can be reduced, expected 'hyperelastic'", spec.kind
             return
+        if self.case is not None:
+            yield ("method", "case"), "a body has no load cases, expected none", self.case
         for said in named("forward.reduced.limits:mistakes")(spec):
             yield ("model",), said, spec.kind
 
@@ -131,7 +139,7 @@ class ReductionStudy(Study):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
         """Check the blocks; of an inversion, the priors are what counts, and what was measured does not."""
-        return cls.model_validate({name: block for name, block in blocks.items() if name not in OF_DATA})
+        return cls.model_validate(_of_case({name: one for name, one in blocks.items() if name not in OF_DATA}))
 
     @property
     def estimates(self) -> int:
@@ -167,3 +175,33 @@ class ReductionStudy(Study):
     def summary(self, job: Job) -> dict[str, Any]:
         """Return how large it is, its errors, and where it is."""
         return {"reduced": job.told}  # type: ignore[attr-defined]
+
+
+def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
+    """Return the study of one load case of a specimen, if that is what is to be reduced.
+
+    Raises
+    ------
+    StudyError
+        If the case is not one of the specimen's.
+    """
+    model, method = blocks.get("model"), blocks.get("method")
+    if not isinstance(model, Mapping) or model.get("kind") != "specimen" or not isinstance(method, Mapping):
+        return blocks
+    specimen: Specimen = named("forward.specimen:Specimen").model_validate(model)
+    case = next((one for one in specimen.cases if one.name == method.get("case")), None)
+    if case is None:
+        known = ", ".join(one.name for one in specimen.cases)
+        message = f"method.case: one load case of a specimen is reduced at a time, expected one of: {known}"
+        raise StudyError(message)
+    body = specimen.loaded(case)
+    acts = {*body.scalars, *body.coefficients}
+    absent = set(specimen.scalars) - acts
+    changed = {
+        "model": body.model_dump(mode="json", exclude_none=True)
+        | {"outputs": [one.model_dump(mode="json", exclude_none=True) for one in case.outputs] or [ALWAYS]},
+        "method": {name: value for name, value in method.items() if name != "case"},
+        "parameters": {path: one for path, one in blocks.get("parameters", {}).items() if path not in absent},
+    }
+    pairs = [one for one in blocks.get("correlations", ()) if not absent.intersection(one.get("between", ()))]
+    return {**blocks, **changed, **({"correlations": pairs} if pairs else {})}

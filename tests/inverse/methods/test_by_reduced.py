@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 
 from forward.model import FunctionModel
+from forward.reduced.spec import Reduced
 from inverse.criticism.doubts import reduced_off
 from inverse.data.outputs import stated
 from inverse.methods.by_reduced import Agreement, Corrected, invert_by_reduced
@@ -43,6 +44,34 @@ samples = 64
 starts = 1
 mesh_error = false
 """
+SPECIMEN = """
+[model]
+kind = "specimen"
+formulation = "displacement"
+body = { kind = "box", size = [0.1, 0.05, 0.03], cells = [2, 1, 1], cell = "hexahedron", degree = 1 }
+material = { kind = "neo-hookean", C1 = 1100, D1 = 3000 }
+cases = [
+    { name = "hang", clamp = ["x-min"], loads = [{ kind = "gravity", density = 950 }] },
+    { name = "pull", clamp = ["x-min"], displacements = [{ on = "x-max", x = 0.01 }], outputs = [{ name = "grip", kind = "reaction", on = "x-max", component = "x" }] },
+]
+observed = [{ at = [[0.1, 0.0, 0.03], [0.05, 0.0, 0.03]] }]
+"""  # noqa: E501
+MADE = SPECIMEN + '[method]\nkind = "synthesize"\nnoise = { relative = 0.02 }\nseed = 3\n'
+OF_SPECIMEN = (
+    SPECIMEN
+    + """
+[parameters]
+"material.C1" = { kind = "uniform", lower = 700, upper = 1300 }
+"loads.gravity.density" = { kind = "uniform", lower = 900, upper = 1100 }
+[data]
+files = ["data"]
+[method]
+kind = "invert"
+samples = 64
+starts = 1
+mesh_error = false
+"""
+)
 SMALL = ["--set", "method.snapshots=8", "--set", "method.unseen=2", "--set", "method.rounds=0"]
 BY_REDUCED = ["--set", "method.reduced={file='model.npz',solves=12}"]
 
@@ -101,6 +130,33 @@ def test_what_cannot_stand_for_the_body_is_refused_in_one_line(folder):
         load(study, ["method.reduced=nowhere.npz"])
     wider = "parameters={'material.C1'={kind='uniform',lower=700,upper=2000}}"
     assert any("was trained from" in one.text for one in load(study, [reduced, wider]).findings)
+
+
+@pytest.mark.fem
+def test_a_specimen_has_a_reduced_model_for_each_load_case(tmp_path):
+    (tmp_path / "made.toml").write_text(MADE)
+    (tmp_path / "study.toml").write_text(OF_SPECIMEN)
+    study, quiet = str(tmp_path / "study.toml"), ["--quiet", "--no-report"]
+    assert main(["run", str(tmp_path / "made.toml"), "--out", str(tmp_path / "made"), *quiet]) == 0
+    (tmp_path / "made" / "data").rename(tmp_path / "data")
+    with pytest.raises(StudyError, match="expected one of: hang, pull"):
+        load(tmp_path / "study.toml", ["method={kind='reduce'}"])
+    for case in ("hang", "pull"):
+        made = ["reduce", study, *SMALL, "--set", f"method.case={case}", "--output", str(tmp_path / f"{case}.npz")]
+        assert main([*made, "--out", str(tmp_path / case), *quiet]) == 0
+    assert Reduced(file=str(tmp_path / "pull.npz")).scalars.keys() == {"material.C1"}
+    with pytest.raises(StudyError, match='hang = "FILE", pull = "FILE"'):
+        load(tmp_path / "study.toml", ["method.reduced=hang.npz"])
+    with pytest.raises(StudyError, match="hang: made of another body, which has other"):
+        load(tmp_path / "study.toml", ["method.reduced={file={hang='pull.npz',pull='pull.npz'}}"])
+    assert ran(tmp_path, "direct") in {0, 3}
+    by_both = ["--set", "method.reduced={file={hang='hang.npz',pull='pull.npz'},solves=12}"]
+    assert ran(tmp_path, "reduced", *by_both) in {0, 3}
+    found, direct = results(tmp_path, "reduced"), results(tmp_path, "direct")
+    np.testing.assert_allclose((found["mode"] - direct["mode"]) / direct["std"], 0, atol=0.01)
+    assert (np.abs(found["mean"] - direct["mean"]) < 0.2 * direct["std"]).all()
+    assert float(found["reduced_share"]) > 0.9
+    assert int(found["solves"]) <= 13
 
 
 @pytest.mark.fem

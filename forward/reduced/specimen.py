@@ -1,0 +1,132 @@
+"""Reduced models of the load cases of a specimen, as one model of what is observed of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray, Guess, OneByOne, SolveError, Stability, Work
+from forward.reduced.model import ReducedModel, ReducedSolution
+
+if TYPE_CHECKING:
+    from forward.fem.specimen import SpecimenModel
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedSpecimen(OneByOne):
+    """A specimen by a reduced model of each load case, with the parameters and the outputs of the specimen itself.
+
+    Attributes
+    ----------
+    parameters, outputs, cases
+        Names.
+    models
+        The models of the cases.
+    positions
+        Indices of the parameters of each case among all.
+    seen
+        What is observed (n, N) of the coordinate fields of each case.
+    others, which
+        Of each case, which of its observations are other outputs than displacements, and their numbers among these.
+    """
+
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    cases: tuple[str, ...]
+    models: tuple[ReducedModel, ...]
+    positions: Sequence[NDArray[np.int64]]
+    seen: Sequence[FloatArray]
+    others: Sequence[NDArray[np.int64]]
+    which: Sequence[NDArray[np.int64]]
+
+    differentiable, space = True, None
+
+    @classmethod
+    def of(cls, observed: SpecimenModel, models: tuple[ReducedModel, ...]) -> ReducedSpecimen:
+        """Observe what a specimen does; collective over its ranks."""
+        seen = observed.observed_of([model.data.fields[: model.level.count] for model in models])
+        cases = tuple(case.name for case in observed.spec.cases)
+        own = observed.positions, seen, observed.others, observed.which
+        return cls(observed.parameters, observed.outputs, cases, models, *own)
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> ReducedSpecimenSolution:
+        """Find the equilibria of all cases at `parameters` (d,).
+
+        Raises
+        ------
+        SolveError
+            With the name of the case that failed.
+        """
+        solutions = []
+        for case, model, where in zip(self.cases, self.models, self.positions, strict=True):
+            try:
+                solutions.append(model.reduced(parameters[where]))
+            except SolveError as error:
+                message = f"load case '{case}': {error.reason}"
+                raise type(error)(message, error.history, error.work, error.stability) from error
+        return ReducedSpecimenSolution(self, tuple(solutions), len(parameters))
+
+
+class ReducedSpecimenSolution:
+    """The equilibria of all cases, with derivatives of what is observed."""
+
+    residual, converged = 0.0, True
+
+    def __init__(self, model: ReducedSpecimen, solutions: tuple[ReducedSolution, ...], count: int) -> None:
+        self._model, self._solutions, self._count = model, solutions, count
+        self.outputs = np.concatenate(self._observed([one.c for one in solutions], [one.outputs for one in solutions]))
+        self.outputs.flags.writeable = False
+        self.state = np.zeros(0)
+
+    def _observed(self, coordinates: Sequence[FloatArray], outputs: Sequence[FloatArray]) -> list[FloatArray]:
+        """What is observed (n, …) of coordinates (N, …) and other outputs (m, …) of each case."""
+        model = self._model
+        found = [seen @ c for seen, c in zip(model.seen, coordinates, strict=True)]
+        for rows, others, which, values in zip(found, model.others, model.which, outputs, strict=True):
+            rows[others] = values[which]
+        return found
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivatives (n, d) of the outputs."""
+        found = self._observed([one.slopes for one in self._solutions], [one.jacobian for one in self._solutions])
+        whole = [np.zeros((len(rows), self._count)) for rows in found]
+        for to, rows, where in zip(whole, found, self._model.positions, strict=True):
+            to[:, where] = rows
+        return np.concatenate(whole)
+
+    @property
+    def stability(self) -> Stability:
+        """That of the case of which least is known."""
+        return Stability.of_all([one.stability for one in self._solutions])
+
+    @property
+    def work(self) -> Work:
+        """Cost of the solutions of all cases so far."""
+        return Work.sum_of(one.work for one in self._solutions)
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them."""
+        return np.asarray(direction) @ self.jacobian.T
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them."""
+        return np.asarray(weights) @ self.jacobian
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state, of which there is none: (0,), or (k, 0)."""
+        return np.zeros((*np.shape(direction)[:-1], 0))
+
+    def mesh_error(self) -> None:
+        """No mesh that could be refined."""
+        return
+
+    def saturation(self, spare: float = math.inf) -> None:
+        """No mesh that could be refined."""
+        return
