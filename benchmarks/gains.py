@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--snapshots", type=int, default=320)
     parser.add_argument("--modes", type=int, default=60)
     parser.add_argument("--more", type=int, default=240, help="of the larger model")
-    parser.add_argument("--rounds", type=int, default=2, help="in which half of the snapshots are drawn")
+    parser.add_argument("--rounds", type=int, default=1, help="in which half of the snapshots are drawn")
     parser.add_argument("--samples", type=int, default=64, help="what a study may spend, in solves of the body")
     parser.add_argument("--pilot", type=int, default=16)
     parser.add_argument("--costs", type=float, nargs=2, help="of both models, in solves of the body; or as predicted")

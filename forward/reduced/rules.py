@@ -15,7 +15,7 @@ from forward.observables.functionals import Integral
 from forward.reduced import cubature
 from forward.reduced.data import LevelData, Points
 from forward.reduced.integrands import Integrand, Sampler
-from forward.reduced.kernels import Kernel
+from forward.reduced.kernels import Kernel, spread
 
 CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
 STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
@@ -163,27 +163,23 @@ class Rules:
         mixture = cubature.Mixture(size, len(points.weights), SEED)
         rows: list[FloatArray] = []
         m, n = points.fields.shape[:2]
-        fields = points.fields[:, :, tested].transpose(0, 2, 1).copy()
+        fields = np.ascontiguousarray(points.fields[:, :, tested])
         for c, point in training.projected(sizes):
             components = (points.fields.reshape(m * n, -1) @ c).reshape(m, n)
             T = kernel(sampler.inputs(components, points, point), point[numbers])
-            values = T[0] * fields[0]
-            for k in range(1, m):
-                values += T[k] * fields[k]
+            values = np.ascontiguousarray(spread(T[None], fields)[0].T)
             targets = values @ points.weights
-            totals = []
-            for (of, _), there, kernel_of in zip(self._densities, densities, of_densities, strict=False):
-                density = kernel_of(of.inputs(there.fields @ c, there, point), point[numbers])[0]
-                rows.append(density)
-                totals.append(float(density @ there.weights))
             if not whole:
                 equations.set_parameters(point)
                 equations.at_load(0.0)
                 equations.set_state(c @ training.rows)
                 targets = training.rows[tested] @ equations.imbalance()
-                totals = [functional.value() * functional.size for _, functional in self._densities]
-            for i, total in enumerate(totals):
-                rows[i - len(totals)] = rows[i - len(totals)] / (total or 1.0)
+            if not (np.isfinite(T).all() and np.isfinite(targets).all()):
+                continue  # few modes have turned a cell of this state inside out
+            for (of, functional), there, kernel_of in zip(self._densities, densities, of_densities, strict=False):
+                density = kernel_of(of.inputs(there.fields @ c, there, point), point[numbers])[0]
+                total = float(density @ there.weights) if whole else functional.value() * functional.size
+                rows.append(density / (total or 1.0))
             scale = np.full(len(tested), float(np.linalg.norm(targets[tests:])) or 1.0)
             scale[:tests] = np.where(targets[:tests] == 0, scale[:tests], np.abs(targets[:tests]))
             mixture.add(values / scale[:, None], targets / scale)

@@ -361,14 +361,15 @@ def _reduced(study: InversionStudy) -> Callable[[ForwardModel], ForwardModel] | 
         return None
     if isinstance(study, OutputInversion):
         assert study.reduced is not None
-        body: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
-        return lambda observed: body
+        alone: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
+        return lambda observed: alone
     assert isinstance(study, Inversion)
     bodies = [study.specimen.loaded(case) for case in study.specimen.cases]
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
-    models = tuple(made.standing_for(*one) for made, *one in zip(study.reduced, bodies, acting, strict=True))
-    made = named("forward.reduced.specimen:ReducedSpecimen")
-    return lambda observed: cast("ForwardModel", made.of(observed, models))
+    found = zip(study.reduced, bodies, acting, strict=True)
+    models = tuple(one.standing_for(body, paths) for one, body, paths in found)
+    specimen = named("forward.reduced.specimen:ReducedSpecimen")
+    return lambda observed: cast("ForwardModel", specimen.of(observed, models))
 
 
 def _alone(shared: Shared | None) -> None:

@@ -178,7 +178,7 @@ class _Making:
         if known.any():
             largest = 100 * sizes[known].max()
             self._say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
-        return candidates[np.sort(np.concatenate([lost, worst]))]
+        return np.asarray(candidates[np.sort(np.concatenate([lost, worst]))])
 
     def _measured(self, data: ReducedData, reduction: Reduction) -> xr.Dataset:
         """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
