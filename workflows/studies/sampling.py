@@ -215,7 +215,7 @@ class Study(Sourced, StudyKind):
                 f"The error of the mesh is not estimated: that would take about {self._too_large:,.0f} MiB for each "
                 f"group of ranks, more than accuracy.memory = {self.accuracy.memory:,.0f} MiB.",
             )
-        if 0 < self.estimates < FEWEST:
+        if self.accuracy.tolerance is None and 0 < self.estimates < FEWEST:  # a tolerance takes as many as it needs
             yield Finding(
                 "note",
                 f"The error of the mesh is estimated at {self.estimates} points only: more would take over a fifth of "

@@ -40,8 +40,10 @@ def plan(study: Study, rank_groups: int) -> list[str]:
     if spec.cost() is None:  # the time of a solve is unknown
         return lines
     if study.estimates:
-        estimates = f"{study.estimates} estimates in elements of one degree more"
-        lines.append(f"mesh error  {up_to}{estimates}; none with accuracy.mesh_error = false")
+        estimates = f"{up_to}{study.estimates} estimates"
+        if study.accuracy.tolerance is not None:  # the study's number is of a method alone
+            estimates = f"{tolerance_asked.COUNTS[0]} to {tolerance_asked.COUNTS[-1]} estimates on each mesh"
+        lines.append(f"mesh error  {estimates} in elements of one degree more; none with accuracy.mesh_error = false")
         never = never_estimable(spec, [output.name for output in spec.returned])
         if never:
             lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")

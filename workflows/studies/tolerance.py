@@ -40,7 +40,7 @@ from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
 from workflows.studies.sampling_job import told_of
-from workflows.studies.tolerance_asked import goal, refinement
+from workflows.studies.tolerance_asked import COUNTS, goal, refinement
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -60,7 +60,6 @@ STEP = 1.1  # ratio of the numbers of cells that are looked at
 FAR = 2.0  # times as many cells: farther, an assumed rate says too little
 DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
 LARGEST = 16.0  # times as many cells along an edge
-COUNTS = 3, 4, 6, 9  # estimates
 FALL = {1: 2.0, 2: 2.0}  # power of their number with which what they leave open falls, by the number of parameters
 OF_MANY = 1.5  # the same of more parameters
 POINTS = 4096  # at which tangents are drawn

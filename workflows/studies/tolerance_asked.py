@@ -19,6 +19,7 @@ AUTOMATIC = "automatic"
 SCRAMBLES = 16  # of quasi-Monte Carlo, by default
 AMOUNTS = ("samples", "tolerance", "budget_seconds")
 SOLVES = 10_000  # most, by default
+COUNTS = 3, 4, 6, 9  # estimates of the error of a mesh
 # Methods that stop at a goal, and so need no number of samples.
 AIMING = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
 

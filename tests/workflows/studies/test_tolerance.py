@@ -399,6 +399,16 @@ def test_too_few_solves_are_said(tmp_path):
 
 
 @pytest.mark.unit
+def test_no_number_of_estimates_is_told_that_a_tolerance_does_not_keep_to():
+    fine = "model.body.cells=[40, 4, 12]"
+    given, study = load(TINY, [fine, "method={kind='chaos', samples=4}"]), asked(1e-3, fine)
+    assert any("at 2 points only" in one.text for one in given.findings)
+    assert study.estimates == 2
+    assert not any("points only" in one.text for one in study.findings)
+    assert any("3 to 9 estimates on each mesh" in line for line in plan(study))
+
+
+@pytest.mark.unit
 def test_a_number_of_samples_of_the_method_is_the_limit_that_is_named(tmp_path):
     study = without_method(1e-9, solves=100)
     wide = {"kind": "uniform", "lower": 1e5, "upper": 1e6}
