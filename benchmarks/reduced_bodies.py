@@ -69,6 +69,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--unseen", type=int, default=24)
     parser.add_argument("--modes", type=int, nargs="+", default=[20])
     parser.add_argument("--moving", type=float, default=0.0, help="standard deviation (m) of the place of the ball")
+    parser.add_argument("--cells", type=int, nargs=3, help="of the body; by default few")
     parser.add_argument("--mixed", action="store_true", help="the nearly incompressible block, κ/μ = 10⁴")
     given = parser.parse_args(options)
     names, nominal, spread = tuple(MEANS), [*MEANS.values()], [*SPREADS.values()]
@@ -77,7 +78,10 @@ def main(options: Sequence[str] = ()) -> None:
     if given.mixed:
         names, (nominal, spread) = tuple(OF_MIXED), zip(*OF_MIXED.values(), strict=True)  # type: ignore[assignment]
     mean, deviation, rng = np.array(nominal), np.array(spread), np.random.default_rng(1)
-    full = Hyperelastic.model_validate(MIXED if given.mixed else BODY).build(MPI.COMM_SELF, names)
+    body = MIXED if given.mixed else BODY
+    if given.cells:
+        body = body | {"body": body["body"] | {"cells": given.cells}}  # type: ignore[operator]
+    full = Hyperelastic.model_validate(body).build(MPI.COMM_SELF, names)
     begin = time.process_time()
     snapshots = solved(full, mean + deviation * rng.uniform(-REACH, REACH, (given.snapshots, len(names))), deviation)
     taken = time.process_time() - begin

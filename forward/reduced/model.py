@@ -22,6 +22,8 @@ from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
 from forward.reduced.together import SINGLE, TOGETHER, TOLERANCE, equilibria
 
+BEYOND = 0.25  # of the range of an output in the snapshots, how far beyond it is cut off
+
 
 class Estimate(NamedTuple):
     """What the nested larger model says of a solution.
@@ -65,6 +67,8 @@ class ReducedModel(OneByOne):
         Whether the stability of equilibria is tested. Without, those at many points are found in lockstep.
     unbalanced
         What may be left of the forces in lockstep, relative to what they would be if they did not cancel.
+    within
+        Whether outputs are cut off a little beyond those of the snapshots, where nothing says that they are right.
     """
 
     def __init__(
@@ -79,6 +83,7 @@ class ReducedModel(OneByOne):
         alone: bool = False,
         tested: bool = True,
         unbalanced: float = TOLERANCE,
+        within: bool = False,
     ) -> None:
         self.data, self.parameters = data, parameters
         names = [output.name for output in data.outputs]
@@ -101,6 +106,11 @@ class ReducedModel(OneByOne):
         self.way: Way = under_tools if touched and not self.level.pressures else newton
         self.touched = touched
         self._tolerance, self._full, self._unbalanced = tolerance, full, unbalanced
+        self.range: tuple[FloatArray, FloatArray] | None = None
+        if within and "highest" in data.about:  # not in older files
+            lowest, highest = (np.array(data.about[name])[self.which] for name in ("lowest", "highest"))
+            more = BEYOND * (highest - lowest)
+            self.range = lowest - more, highest + more
 
     @property
     def together(self) -> int:
@@ -262,6 +272,8 @@ class ReducedSolution:
         self._model, self._whole, self._K, self.work = model, whole, K, work
         self.parameters, self.c = np.array(parameters), c
         self.outputs = model.level.outputs(c, whole) if outputs is None else outputs
+        if model.range is not None:
+            self.outputs = np.clip(self.outputs, *model.range)
         self.stability = self._stability()
         for array in (self.parameters, self.c, self.outputs):
             array.flags.writeable = False

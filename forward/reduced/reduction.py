@@ -136,8 +136,13 @@ class Reduction:
             modes = modes[: n + sizes.more]
         adjoints = self.equations.layout.scatter(snapshots.adjoints)
         modes = np.vstack([modes, self._of_adjoints(adjoints, modes, max(n, sizes.more // OF_ADJOINTS))])
-        spread = np.maximum(snapshots.outputs.std(axis=0), 1e-300)
-        return self._of_modes(modes, n, rest, snapshots.parameters, sizes, spread, left, kept)
+        outputs = snapshots.outputs
+        told = {
+            "spread": np.maximum(outputs.std(axis=0), 1e-300).tolist(),
+            "lowest": outputs.min(axis=0).tolist(),
+            "highest": outputs.max(axis=0).tolist(),
+        }
+        return self._of_modes(modes, n, rest, snapshots.parameters, sizes, told, left, kept)
 
     def enriched(self, data: ReducedData, answers: Snapshots, sizes: Sizes) -> ReducedData:
         """Return a reduced model of this body that holds further solutions too, with a mode more for each of them.
@@ -157,8 +162,10 @@ class Reduction:
         whole = np.vstack([data.coordinates[:, data.before :] @ old, rest])
         parameters = np.vstack([data.snapshots, answers.parameters])
         truncation = max(self._rest.left(rest, first), data.about["truncation"])
-        spread = np.array(data.about["spread"])
-        return self._of_modes(modes, len(first), whole, parameters, sizes, spread, truncation, None)
+        told: dict[str, list[float]] = {
+            name: data.about[name] for name in ("spread", "lowest", "highest") if name in data.about
+        }
+        return self._of_modes(modes, len(first), whole, parameters, sizes, told, truncation, None)
 
     def places(self, states: FloatArray, parameters: FloatArray) -> NDArray[np.int64]:
         """Return where the body has its largest values (s, m) in states (s, U) at parameters (s, d).
@@ -213,7 +220,7 @@ class Reduction:
         rest: FloatArray,
         parameters: FloatArray,
         sizes: Sizes,
-        spread: FloatArray,
+        of_outputs: dict[str, list[float]],
         truncation: float,
         kept: NDArray[np.bool_] | None,
     ) -> ReducedData:
@@ -229,8 +236,8 @@ class Reduction:
             Snapshots (s, U_local) less what prescribed displacements move, and their parameters (s, d).
         sizes
             What the points may miss.
-        spread, truncation
-            Standard deviations (m,) of the outputs, and what the modes leave, for those who read it.
+        of_outputs, truncation
+            Standard deviations (m,) of the outputs and their range, and what the modes leave, for those who read it.
         kept
             Which cells are kept in full; None for none.
         """
@@ -274,7 +281,7 @@ class Reduction:
                 "modes of the larger model": len(modes),
                 "truncation": truncation,
                 "unknowns": int(layout.size),
-                "spread": spread.tolist(),
+                **of_outputs,
                 **told,
             },
         )

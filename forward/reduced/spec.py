@@ -64,6 +64,9 @@ class Reduced(ModelSpec):
     unbalanced
         What part of the forces may then be left out of balance: 1e-4, which takes half of the time, changes outputs by
         some 1e-4 of their spread.
+    within
+        Whether outputs are cut off a quarter of their range beyond those of the snapshots, as beside a body, which says
+        what is beyond: a largest stress where a cell is nearly turned inside out may be several times too large.
     digest
         Hash of the file, kept with results: another file of the same name is refused.
     """
@@ -74,6 +77,7 @@ class Reduced(ModelSpec):
     larger: bool = False
     accept_unstable: bool = False
     unbalanced: Annotated[float, Field(gt=0, lt=1)] = 1e-9
+    within: bool = False
     digest: str | None = None
 
     @model_validator(mode="after")
@@ -273,6 +277,7 @@ class Reduced(ModelSpec):
             alone=self.larger,
             tested=not self.accept_unstable,
             unbalanced=self.unbalanced,
+            within=self.within,
         )
 
 

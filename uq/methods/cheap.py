@@ -170,7 +170,7 @@ class ReducedModel(CheapModel):
     def of(self, spec: ModelSpec) -> ModelSpec:
         """Return the reduced model."""
         made: ModelSpec = named("forward.reduced.spec:Reduced")(
-            file=self.file, larger=self.larger, accept_unstable=True, unbalanced=UNBALANCED
+            file=self.file, larger=self.larger, accept_unstable=True, unbalanced=UNBALANCED, within=True
         )
         return made
 

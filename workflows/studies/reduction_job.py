@@ -97,7 +97,7 @@ def job(study: ReductionStudy, ensemble: Ensemble, directory: Path) -> Job:
         from workflows.studies.reduction import FILE
 
         save(data, directory / FILE)
-        kept = {key: value for key, value in data.about.items() if key != "spread"}
+        kept = {key: value for key, value in data.about.items() if key not in {"spread", "lowest", "highest"}}
         told.update(kept | {"seconds": made.seconds, "file": FILE})
         return found
 

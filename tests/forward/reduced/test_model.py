@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,6 +158,19 @@ def test_forces_may_be_left_out_of_balance_in_lockstep(full, small):
     for one, other in zip(exact, rough, strict=True):
         assert 0 < other.work.residuals < one.work.residuals
         assert (np.abs(other.outputs - one.outputs) < 0.02 * spread).all()
+
+
+def test_outputs_may_be_cut_off_beyond_those_of_the_snapshots(full, snapshots, small):
+    points = NOMINAL + SPREAD * np.random.default_rng(3).uniform(-1, 1, (4, 7))
+    free = np.array([ReducedModel(small, full.parameters).solve(point).outputs for point in points])
+    lowest, highest = snapshots.outputs.min(axis=0), snapshots.outputs.max(axis=0)
+    assert small.about["highest"] == highest.tolist()
+    about = small.about | {"highest": (lowest + 0.5 * (free.max(axis=0) - lowest)).tolist()}
+    model = ReducedModel(replace(small, about=about), full.parameters, tested=False, within=True)
+    found = np.array([one.outputs for one in model.solve_many(points)])
+    more = 0.25 * (np.array(about["highest"]) - lowest)
+    np.testing.assert_allclose(found, np.clip(free, lowest - more, about["highest"] + more), rtol=1e-6)
+    assert (found < free - 1e-6 * np.abs(free)).any(axis=0).all()
 
 
 def test_what_lockstep_does_not_find_newtons_method_does(full, small, monkeypatch):
