@@ -67,7 +67,7 @@ def _rounded(numbers: list[float], value: float, error: float, most: int) -> str
         numbers = [numbers[0], *(max(one, 10.0**-decimals) for one in numbers[1:])]
     power = _power(max(abs(value), error))
     after = max(decimals + power, 0)
-    text = " ± ".join(f"{round(one, decimals) / 10.0**power:,.{after}f}" for one in numbers)
+    text = " ± ".join(f"{round(one, decimals) / 10.0**power + 0.0:,.{after}f}" for one in numbers)
     if not power:
         return text.replace("-", "−")
     return _scaled(f"({text})" if len(numbers) > 1 else text, power)

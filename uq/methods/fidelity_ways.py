@@ -258,7 +258,7 @@ def described(team: Team, way: ByModels | ByExpansion, models: ByModels, expande
     """Return estimates, what was spent on what, and what other methods are predicted to need, as labelled arrays."""
     by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
     estimates, pilot = way.estimates, models.pilot
-    dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=False)
+    dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=True)
     numbers = sorted(team.taken)
     taken = [team.taken[g] for g in numbers]
     K = len(team.members)
@@ -336,7 +336,7 @@ def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool
     }
     needed = {name: float(np.nanmax(found, initial=0.0)) for name, found in others.items()}
     told = ", ".join(words[name].format(f"{number:,.0f}") for name, number in needed.items())
-    text = f"For the errors of the means that were reached at the cost of {spent:,.0f} solves, by prediction, {told}."
+    text = f"The errors of the means took the work of {spent:,.0f} solves; others are predicted to need: {told}."
     least = min(needed, key=lambda name: needed[name])
     if needed[least] < spent and not expanded_used:
         instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least

@@ -47,7 +47,7 @@ MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
 class Multifidelity(Amount):
     """Approximate control variates: mean and standard deviation from a model and cheap ones, without bias.
 
-    Displacement fields are not estimated: models may live on different meshes.
+    Of displacement fields only that at the mean parameters is there: models may live on different meshes.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class Multifidelity(Amount):
             if team.spent == before:  # what is left pays for no further sample
                 break
         poor = self.budget_seconds is not None and self._left(team) < self.limit - team.spent
-        amount = f"{team.count} samples that cost {team.spent:.4g} solves"
+        amount = f"{team.count} samples that cost {team.spent:.3g} solves"
         stopped = self.why_stopped(reached, f"relative error {reached:.3g}", 1 - int(poor), 1, amount)
         dataset = described(team, way, models, expansion)
         if self.quantiles:

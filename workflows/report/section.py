@@ -80,7 +80,8 @@ class Results:
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
-        return and_error(float(of_output[name]), float(of_output[f"{name}_error"]), self.unit(output))
+        value = float(of_output[name])
+        return NONE if np.isnan(value) else and_error(value, float(of_output[f"{name}_error"]), self.unit(output))
 
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""

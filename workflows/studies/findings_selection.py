@@ -60,7 +60,8 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
         if bad:
             where = f" in {', '.join(bad)}" if dataset.sizes["group"] > 1 else ""
             smallest = float(chances.min())
-            said.append(f"{words}{where} ({_chance(smallest)})")
+            told = chance(smallest)
+            said.append(f"{words}{where} (p {told if told.startswith('<') else f'= {told}'})")
     return said
 
 
@@ -287,5 +288,6 @@ def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, floa
     return difference, float(np.hypot(errors.sel(model=one), errors.sel(model=other)))
 
 
-def _chance(p: float) -> str:
-    return "p < 0.0003" if p < 3e-4 else f"p = {number(p, 2)}"
+def chance(p: float) -> str:
+    """Write a probability that was found by a few thousand draws: 0.52, < 0.0003."""
+    return "< 0.0003" if p < 3e-4 else number(p, 2)

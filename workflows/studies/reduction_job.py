@@ -37,6 +37,7 @@ ENOUGH = 120  # modes of states that the larger model has besides then
 CANDIDATES = 32  # for each snapshot that is drawn where errors are large
 LOST = 4  # of so many snapshots that are drawn, one may be where the reduced model has no answer
 UNBALANCED = 1e-4  # forces that may be left at candidates
+TIMED = 16  # samples at which a solve is timed
 UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
 TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be taken for the errors
@@ -235,6 +236,7 @@ class _Making:
         found["reduced_state_error"] = ("sample", of_state)
         found["points"] = (("sample", "parameter"), points)
         self.seconds["full solve"] = float(np.median(full.seconds))
+        self.seconds["reduced solve"] = _seconds_of(model, points[good][:TIMED])
         return found
 
     @staticmethod
@@ -254,6 +256,16 @@ class _Making:
 def _outputs(solution: Solution | SolveError, count: int) -> FloatArray:
     """Return the outputs (count,) of a solution; NaN without one."""
     return np.full(count, np.nan) if isinstance(solution, SolveError) else np.asarray(solution.outputs)
+
+
+def _seconds_of(model: ReducedModel, points: FloatArray) -> float:
+    """Return the median processor time of a solve with its outputs at points (n, d); NaN without points."""
+    taken = []
+    for point in points:
+        begin = time.process_time()
+        assert np.isfinite(model.reduced(point).outputs).all()
+        taken.append(time.process_time() - begin)
+    return float(np.median(taken)) if taken else float("nan")
 
 
 def _of_gradients(names: list[str], gradients: FloatArray, places: FloatArray) -> dict[str, Any]:

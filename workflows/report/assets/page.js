@@ -71,6 +71,11 @@
     };
     table.parentElement.before(tools(button("CSV", `save the table of ${name} as CSV`, file)));
     table.csv = () => csv(table);
+    // What lies beyond the window fades out, so that one sees that there is more.
+    const box = table.parentElement;
+    const fade = () => box.toggleAttribute("data-more", box.scrollLeft + box.clientWidth < box.scrollWidth - 4);
+    box.addEventListener("scroll", fade, { passive: true });
+    new ResizeObserver(fade).observe(box);
   }
   // On paper nothing can be opened.
   let closed = [];

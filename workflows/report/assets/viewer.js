@@ -718,7 +718,9 @@ class Viewer {
     const shown = () => {
       const outputs = x.outputs(), outside = x.outside(), fixed = x.fixed.some(Boolean);
       table.replaceChildren(...outputs.map((o, k) => {
-        const [one, name] = fitting(o.mean, o.unit), of = (v) => digits(v / one, 4), rest = x.fixed.every(Boolean);
+        // Four digits, or fewer where the expansion knows fewer.
+        const [one, name] = fitting(o.mean, o.unit), rest = x.fixed.every(Boolean), rough = o.error > 5e-4 * Math.abs(o.mean);
+        const of = (v) => (rough ? rounded(v / one, o.error / one) : digits(v / one, 4));
         const words = rest ? `± ${rounded(o.error / one, o.error / one)} (${whose})` : `95 %: ${of(o.interval[0])} to ${of(o.interval[1])}`;
         const value = rest ? rounded(o.mean / one, o.error / one) : of(o.mean);
         return make("div", { className: "output" }, make("b", { textContent: o.name }), make("strong", { textContent: withUnit(value, name) }), make("span", { textContent: words }), bars(o, this.all[k]));
@@ -729,7 +731,8 @@ class Viewer {
         const follows = x.joint && fixed && !x.fixed[i] ? x.follows(i) : null;
         if (follows !== null) row.range.value = follows;
         row.number.textContent = x.fixed[i] ? digits(x.values[i], 4) : follows !== null ? `about ${digits(follows, 3)}` : "random";
-        row.share.textContent = x.fixed[i] || !outputs[0].shares ? "" : `${Math.round(100 * outputs[0].shares[i])} % of the variance of ${outputs[0].name}`;
+        const told = outputs.filter((o) => o.shares && o.shares[i] >= 0.005).slice(0, 3).map((o) => `${Math.round(100 * o.shares[i])} % of ${o.name}`);
+        row.share.textContent = x.fixed[i] || !outputs[0].shares ? "" : told.length ? `of the variance: ${told.join(", ")}` : "below 1 % of all variances";
         const place = (x.values[i] - x.parameters[i].low) / (x.parameters[i].high - x.parameters[i].low);
         row.mark.setAttribute("x1", 100 * place); row.mark.setAttribute("x2", 100 * place);
         row.mark.style.display = x.fixed[i] ? "" : "none";
@@ -782,7 +785,9 @@ class Viewer {
     const more = lines.length > many ? [make("details", {}, make("summary", { textContent: `${lines.length - many} more parameters` }), ...lines.slice(many))] : [];
     const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${x.field.loo !== null && isFinite(x.field.loo) ? `, whose leave-one-out error is ${digits(100 * x.field.loo, 2)} % of the standard deviation` : ""}.` : "";
     const whose = this.told.sliders.source ? "of the expansion and the reduced model" : "of the expansion";
-    panel.append(make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}${this.told.sliders.source ? ` ${this.told.sliders.source}` : ""}` }),
+    const miss = Math.max(x.field && x.field.loo !== null && isFinite(x.field.loo) ? x.field.loo : 0, ...start.map((o) => (o.std > 0 && isFinite(o.error) ? o.error / o.std : 0)));
+    const sketch = miss > 0.1 ? [make("p", { className: "warning", textContent: `A sketch: this expansion misses up to ${digits(100 * miss, 2)} % of the standard deviation of what it shows.` })] : [];
+    panel.append(...sketch, make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}${this.told.sliders.source ? ` ${this.told.sliders.source}` : ""}` }),
       table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free);
     panel.hidden = false;
     shown();

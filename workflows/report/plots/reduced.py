@@ -35,8 +35,8 @@ def estimates(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         ax.set_xscale("log")
         ax.set_yscale("log")
         ax.legend(fontsize="small", frameon=False)
-    ax.set_xlabel("error over its root mean square")
-    ax.set_ylabel("estimate over the same")
+    ax.set_xlabel("true error over its root mean square")
+    ax.set_ylabel("estimated error over the same")
     return ax
 
 
@@ -49,6 +49,6 @@ def energies(found: xr.Dataset, kept: int, ax: Axes | None = None) -> Axes:
     ax.axvline(kept, color=HIGH, linestyle="--", linewidth=1, label=f"{kept} kept")
     ax.set_yscale("log")
     ax.set_xlabel("modes")
-    ax.set_ylabel("left of the snapshots")
+    ax.set_ylabel("part that is left out")
     ax.legend(fontsize="small", frameon=False)
     return ax

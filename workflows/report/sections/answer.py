@@ -32,6 +32,7 @@ DRIVERS = 3  # parameters named in a line
 UNSEEN = 0.01  # part of an error that is not worth a word
 SAID = 0.02  # share of the variance that is worth a word
 NAMED = 4  # names in a question
+MODES = 2  # of a field, from which on they are named together
 GOALS = 4  # predictions on the card
 
 
@@ -68,11 +69,11 @@ def forward(results: Results) -> Card:
     """Each output: its mean, spread, errors, and what drives it; at the mean parameters if nothing was sampled."""
     of = results.dataset
     sampled = "mean" in of
-    names = [spoken(str(name)) for name in of["parameter"].values] if "parameter" in of.coords else []
+    names = gathered(results.parameters) if "parameter" in of.coords else []
     path = " at the last step of the path" if "step" in of.coords else ""
     asked = listed([called(results, output) for output in results.drawn])
     be = "is" if len(results.drawn) == 1 else "are"
-    uncertain = f"{listed(names)} {'is' if len(names) == 1 else 'are'} uncertain"
+    uncertain = f"{listed(names)} {'is' if len(names) == 1 and ' modes of ' not in names[0] else 'are'} uncertain"
     if not names and sampled:
         question = f"How large {be} {asked}{path}, by all candidates?"
     elif not names:
@@ -107,6 +108,17 @@ def forward(results: Results) -> Card:
         curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
         answers.append(Answer(called(results, output), quantity(value, error, unit), lines, curve, inside, ends))
     return Card(question, answers)
+
+
+def gathered(paths: Sequence[str]) -> list[str]:
+    """Name parameters, and all modes of a random field together: `fields.stiffness.0`, … are modes of the stiffness."""
+    fields = [path.split(".")[1] if path.startswith("fields.") and path[-1].isdigit() else "" for path in paths]
+    count = {of: fields.count(of) for of in fields}
+    said = [
+        spoken(path) if count[of] < MODES or not of else f"{count[of]} modes of the {of}"
+        for path, of in zip(paths, fields, strict=True)
+    ]
+    return list(dict.fromkeys(said))
 
 
 def called(results: Results, output: str) -> str:

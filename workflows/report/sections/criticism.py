@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from forward.words import NONE, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.studies.findings_selection import conflicts, ranking
+from workflows.studies.findings_selection import chance, conflicts, ranking
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -44,8 +44,7 @@ def criticism(dataset: xr.Dataset) -> Table:
                 with_error(behind, float(one["score_behind_error"])) if behind else NONE,
                 number(float(one["score_tail"]), 2),
                 "yes" if bool(one["score_trusted"]) else "no",
-                number(float(one["misfit_probability"].min()), 2),
-                number(float(one["correlation_probability"].min()), 2),
+                *(chance(float(one[f"{what}_probability"].min())) for what in ("misfit", "correlation")),
                 "; ".join(conflicts(dataset, model)) or "none",
             )
         )

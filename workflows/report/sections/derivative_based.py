@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.words import NONE, number, with_error
+from forward.readable import percent
+from forward.words import NONE, number, per, with_error, with_unit
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -29,7 +30,8 @@ class DerivativeBased(Section):
         for output in results.drawn:
             yield Heading(output, level=3)
             yield bounds(results, output)
-            yield active_subspace(results, output)
+            yield leading_direction(results, output)
+            yield eigenvalues(results, output)
             summary = f"{output} against its leading direction: a curve if only that direction matters."
             spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
             yield Pictures(
@@ -40,13 +42,19 @@ class DerivativeBased(Section):
             )
 
 
+def slope_unit(results: Results, output: str, name: str) -> str:
+    """Unit of a squared derivative."""
+    unit = per(results.unit(output), results.parameter_unit(name))
+    return unit if unit == "1" else f"({unit})²"
+
+
 def bounds(results: Results, output: str) -> Table:
     """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
     of_output = results.dataset.sel(output=output)
     rows = []
     for name in results.parameters:
         of = of_output.sel(parameter=name)
-        squared = with_error(float(of["dgsm"]), float(of["dgsm_error"]))
+        squared = with_unit(with_error(float(of["dgsm"]), float(of["dgsm_error"])), slope_unit(results, output, name))
         total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
         bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
         corrected = results.corrected("total_bound", {"output": output, "parameter": name})
@@ -64,15 +72,24 @@ def bounds(results: Results, output: str) -> Table:
     return Table(head, rows)
 
 
-def active_subspace(results: Results, output: str) -> Table:
-    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, and the leading direction."""
+def leading_direction(results: Results, output: str) -> Table:
+    """Components of the direction along which an output changes most, in parameters over their deviations."""
     of_output = results.dataset.sel(output=output)
-    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
     directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
     rows = [
-        (name, with_error(float(component), float(error)), str(i), number(value), f"{number(lower)} to {number(upper)}")
-        for i, (name, (component, error), value, lower, upper) in enumerate(
-            zip(results.parameters, directions, *values, strict=True), start=1
-        )
+        (name, with_error(float(component), float(error)))
+        for name, (component, error) in zip(results.parameters, directions, strict=True)
     ]
-    return Table(("parameter", "leading direction", "number", "eigenvalue", "95 % range"), rows)
+    return Table(("parameter", "leading direction"), rows)
+
+
+def eigenvalues(results: Results, output: str) -> Table:
+    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, each with its share of their sum."""
+    of_output = results.dataset.sel(output=output)
+    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
+    whole = max(float(values[0].sum()), 1e-300)
+    rows = [
+        (str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole))
+        for i, (value, lower, upper) in enumerate(zip(*values, strict=True), start=1)
+    ]
+    return Table(("direction", "eigenvalue", "95 % range", "share of their sum"), rows)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import and_error, margin, size
+from forward.readable import and_error, margin, quantity
 from forward.words import NONE
 from uq.estimators.rounding import only_rounding
 from workflows.report import plots
@@ -143,7 +143,7 @@ def table(results: Results, names: list[str]) -> Table:
             rows.append(
                 (
                     f"{ESTIMATES[name]} of {output}",
-                    size(value, unit, 6),
+                    quantity(value, total if np.isfinite(total) else known(f"{name}_error"), unit),
                     margin(known(f"{name}_error"), unit, like=value),
                     NONE if np.isnan(error) else and_error(error, doubt, unit, like=value),
                     margin(total, unit, like=value),

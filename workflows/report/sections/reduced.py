@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from forward.readable import percent, size
@@ -23,15 +24,15 @@ class ReducedModelOfBody(Section):
         told, found = results.summary["reduced"], results.dataset
         yield Heading("How well it follows the body")
         yield Text(
-            f"Errors on {told['unseen']} samples that the model has not seen, root mean square, relative to the spread "
-            "of each output; what the correction by the residual leaves of them; and the effectivity, the estimated "
-            "over the true error, which is 1 where estimates can be taken for the errors."
+            f"Errors on {told['unseen']} samples that the model has not seen: their root mean square over the spread "
+            "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
+            "over the true error; where it is 1, estimates can be taken for the errors."
         )
         rows = [
             (
                 name,
                 *(percent(told[which][name]) for which in ("errors", "errors after correction")),
-                number(told["effectivity"][name], 3),
+                f"{told['effectivity'][name]:.2f}",
             )
             for name in told.get("errors", ())
         ]
@@ -42,18 +43,21 @@ class ReducedModelOfBody(Section):
             drawn.append(Picture.drawn(plots.estimates(found), caption))
         drawn.append(
             Picture.drawn(
-                plots.energies(found, told["modes"]), "The part of the snapshots that is in modes beyond a number."
+                plots.energies(found, told["modes"]), "The part of the snapshots that so many modes leave out."
             )
         )
         yield Pictures(drawn)
         yield Heading("What it is made of")
-        file = told["file"]
+        file, seconds = told["file"], told["seconds"]
         yield Pairs(
             [
                 ("snapshots", [f"{told['snapshots']:,} solves of the body, {told['unknowns']:,} unknowns"]),
                 ("modes", [f"{told['modes']}; {told['modes of the larger model']} of the model that tells the errors"]),
                 ("points of the material", [f"{told['points']:,}"]),
-                ("made in", [duration(sum(told["seconds"].values())) + " of processor time"]),
+                (
+                    "made in",
+                    [duration(seconds["snapshots"] + seconds["reduction"]) + " of processor time"],
+                ),
                 (
                     "use it",
                     [
@@ -69,15 +73,18 @@ def card(results: Results) -> Card:
     """How small the model is, and how large its errors are."""
     told = results.summary["reduced"]
     lines = [f"instead of {told['unknowns']:,} unknowns", f"from {told['snapshots']} solves", f"in {told['file']}"]
+    own, full = (1e3 * told["seconds"].get(f"{which} solve", math.nan) for which in ("reduced", "full"))
+    if math.isfinite(own):
+        lines.insert(1, f"a solve takes {number(own, 2)} ms, one of the body {number(full, 2)} ms")
     answers = [Answer("reduced model", f"{told['modes']} modes", lines)]
     for name, error in told.get("errors", {}).items():
         left = told["errors after correction"][name]
         true, estimated = (results.dataset[f"reduced_{w}"].sel(output=name) for w in ("error", "estimate"))
         rms = float(((true - estimated) ** 2).mean() ** 0.5)
         lines = [
-            f"of its spread ({size(rms, results.unit(name))}), corrected by the residual",
+            f"of its spread, or {size(rms, results.unit(name))}, once corrected by the residual",
             f"{percent(error)} without the correction",
-            f"its own estimates of errors are {number(told['effectivity'][name], 2)} times the true ones",
+            f"estimated over true error: {told['effectivity'][name]:.2f}",
         ]
         answers.append(Answer(f"error of {name}", percent(left), lines))
     return Card("How well does a reduced model follow the body?", answers)
