@@ -155,6 +155,11 @@ class ModelSpec(Settings):
         return ""
 
     @property
+    def hidden(self) -> str:
+        """Which error of a mesh is in its outputs and cannot be looked at, as a sentence; empty if there is none."""
+        return ""
+
+    @property
     def touched(self) -> bool:
         """Whether tools touch it: richer elements seldom follow the edge of the area in contact."""
         return False

@@ -168,6 +168,13 @@ class Reduced(ModelSpec):
         size = f"{told['modes']} modes, {told['points']} points, from {told['snapshots']} snapshots"
         return f"reduced model of a body of {told['unknowns']:,} unknowns: {size}"
 
+    @property
+    def hidden(self) -> str:
+        """That of the mesh of the body."""
+        size = f"{self._about.told['unknowns']:,}"
+        of_body = f"what the mesh of its body ({size} unknowns) errs"
+        return f"the model is a reduced one, and {of_body} is in all that it computes"
+
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say how large it is, and what errors it has on samples that it was not made of."""
         yield "model", self.description

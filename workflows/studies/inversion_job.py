@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from uq.evaluation.kept import KeptEvaluate, KeptModel
     from workflows.studies.predicted import FieldPredictions
 
+BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
@@ -113,7 +114,8 @@ class _Outputs:
     def of(cls, study: OutputInversion, ensemble: Ensemble) -> _Outputs:
         model = study.spec.build(ensemble.group, study.inputs.names)
         if not has_mesh(study.spec):
-            return cls(study, model, None)
+            hidden = study.spec.hidden
+            return cls(study, model, (None, f"{hidden}; {BY_REDUCED}") if hidden else None)
         meshes, why = _meshes(study, model, study.inputs.mean)
         return cls(study, model, (None if meshes is None else meshes.restricted(), why))
 

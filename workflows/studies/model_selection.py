@@ -169,7 +169,7 @@ class ModelSelection(Comparison):
     @cached_property
     def unchecked(self) -> dict[str, str]:
         """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
-        if not any(has_mesh(spec) for spec in self.of_candidates.values()):
+        if not any(has_mesh(spec) or spec.hidden for spec in self.of_candidates.values()):
             return {}
         return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
 
@@ -177,7 +177,7 @@ class ModelSelection(Comparison):
         if self.method.treatment is None:
             return self.method.unchecked
         if not has_mesh(spec):
-            return f"a model of kind '{spec.kind}' has no mesh"
+            return spec.hidden or f"a model of kind '{spec.kind}' has no mesh"
         try:
             finer(spec)
         except ValueError as error:  # a mesh that is not divided, or would be too large

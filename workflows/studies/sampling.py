@@ -203,7 +203,11 @@ class Study(Sourced, StudyKind):
         return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
-        if "mesh_error" in self.accuracy.model_fields_set and self.accuracy.mesh_error and not self.spec.meshed:
+        if self.accuracy.mesh_error and self.spec.hidden:
+            yield Finding(
+                "note", f"The error of the mesh is not estimated: {self.spec.hidden}; look at it with the body."
+            )
+        elif "mesh_error" in self.accuracy.model_fields_set and self.accuracy.mesh_error and not self.spec.meshed:
             yield Finding(
                 "note",
                 "The error of the mesh is not estimated, as accuracy.mesh_error = true asks for: a model of kind "

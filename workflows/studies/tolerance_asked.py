@@ -111,7 +111,7 @@ def refinement(study: Study) -> tuple[str, str]:
 
 def findings(study: Study) -> Iterator[Finding]:
     """Say what of the errors the tolerance cannot hold."""
-    if not study.spec.meshed:
+    if not study.spec.meshed and not study.spec.hidden:
         return
     if not study.estimates:
         why = "accuracy.mesh_error = false"

@@ -103,7 +103,7 @@ def _told(
     meshes = [] if before is None else before["meshes"]
     never = told_of(study).never
     if before is None:  # nothing to be known, or not asked for; else it was too much
-        known = not study.spec.meshed or not study.accuracy.mesh_error
+        known = not (study.spec.meshed or study.spec.hidden) or not study.accuracy.mesh_error
     else:
         known = all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
     return {
@@ -203,7 +203,7 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
     asked_for = f"accuracy.tolerance = {told['tolerance']:g}"
     text = f"{asked_for} is not reached: {reached} (of the tolerance: {taken})."
     if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
-        if told["mesh"]["tried"]:
+        if told["mesh"] is not None and told["mesh"]["tried"]:
             why = f" {told['reasons'][0]}"
         else:
             text, why = f"{asked_for} is not reached.", f" The error of the mesh is not known; but for it, {reached}."

@@ -132,6 +132,40 @@ def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):
     assert not any("trained" in one.text for one in load(within).findings)
 
 
+def test_the_mesh_of_its_body_is_never_forgotten(folder):
+    stands = f'[model]\nkind = "reduced"\nfile = "model.npz"\n{BODY[BODY.index("[parameters]") :]}'
+    data = load_model(folder / "model.npz")
+    moved = ReducedModel(data, data.parameters).solve(data.nominal).outputs[0]
+    (folder / "asked.toml").write_text(f"{stands}[accuracy]\ntolerance = 0.05\n")
+    (folder / "inverted.toml").write_text(
+        f"{stands}[data]\noutputs = {{ u_max = [{moved}] }}\nnoise = {{ relative = 0.1 }}\n"
+        '[method]\nkind = "invert"\nsamples = 32\nstarts = 1\n'
+    )
+    for name, code in (("asked", 3), ("inverted", 0)):
+        assert (
+            main(["run", str(folder / f"{name}.toml"), "--out", str(folder / name), "--quiet", "--no-report"]) == code
+        )
+    asked, inverted = (json.loads((folder / name / "summary.json").read_text()) for name in ("asked", "inverted"))
+    assert not asked["accuracy"]["kept"]
+    assert asked["accuracy"]["shares"]["total"] < 1
+    assert any("what the mesh of its body (36 unknowns) errs" in one["text"] for one in asked["findings"])
+    assert inverted["verdict"].startswith("doubtful: ")
+    assert "not checked for the mesh" in inverted["verdict"]
+    assert any("an inversion of the body itself with method.reduced" in one["text"] for one in inverted["findings"])
+
+
+def test_candidates_that_are_reduced_models_are_not_checked_for_their_meshes(folder):
+    prior = '"material.C1" = { kind = "uniform", lower = 800, upper = 1200 }'
+    (folder / "selected.toml").write_text(
+        f'[model]\nkind = "reduced"\nfile = "model.npz"\n[candidates.one.parameters]\n{prior}\n'
+        f"[candidates.other]\nmodel.larger = true\n[candidates.other.parameters]\n{prior}\n"
+        '[data]\noutputs = { u_max = [1.2e-2] }\nsigma = { u_max = 1e-3 }\n[method]\nkind = "select"\nnoise = {}\n'
+    )
+    unchecked = load(folder / "selected.toml").unchecked
+    assert set(unchecked) == {"one", "other"}
+    assert all("the model is a reduced one" in why for why in unchecked.values())
+
+
 def test_the_full_model_is_asked_above_a_tolerance(folder):
     (folder / "asked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("32", "8"))
     assert main(["run", str(folder / "asked.toml"), "--out", str(folder / "asked"), "--quiet", "--no-report"]) == 0
