@@ -311,7 +311,9 @@ def exact(case: Case) -> Exact:
 def effectivities(case: Case) -> list[tuple[float, bool]]:
     """Print a row for each output of a problem; return what is claimed, calibrated, over what is true."""
     solution = case.coarse.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
-    error, saturation = solution.mesh_error(), solution.saturation(AFFORDED)
+    error, saturation, name = solution.mesh_error(), solution.saturation(AFFORDED), case.name
+    if not saturation.measured and (longer := solution.saturation()).measured:
+        saturation, name = longer, f"{case.name}, in a long study"
     calibrated = error.calibrated(saturation).outputs
     values, doubts = exact(case)
     true = values - solution.outputs
@@ -319,7 +321,7 @@ def effectivities(case: Case) -> list[tuple[float, bool]]:
     unknowns = f"{case.coarse.unknowns:,} → {list(case.fine.values())[-1].unknowns:,}"
     for i, output in enumerate(case.coarse.outputs):
         print(
-            f"| {case.name} | {unknowns} | {output.name} | {values[i]:.5g} ± {doubts[i]:.1g} "
+            f"| {name} | {unknowns} | {output.name} | {values[i]:.5g} ± {doubts[i]:.1g} "
             f"| {100 * true[i] / values[i]:.2g} | {error.outputs[i] / true[i]:.2f} | {calibrated[i] / true[i]:.2f} "
             f"| {left[i] / abs(true[i]):.2f} |",
             flush=True,
@@ -330,7 +332,7 @@ def effectivities(case: Case) -> list[tuple[float, bool]]:
 def elsewhere(only: str = "") -> None:
     """Print what a study makes of estimates at other parameters, over what a calibration of their own makes of them.
 
-    With the doubt that it states, as in a study of 50 solves.
+    With the doubt that it states, as in a study of 50 solves, or in a long one where so few afford no calibration.
     """
     print("| problem | parameters, at their quantiles | output: by the study over its own (stated doubt) |")
     print("|---|---|---|")
@@ -351,16 +353,19 @@ def elsewhere(only: str = "") -> None:
                 continue
             model, names = case.coarse.build(MPI.COMM_SELF, inputs.names), ", ".join(inputs.names)
             evaluate = SerialEvaluate(model)
-            few = estimate(
-                inputs, evaluate, linearise(inputs, evaluate), estimates_for(50), 0, fields=False, spare=AFFORDED
-            )
-            unknown, centre = unknown_of(few), few.outputs[0]
+            centre, count = linearise(inputs, evaluate), estimates_for(50)
+            spare = AFFORDED
+            few = estimate(inputs, evaluate, centre, count, 0, fields=False, spare=spare)
+            if not few.measured:  # a long study
+                spare = math.inf
+                few = estimate(inputs, evaluate, centre, count, 0, fields=False, spare=spare)
+            unknown, at_mean = unknown_of(few), few.outputs[0]
             for quantiles in ((0.05, 0.05), (0.05, 0.95), (0.95, 0.05), (0.95, 0.95)):
                 (point,) = inputs.points(np.array([quantiles]))
                 solution = model.solve(point)
                 error, shifts = solution.mesh_error(), np.nan_to_num(few.shifts)
-                here = error.outputs * few.saturation + shifts * solution.outputs / centre
-                own = solution.saturation(AFFORDED)
+                here = error.outputs * few.saturation + shifts * solution.outputs / at_mean
+                own = solution.saturation(spare)
                 its = error.calibrated(own).outputs
                 left = np.zeros(len(its)) if own.doubts is None else own.doubts
                 ratios, doubts = here / its, unknown * np.abs(here)

@@ -18,6 +18,7 @@ ROUNDING = 1e-12  # of the extent of the mesh: distance that counts as rounding
 STEPS = 30  # of Newton's method in a hexahedron
 NEAREST = 8  # cells that are tried for a point in no cell
 AT_ONCE = 2048  # points
+FEW = 2**21  # pairs of a point and a cell, all of which are looked at
 FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])  # of a tetrahedron
 
 
@@ -73,15 +74,22 @@ def _some(corners: FloatArray, boxes: tuple[FloatArray, FloatArray], points: Flo
 
 def _candidates(lows: FloatArray, highs: FloatArray, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return pairs of a point and a cell that may hold it, or may be the nearest, sorted by point."""
-    from scipy.spatial import cKDTree
+    slack = 0.05 * (highs - lows)
+    lowest, highest = lows - slack, highs + slack
+    if len(points) * len(lows) <= FEW:
+        within = np.ones((len(points), len(lows)), dtype=bool)
+        for x, low, high in zip(points.T, lowest.T, highest.T, strict=True):
+            within &= (x[:, None] >= low) & (x[:, None] <= high)
+        point, cell = np.nonzero(within)
+    else:
+        from scipy.spatial import cKDTree
 
-    centres, slack = (lows + highs) / 2, 0.05 * (highs - lows)
-    reach = float(np.linalg.norm(highs - lows, axis=1).max()) * 0.55
-    near = cKDTree(centres).query_ball_point(points, reach)
-    point = np.repeat(np.arange(len(points)), [len(cells) for cells in near])
-    cell = np.concatenate([np.asarray(cells, dtype=np.int64) for cells in near])
-    inside = ((lows - slack)[cell] <= points[point]).all(axis=1) & (points[point] <= (highs + slack)[cell]).all(axis=1)
-    point, cell = point[inside], cell[inside]
+        reach = float(np.linalg.norm(highs - lows, axis=1).max()) * 0.55
+        near = cKDTree((lows + highs) / 2).query_ball_point(points, reach)
+        point = np.repeat(np.arange(len(points)), [len(cells) for cells in near])
+        cell = np.concatenate([np.asarray(cells, dtype=np.int64) for cells in near])
+        inside = ((lowest[cell] <= points[point]) & (points[point] <= highest[cell])).all(axis=1)
+        point, cell = point[inside], cell[inside]
     lost = np.setdiff1d(np.arange(len(points)), point)
     pairs = [(point, cell)]
     for i in lost:
@@ -101,15 +109,16 @@ def shapes(local: FloatArray, corners: int) -> FloatArray:
     return np.asarray(np.einsum("ni,nj,nk->nkji", ends[..., 0], ends[..., 1], ends[..., 2]).reshape(-1, 8))
 
 
-def _slopes(local: FloatArray) -> FloatArray:
-    """Their derivatives (n, 8, 3) in hexahedra."""
-    ends = np.stack([1 - local, local], axis=1)
-    along = np.broadcast_to(np.array([-1.0, 1.0]), (len(local), 2))
-    parts = []
-    for axis in range(3):
-        a, b, c = (along if k == axis else ends[..., k] for k in range(3))
-        parts.append(np.einsum("ni,nj,nk->nkji", a, b, c).reshape(-1, 8))
-    return np.stack(parts, axis=2)
+def _mapped(corners: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return places (n, 3) in hexahedra and their derivatives (n, 3, 3), coordinates first; axis by axis."""
+    x, y, z = local.T[:, :, None]
+    along_z = corners[:, 4:] - corners[:, :4]
+    of_z = corners[:, :4] + z[:, None] * along_z
+    of_yz, slopes_z = (part[:, :2] + y[:, None] * (part[:, 2:] - part[:, :2]) for part in (of_z, along_z))
+    slopes_y = of_z[:, 2:] - of_z[:, :2]
+    slopes_x = of_yz[:, 1] - of_yz[:, 0]
+    others = (part[:, 0] + x * (part[:, 1] - part[:, 0]) for part in (slopes_y, slopes_z))
+    return of_yz[:, 0] + x * slopes_x, np.stack([slopes_x, *others], axis=2)
 
 
 def _in_tetrahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
@@ -130,13 +139,15 @@ def _in_tetrahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
 def _in_hexahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
     """Newton's method in the reference cell, the steps of which end at its faces."""
     x = np.full((len(points), 3), 0.5)
+    left = np.arange(len(points))
     for _ in range(STEPS):
-        gap = points - np.einsum("nk,nka->na", shapes(x, 8), corners)
-        slopes = np.einsum("nkd,nka->nad", _slopes(x), corners)
-        new = np.clip(x + np.linalg.solve(slopes, gap[..., None])[..., 0], 0.0, 1.0)
-        moved = float(np.abs(new - x).max(initial=0.0))
-        x = new
-        if moved < 1e-14:
+        places, slopes = _mapped(corners[left], x[left])
+        step = np.linalg.solve(slopes, (points[left] - places)[..., None])[..., 0]
+        new = np.clip(x[left] + step, 0.0, 1.0)
+        moved = np.abs(new - x[left]).max(axis=1, initial=0.0)
+        x[left] = new
+        left = left[~(moved < 1e-14)]
+        if not len(left):
             break
     return x
 

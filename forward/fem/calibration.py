@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from forward.fem.affordable import Finer, finer
 from forward.fem.dolfinx import spaces
@@ -31,6 +31,7 @@ from forward.fem.model import HyperelasticModel
 from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
 
 if TYPE_CHECKING:
+    from forward.fem.enriched import Enriched, EnrichedState
     from forward.fem.equations import Discretisation
     from forward.fem.model import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
@@ -40,7 +41,7 @@ USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh boun
 ORDERS = np.linspace(HIGHEST, LOWEST, 400)
 OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
 LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
-THOROUGH = {False: 2e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
+THOROUGH = {False: 2e-3, True: 1e-4}  # nonlinearity left where one step is not enough, without pressures and with them
 
 
 class Limit(NamedTuple):
@@ -81,14 +82,23 @@ def limit(
 def limit_alone(own: ArrayLike, seen: ArrayLike, finer: ArrayLike, times: float, degree: int = 2) -> Limit:
     """Extrapolate errors of outputs where there is no estimate on the finer mesh; parameters as of `limit`."""
     values, e, there = np.broadcast_arrays(*(np.asarray(part, dtype=float) for part in (own, seen, finer)))
-    gone = 1 - times**-ORDERS  # of the error, on the finer mesh
-    ratios = (1 - (degree / (degree + 1)) ** (2 * ORDERS)) / gone  # rise as the order falls
     moved = there - values
     ratio = np.divide(e, moved, out=np.full(e.shape, np.nan), where=moved != 0)
-    regular = (ratio >= ratios[0]) & (ratio <= ratios[-1])
-    errors = moved / np.where(regular, np.interp(ratio, ratios, gone), 1 - times**-USUAL)
+    gone, regular = _gone(ratio, times, degree)
+    errors = moved / np.where(regular, gone, 1 - times**-USUAL)
     errors = np.where(np.isnan(e), np.nan, errors)
     return Limit(errors, _doubts(errors, errors - moved, times) + np.where(regular, 0.0, np.abs(e - moved)))
+
+
+def _gone(ratio: FloatArray, times: float, degree: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the parts (m,) of errors that are gone on a finer mesh, and whether they show an order.
+
+    By the ratios (m,) of what richer elements see to what is gone, which rise as the order falls; where they show none,
+    those of the nearest one.
+    """
+    gone = 1 - times**-ORDERS
+    ratios = (1 - (degree / (degree + 1)) ** (2 * ORDERS)) / gone
+    return np.interp(ratio, ratios, gone), (ratio >= ratios[0]) & (ratio <= ratios[-1])
 
 
 def _doubts(errors: FloatArray, rest: FloatArray, times: float) -> FloatArray:
@@ -155,36 +165,47 @@ class FinerMesh:
         model, point = self._model, solution.parameters
         if np.delete(point, self._scalars).any() or self._finer is None:
             return None
-        usual, bent = solution.mesh_error().outputs, THOROUGH[model.spec.mixed]
-        own = solution.estimated(model.enriched, (solution.enriched_state, bent))
+        usual, own = solution.mesh_error().outputs, solution.enriched_state
+        if not (self._finer.estimated and own.straight):
+            own = _thorough(solution, model.enriched)
+        other, there, brought = self._solved(point[self._scalars], np.array([own.state, own.change]))
+        times, degree, after = self._finer.times, model.spec.body.degree, [there.state]
+        richer = there.enriched_state if self._finer.estimated else None
+        # What single steps leave is nearly the same on both meshes; if only one of them goes on, it is taken for error.
+        if richer is not None and not (own.straight and richer.straight):
+            own = _thorough(solution, model.enriched) if own.straight else own
+            richer = _thorough(there, other.enriched)
         seen = model.enriched.values(solution, own) - solution.outputs
-        other, there = self._solved(point[self._scalars], own.state)
-        times, degree = self._finer.times, model.spec.body.degree
-        after = [there.state]
-        if self._finer.estimated:
-            richer = there.estimated(other.enriched, (there.enriched_state, bent))
+        if richer is None:
+            found = limit_alone(solution.outputs, seen, there.outputs, times, degree)
+        else:
             seen_there = other.enriched.values(there, richer) - there.outputs
             found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
             after.append(other.enriched.down(richer.change))
-        else:
-            found = limit_alone(solution.outputs, seen, there.outputs, times, degree)
-        before = _everywhere(model.equations, np.array([solution.state, model.enriched.down(own.change)]))
-        moved = _moved(other.equations, model.equations, np.array(after))
-        n = model.space.displacements
-        return saturation(usual, found, of_states(before[:, :n], moved[:, :n], times, degree))
+        n = other.space.displacements
+        here, moved = brought[:, :n], _everywhere(other.equations, np.array(after))[:, :n]
+        return saturation(usual, found, of_states(np.array([here[0] - here[1], here[1]]), moved, times, degree))
 
-    def _solved(self, parameters: FloatArray, richer: FloatArray) -> tuple[HyperelasticModel, FiniteElementSolution]:
-        """Solve from what richer elements say of the state, (U⁺_local,), with the one factor of the stiffness there.
+    def _solved(
+        self, parameters: FloatArray, richer: FloatArray
+    ) -> tuple[HyperelasticModel, FiniteElementSolution, FloatArray]:
+        """Solve from what richer elements say of the state, with the one factor of the stiffness there.
 
-        Where that has negative eigenvalues, only the equilibrium can tell whether it is stable.
+        Returns the rows (k, U⁺_local) of these, the first of which is the state, at its nodes (k, U) too. Where the
+        factor has negative eigenvalues, only the equilibrium can tell whether it is stable.
         """
         other = self._untested
-        there = _moved(self._model.enriched.equations, other.equations, richer[None])
-        start = other.equations.layout.scatter(there)[0]
+        there = _moved(self._model.enriched.equations, other.equations, richer)
+        start = other.equations.layout.scatter(there[:1])[0]
         near = ReferenceSolution(parameters, start)
         if other.take_reference(near).indefinite():
-            return self._tested, self._tested.solve(parameters, Guess(start))
-        return other, other.solve(parameters, Guess(start, near))
+            return self._tested, self._tested.solve(parameters, Guess(start)), there
+        return other, other.solve(parameters, Guess(start, near)), there
+
+
+def _thorough(solution: FiniteElementSolution, enriched: Enriched) -> EnrichedState:
+    """Return the state in richer elements, further to equilibrium there than is usual."""
+    return solution.estimated(enriched, (solution.enriched_state, THOROUGH[enriched.equations.spec.mixed]))
 
 
 def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) -> float:
@@ -193,7 +214,7 @@ def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) 
     Parameters
     ----------
     before, after
-        State and estimate (2, U) on the mesh, and on the finer one; there (1, U) without an estimate.
+        State and estimate (2, U) on the mesh, and on the finer one, at the same nodes; (1, U) without an estimate.
     times, degree
         As of `limit`.
     """
@@ -202,8 +223,11 @@ def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) 
     if not square > 0:
         return 1.0
     moved, *shrunk = [float(x @ seen) / square for x in (there - own, *seen_there)]
-    found = limit(0.0, 1.0, moved, shrunk[0], times, degree) if shrunk else limit_alone(0.0, 1.0, moved, times, degree)
-    return float(np.clip(found.errors, LEAST, MOST))
+    if shrunk:
+        factor = limit(0.0, 1.0, moved, shrunk[0], times, degree).errors
+    else:  # errors of a whole state do not cancel as those of an output
+        factor = moved / _gone(np.array(1 / moved if moved else np.inf), times, degree)[0]
+    return float(np.clip(factor, LEAST, MOST))
 
 
 def _everywhere(equations: Discretisation, rows: FloatArray) -> FloatArray:

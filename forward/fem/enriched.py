@@ -38,6 +38,7 @@ SETTLED = 0.01  # part of the energy of e that the conjugate gradients may miss
 LEFT = 0.05  # of the forces, where pressures leave no energy to go by; a second step takes as much of what is left
 STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
+LITTLE = 0.01  # the same before the steps, after which these forces are met again
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 5e-3  # relative tolerance of the same solves
 CLOSER = 0.1  # that of further steps, which change a tenth, and the part of their energy that these may miss
@@ -136,6 +137,11 @@ class EnrichedState(NamedTuple):
     before: FloatArray
     step: FloatArray
     linearised: FloatArray
+
+    @property
+    def straight(self) -> bool:
+        """Whether one linear step led there."""
+        return self.step is self.change
 
     @property
     def relative(self) -> float:
@@ -332,7 +338,7 @@ class Enriched:
     def _solve_by_smoothing(
         self, solution: Solved, right: FloatArray, missing: float, *, transpose: bool
     ) -> FloatArray | None:
-        """Solve by steps of conjugate gradients and, before and after, with the stiffness of the body.
+        """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
 
         The former may miss such a part of the energy. The solve afterwards corrects what affects outputs most: it makes
         the residual orthogonal to V_h.
@@ -347,7 +353,8 @@ class Enriched:
             y[fixed] = 0
             return y
 
-        found = self._on_the_body(solution, right, transpose=transpose)
+        little = LITTLE if inverse.weights is None else ORTHOGONAL
+        found = self._on_the_body(solution, right, little, transpose=transpose)
         for i, b in enumerate(right):
             residual = b - multiply(found[i]) if found[i].any() else b
             if inverse.weights is None:
@@ -360,14 +367,14 @@ class Enriched:
                 return None
             found[i] += change
         left = right - np.array([multiply(x) for x in found])
-        return found + self._on_the_body(solution, left, transpose=transpose)
+        return found + self._on_the_body(solution, left, ORTHOGONAL, transpose=transpose)
 
-    def _on_the_body(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray:
+    def _on_the_body(self, solution: Solved, right: FloatArray, negligible: float, *, transpose: bool) -> FloatArray:
         """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
         forces = np.array([self.restrict(row) for row in right])
         forces[:, self._coarse.fixed] = 0
         sizes, wholes = self._coarse.norms(forces), self.equations.norms(right)
-        worth = sizes > ORTHOGONAL * wholes
+        worth = sizes > negligible * wholes
         found = np.zeros_like(right)
         if worth.any():
             solved = solution.solve(forces[worth], transpose=transpose, tolerance=ROUGH)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -77,9 +78,19 @@ class Results:
             return self.parameters
         return [str(name) for name in effects["parameter"].to_numpy()[(-abs(effects)).argsort().to_numpy()]]
 
+    @cached_property
+    def _of_outputs(self) -> dict[str, xr.Dataset]:
+        return {}
+
+    def of(self, output: str) -> xr.Dataset:
+        """What is known of an output: all variables, those without outputs too."""
+        if output not in self._of_outputs:
+            self._of_outputs[output] = self.dataset.sel(output=output)
+        return self._of_outputs[output]
+
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
-        of_output = self.dataset.sel(output=output)
+        of_output = self.of(output)
         value = float(of_output[name])
         return NONE if np.isnan(value) else and_error(value, float(of_output[f"{name}_error"]), self.unit(output))
 
@@ -92,7 +103,7 @@ class Results:
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""
-        return str(self.dataset["unit"].sel(output=output).item())
+        return str(self.of(output)["unit"].item())
 
     def parameter_unit(self, path: str, label: str = "/") -> str:
         """SI unit of a number of the model of some evaluations, by its path; "1" for other names."""

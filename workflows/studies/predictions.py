@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import REPORT, START
-from forward.fem.finer import finer, graded
 from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
@@ -64,6 +63,8 @@ def meshes_of(spec: Any) -> tuple[Any, ...]:
     ValueError
         If there are none, or they would be too large.
     """
+    from forward.fem.finer import finer, graded
+
     if isinstance(spec.body, MeshFile):
         return ()
     beside = graded(spec)

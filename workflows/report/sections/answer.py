@@ -88,8 +88,8 @@ def forward(results: Results) -> Card:
     answers = []
     for output in results.drawn:
         name = "mean" if sampled else "nominal"
-        one = of.sel(output=output)
-        value, unit = float(one[name]), results.unit(output)
+        one, unit = results.of(output), results.unit(output)
+        value = float(one[name])
         errors = {source: float(e[results.outputs.index(output)]) for source, e in parts_of(results, name).items()}
         if not counts[output]:
             answers.append(Answer(called(results, output), "0", ("zero but for rounding",)))

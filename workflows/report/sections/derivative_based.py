@@ -50,7 +50,7 @@ def slope_unit(results: Results, output: str, name: str) -> str:
 
 def bounds(results: Results, output: str) -> Table:
     """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
-    of_output = results.dataset.sel(output=output)
+    of_output = results.of(output)
     rows = []
     for name in results.parameters:
         of = of_output.sel(parameter=name)
@@ -74,7 +74,7 @@ def bounds(results: Results, output: str) -> Table:
 
 def leading_direction(results: Results, output: str) -> Table:
     """Components of the direction along which an output changes most, in parameters over their deviations."""
-    of_output = results.dataset.sel(output=output)
+    of_output = results.of(output)
     directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
     rows = [
         (name, with_error(float(component), float(error)))
@@ -85,7 +85,7 @@ def leading_direction(results: Results, output: str) -> Table:
 
 def eigenvalues(results: Results, output: str) -> Table:
     """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, each with its share of their sum."""
-    of_output = results.dataset.sel(output=output)
+    of_output = results.of(output)
     values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
     whole = max(float(values[0].sum()), 1e-300)
     rows = [

@@ -58,7 +58,7 @@ def references(results: Results) -> Table:
     """The references, and the errors of the solver and the mesh."""
     rows = []
     for output in results.outputs:
-        of_output, unit = results.dataset.sel(output=output), results.unit(output)
+        of_output, unit = results.of(output), results.unit(output)
         floors = (size(abs(float(of_output[f"{name}_error"])), unit) for name in ("solver", "mesh"))
         rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
     return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
@@ -66,7 +66,7 @@ def references(results: Results) -> Table:
 
 def errors(results: Results, output: str, estimated: str) -> Table:
     """Error and cost of each method at each budget, for one estimate of an output."""
-    dataset = results.dataset.sel(output=output)
+    dataset = results.of(output)
     scale = abs(float(dataset[estimated]))
     plain, gained = plain_samples(dataset, estimated).to_numpy(), gains(dataset, estimated)
     methods = dataset["row_method"].to_numpy().tolist()

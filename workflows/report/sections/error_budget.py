@@ -126,9 +126,9 @@ def sentence(results: Results, name: str) -> str:
 
 def table(results: Results, names: list[str]) -> Table:
     """The errors of each estimate, and its corrected value."""
-    rows, dataset = [], results.dataset
+    rows = []
     for output in np.array(results.outputs)[counting(results)].tolist():
-        of_output, unit = dataset.sel(output=output), results.unit(output)
+        of_output, unit = results.of(output), results.unit(output)
 
         def known(name: str, of_output: xr.Dataset = of_output) -> float:
             return float(of_output[name]) if name in of_output else np.nan

@@ -36,7 +36,7 @@ class LocalSensitivities(Section):
 
 def sensitivities(results: Results, output: str) -> Table:
     """Derivatives of an output, in physical units and times the standard deviation and the range of the parameter."""
-    unit, slopes = results.unit(output), results.dataset.sel(output=output)
+    unit, slopes = results.unit(output), results.of(output)
     rows = []
     for name in results.leading(slopes["derivative_per_std"]):
         of_parameter = slopes.sel(parameter=name)

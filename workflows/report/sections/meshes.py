@@ -99,7 +99,7 @@ def differences(results: Results, output: str) -> Table:
 
 def rates(results: Results, output: str) -> str:
     """The rates of convergence of an output, in words."""
-    of_output = results.dataset.sel(output=output)
+    of_output = results.of(output)
     weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
     return (
         f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "

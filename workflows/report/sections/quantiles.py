@@ -28,7 +28,7 @@ def quantiles(results: Results) -> Table:
     """Quantiles of the outputs."""
     rows = []
     for output in results.outputs:
-        of_output = results.dataset.sel(output=output)
+        of_output = results.of(output)
         pairs = zip(of_output["quantiles"].to_numpy(), of_output["quantiles_error"].to_numpy(), strict=True)
         rows.append((output, *(and_error(float(q), float(e), results.unit(output)) for q, e in pairs)))
         if "quantiles_corrected" in results.dataset and np.isfinite(of_output["quantiles_corrected"]).all():

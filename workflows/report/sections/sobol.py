@@ -40,7 +40,7 @@ class SobolIndices(Section):
 
 def sobol(results: Results, output: str) -> Table:
     """Sobol' indices of an output, and what they are without the error of the mesh."""
-    leading = results.leading(results.dataset.sel(output=output)["sobol_total"])
+    leading = results.leading(results.of(output)["sobol_total"])
     groups = map(str, results.dataset["group"].values if "group" in results.dataset.coords else ())
     single, grouped = (("sobol_first", "sobol_total"), ("sobol_group_first", "sobol_group_total"))
     rows = [(name, *_cells(results, single, {"output": output, "parameter": name})) for name in leading]

@@ -27,7 +27,7 @@ def total_errors(results: Results) -> Table:
     """Errors of means and standard deviations by where they come from."""
     rows = []
     for output in results.outputs:
-        of_output = results.dataset.sel(output=output)
+        of_output = results.of(output)
         for word, first in (("mean", ""), ("standard deviation", "std_")):
             names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
             errors = [margin(float(of_output[name]), results.unit(output)) for name in names]
