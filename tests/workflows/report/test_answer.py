@@ -10,9 +10,9 @@ from scipy import integrate, stats
 
 from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
-from workflows.report import bodies, plots
+from workflows.report import bodies, plots, small_density
 from workflows.report.page import write_report
-from workflows.report.sections import answer
+from workflows.report.sections import answer, population
 
 
 @pytest.fixture(autouse=True)
@@ -93,14 +93,23 @@ def test_intervals_of_an_expansion_are_those_of_its_density():
 
 def test_small_densities_are_densities():
     values = stats.norm(5, 2).rvs(4000, random_state=1)
-    at, curve = answer.smooth(values)
+    at, curve = small_density.smooth(values)
     scaled = curve / integrate.trapezoid(curve, at)
     np.testing.assert_allclose(scaled, stats.norm(5, 2).pdf(at), atol=0.02)
 
 
+def test_small_densities_of_one_sign_end_at_zero():
+    draws = -stats.lognorm(0.7, scale=70).rvs(4000, random_state=1)
+    at, curve = population._new_specimens(draws, logarithmic=True)
+    assert (np.diff(at) > 0).all()
+    assert at[-1] < 0
+    scaled = curve / integrate.trapezoid(curve, at)
+    np.testing.assert_allclose(scaled, stats.lognorm(0.7, scale=70).pdf(-at), atol=0.15 * scaled.max())
+
+
 def test_a_small_density_holds_an_interval_that_reaches_beyond_its_samples():
     at, curve = np.linspace(2.0, 4.0, 5), np.array([0.0, 1.0, 2.0, 1.0, 0.0])
-    drawn, inside, ends = answer._curve(at, curve, (1.0, 3.5), "m", 3.0)
+    drawn, inside, ends = small_density.curve_of(at, curve, (1.0, 3.5), "m", 3.0)
     assert inside == pytest.approx((0.0, 2.5 / 3))
     assert ends == ("1.0", "4.0\N{NO-BREAK SPACE}m")
     assert drawn[0] == 0

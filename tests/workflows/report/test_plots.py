@@ -6,7 +6,7 @@ import xarray as xr
 from scipy.stats import gaussian_kde, multivariate_normal
 
 from workflows.report import plots
-from workflows.report.plots import pairs
+from workflows.report.plots import pairs, residuals
 from workflows.report.plots.figure import in_fitting_units, quantity
 from workflows.report.scene.scene import spread_over
 
@@ -109,3 +109,23 @@ def test_the_most_probable_model_stands_out():
     found = plots.selection.colours(of)
     assert [name for name, colour in found.items() if colour == plots.HIGH] == ["ogden"]
     assert len(set(found.values())) == 3
+
+
+def test_measured_displacements_are_drawn_over_predicted_ones_in_one_unit():
+    predicted = np.array([1e-3, 2e-3, -3e-3, 0.5])
+    one = xr.Dataset(
+        {
+            "measured": ("datum", predicted + 1e-4),
+            "predicted": ("datum", predicted),
+            "datum_axis": ("datum", [0, 1, 2, 3]),  # the last is a force
+            "datum_case": ("datum", [0, 0, 1, 1]),
+        },
+        coords={"case": ["shear", "press", "unseen"]},
+    )
+    ax = residuals.agreement(one)
+    shear, press, line = (np.array(drawn.get_xydata()) for drawn in ax.lines)
+    np.testing.assert_allclose(shear, [[1, 1.1], [2, 2.1]])
+    np.testing.assert_allclose(press, [[-3, -2.9]])
+    np.testing.assert_allclose(line, [[-3, -3], [2.1, 2.1]])
+    assert ax.get_xlabel() == "predicted displacement (mm)"
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["shear", "press"]

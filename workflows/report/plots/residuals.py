@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import scale
-from workflows.report.plots.figure import HIGH, grid, text_of
+from workflows.report.plots.figure import COLOURS, DARK, HIGH, axes, grid, text_of
 from workflows.report.plots.view import box, seen
-from workflows.results.points import MeasuredPoints, measured_points
+from workflows.results.points import MeasuredPoints, N, measured_points
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -36,6 +36,34 @@ def residuals(one: xr.Dataset) -> Axes:
         arrows.set_title(f"{text_of(part.case)}: arrows {factor:.3g} times as long", fontsize="small")
         _map(coloured, ends, part, part.over, most, "over the error")
     return found[0]
+
+
+def agreement(one: xr.Dataset) -> Axes:
+    """Draw the measured over the predicted displacements of each load case, and the line on which both are equal."""
+    ax = axes(height=3.6)
+    seen_ = np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)
+    measured, predicted, case = (one[name].to_numpy()[seen_] for name in ("measured", "predicted", "datum_case"))
+    size, unit = scale(float(np.abs(measured).max()), "m")
+    for k, name in enumerate(one["case"].values):
+        here = case == k
+        if here.any():
+            colour = COLOURS[k % len(COLOURS)]
+            ax.plot(
+                predicted[here] / size,
+                measured[here] / size,
+                ".",
+                ms=4,
+                alpha=0.7,
+                color=colour,
+                label=text_of(str(name)),
+            )
+    both = np.concatenate([measured, predicted]) / size
+    ends = [float(both.min()), float(both.max())]
+    ax.plot(ends, ends, color=DARK, linewidth=0.8, zorder=1)
+    ax.set_xlabel(f"predicted displacement ({unit})")
+    ax.set_ylabel(f"measured ({unit})")
+    ax.legend(fontsize="small", frameon=False)
+    return ax
 
 
 def distances(one: xr.Dataset) -> Axes:

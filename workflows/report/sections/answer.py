@@ -15,8 +15,10 @@ from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
 from workflows.report.sections.error_budget import counting, parts_of
 from workflows.report.sections.findings import gravest
+from workflows.report.sections.population import card as population
 from workflows.report.sections.posterior import measured_kind
 from workflows.report.sections.reduced import card as reduced
+from workflows.report.small_density import CURVE, curve_of, smooth
 from workflows.studies.findings_selection import bayes_factor, by_probability, grade
 
 if TYPE_CHECKING:
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
 
 ENDS = (0.025, 0.975)
 LEAST = 40  # samples of which quantiles are told
-CURVE = 48  # points of a small density
 TILES = 12  # answers; the others are in the tables
 DRIVERS = 3  # parameters named in a line
 UNSEEN = 0.01  # part of an error that is not worth a word
@@ -194,35 +195,7 @@ def density(one: xr.Dataset, unit: str) -> tuple[Sequence[float], tuple[float, f
         if len(values) < LEAST or np.ptp(values) <= 1e-12 * np.abs(values).max():
             return (), (0.0, 1.0), ("", "")
         at, curve = smooth(values)
-    return _curve(at, curve, middle(one)[:2], unit, float(one["mean"]))
-
-
-def _curve(
-    at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str, value: float
-) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
-    low, high = min(float(at[0]), inside[0]), max(float(at[-1]), inside[1])
-    if (low, high) != (float(at[0]), float(at[-1])):  # draws of weighted points may reach less far than their interval
-        lattice = np.linspace(low, high, CURVE)
-        at, curve = lattice, np.interp(lattice, at, curve, left=0.0, right=0.0)
-    a, b = (float(np.clip((x - low) / (high - low), 0, 1)) for x in inside)
-    words = interval(low, high, unit, value)
-    cut = " to " if " to " in words else "–"
-    left, _, right = words.partition(cut)
-    return [float(y) for y in curve], (a, b), (left, right)
-
-
-def smooth(values: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return places (m,) and the density (m,) of samples (n,) there, with Gaussian kernels on a lattice."""
-    weights = np.ones(len(values)) if weights is None else weights
-    weights = weights / weights.sum()
-    mean = weights @ values
-    std = float(np.sqrt(weights @ (values - mean) ** 2)) or 1.0
-    width = 1.06 * std * float(1 / (weights**2).sum()) ** -0.2
-    low, high = max(values.min(), mean - 5 * std), min(values.max(), mean + 5 * std)
-    at = np.linspace(low - width, high + width, CURVE)
-    counts, edges = np.histogram(values, bins=400, range=(low, high), weights=weights)
-    centres = (edges[1:] + edges[:-1]) / 2
-    return at, np.exp(-0.5 * ((at[:, None] - centres) / width) ** 2) @ counts
+    return curve_of(at, curve, middle(one)[:2], unit, float(one["mean"]))
 
 
 def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
@@ -351,7 +324,7 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
-        return Answer(spoken(name), quantity(mean, std, unit), lines, *_curve(at, curve, (lower, upper), unit, mean))
+        return Answer(spoken(name), quantity(mean, std, unit), lines, *curve_of(at, curve, (lower, upper), unit, mean))
     return Answer(spoken(name), quantity(mean, std, unit), lines)
 
 
@@ -396,35 +369,6 @@ def _odds(ln_B: float) -> str:
     if ln_B > 13:
         return f"{power_of_ten(int(ln_B / np.log(10)))} to 1"
     return f"{number(float(np.exp(ln_B)), 2)} to 1"
-
-
-def population(results: Results) -> Card:
-    """Each parameter: the typical specimen, and a new one."""
-    of = results.dataset
-    question = f"What are specimens of this kind like, and what will a new one be like, from {of.sizes['specimen']}?"
-    answers = []
-    for name in results.parameters:
-        unit = results.parameter_unit(name)
-        (low, mid, high), new, scale = (
-            [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
-        )
-        factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
-        spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
-        at, curve = smooth(_trimmed(of["population_draw"].sel(parameter=name).to_numpy()))
-        lines = [
-            f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
-            f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
-            f"specimens differ by {spread_} (one standard deviation)",
-        ]
-        shown = _curve(at, curve, (new[0], new[2]), unit, mid)
-        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
-    return Card(question, answers)
-
-
-def _trimmed(values: FloatArray) -> FloatArray:
-    """Return values without the outer per cent at each end, which may be far away."""
-    low, high = np.quantile(values, (0.01, 0.99))
-    return np.asarray(values[(values >= low) & (values <= high)])
 
 
 def compared(results: Results) -> Card:

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from forward.readable import interval, quantity, scale, spoken
+import numpy as np
+
+from forward.readable import interval, quantity, scale, size, spoken
 from forward.words import named, number, with_error
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import population as plots
 from workflows.report.section import Results, Section
+from workflows.report.small_density import CURVE, curve_of, smooth
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from forward.model import FloatArray
 
 
 class PopulationOfSpecimens(Section):
@@ -101,3 +106,47 @@ def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
     """Write a median, to the place of a deviation, with the ends of an interval."""
     lower, middle, upper = (float(x) for x in quantiles.to_numpy())
     return f"{quantity(middle, (upper - lower) / 4, unit)} ({interval(lower, upper, unit, middle)})"
+
+
+def card(results: Results) -> Card:
+    """Each parameter: the typical specimen, and a new one."""
+    of = results.dataset
+    question = f"From {of.sizes['specimen']} specimens: what is typical of their kind, and what will a new one be like?"
+    answers = []
+    for name in results.parameters:
+        unit = results.parameter_unit(name)
+        (low, mid, high), new, scale = (
+            [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
+        )
+        factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
+        spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
+        at, curve = _new_specimens(
+            _trimmed(of["population_draw"].sel(parameter=name).to_numpy()), logarithmic=bool(of["logarithmic"])
+        )
+        lines = [
+            f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
+            f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
+            f"specimens differ by {spread_} (one standard deviation)",
+        ]
+        shown = curve_of(at, curve, (new[0], new[2]), unit, mid)
+        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
+    return Card(question, answers)
+
+
+def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray, FloatArray]:
+    """Return places (m,) and the density (m,) of draws (n,) there; of those of one sign by their logarithms."""
+    if not logarithmic:
+        return smooth(values)
+    sign = np.sign(np.median(values))
+    logs = np.log(sign * values[sign * values > 0])
+    at, curve = smooth(logs)
+    sizes = np.linspace(np.exp(logs.min()), np.exp(logs.max()), CURVE)
+    found = np.interp(np.log(sizes), at, curve) / sizes
+    order = np.argsort(sign * sizes)
+    return (sign * sizes)[order], found[order]
+
+
+def _trimmed(values: FloatArray) -> FloatArray:
+    """Return values without the outer per cent at each end, which may be far away."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    return np.asarray(values[(values >= low) & (values <= high)])

@@ -323,6 +323,8 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
     )
     if not has_points(one):
         return
+    words_ = "Measured against predicted displacements, component by component; on the line both are equal."
+    yield residuals.agreement(one), words_
     yield residuals.residuals(one), f"{words}; fields/points-{one.data_set.item()}.vtu for ParaView."
     if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
         yield residuals.distances(one), "How far points were from the body before they were moved onto it."
