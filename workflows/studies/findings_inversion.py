@@ -118,14 +118,25 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
     )
     found += _of_reduced(one, names)
+    return found + _of_mesh(one, study, number)
+
+
+def _of_mesh(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
+    """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
+    from inverse.criticism import doubts as criticism
+
     if "mesh_checked" not in one:
-        return found
-    found += criticism.not_estimable(study.not_estimable(number))
+        return []
+    found, names = criticism.not_estimable(study.not_estimable(number)), [str(name) for name in one.parameter.values]
+    seen = np.isfinite(one["measured"].to_numpy())
     shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
     nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
     why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
     if bool(one["mesh_corrected"]):
         left = dict(zip(names, one["mesh_left"].to_numpy().tolist(), strict=True))
         settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
-        return found + criticism.mesh_corrected(error, shifts, left, nodes, settled=settled, counted=counted)
+        of_file = getattr(getattr(study.model, "body", None), "kind", "") == "mesh"
+        return found + criticism.mesh_corrected(
+            error, shifts, left, nodes, settled=settled, counted=counted, from_file=of_file
+        )
     return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)

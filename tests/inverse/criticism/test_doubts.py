@@ -144,6 +144,9 @@ def test_a_corrected_mesh_is_a_note_unless_it_decides():
         assert "take a finer one" in doubt.text
     (doubt,) = mesh_corrected(10 * error, shifts, {"x": 0.3}, none, settled=False)
     assert doubt.severity == "error"
+    for size, severity in ((1.5, "note"), (3.0, "warning")):  # as far as intervals of bodies from files hold
+        (doubt,) = mesh_corrected(np.full(9, size), shifts, {"x": 0.3}, none, settled=True, from_file=True)
+        assert doubt.severity == severity
     # Of a field, what the data determine best may be wrong where vertices are not.
     for size, counted, severity in ((3.5, True, "note"), (4.5, True, "warning"), (3.5, False, "warning")):
         field = ({"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4))
