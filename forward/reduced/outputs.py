@@ -20,7 +20,6 @@ from forward.reduced.kernels import Kernel
 from forward.reduced.level import LENGTH
 
 NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
-IN_CELL = 0.9  # of the largest stress of their cell, that they have then too: neighbours of a peak are no peaks
 
 
 class Outputs:
@@ -135,7 +134,7 @@ class Outputs:
         self, sampler: Sampler, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
     ) -> NDArray[np.int64]:
         """Number the points that are near the largest value in any snapshot, and those in cells kept in full."""
-        near, cells = np.zeros(sampler.count, dtype=bool), len(self._equations.layout.cells()[0])
+        near = np.zeros(sampler.count, dtype=bool)
         if kept is not None:
             near |= np.repeat(kept, sampler.count // len(kept))
         everywhere = sampler.points(np.zeros((0, states.shape[1])))
@@ -144,7 +143,5 @@ class Outputs:
         for state, point in zip(states, parameters, strict=True):
             inputs = sampler.inputs(sampler.components(state), everywhere, point)
             values = kernel(inputs, point[self._numbers])[0]
-            of_cells = values.reshape(cells, -1)
-            high = (of_cells >= IN_CELL * of_cells.max(axis=1, keepdims=True)).ravel()
-            near |= high & (values >= NEAR_PEAK * values.max())
+            near |= values >= NEAR_PEAK * values.max()
         return np.flatnonzero(near)

@@ -19,6 +19,7 @@ from forward.reduced.integrands import of_density, of_form
 from forward.reduced.limits import mistakes
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
+from forward.reduced.outputs import NEAR_PEAK
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 
@@ -208,6 +209,17 @@ def test_largest_values_have_places(full, snapshots, reduction, small):
     found = ReducedModel(small, full.parameters).solve(snapshots.parameters[0])
     corrected = np.linalg.norm(found.corrected_state.reshape(-1, 3), axis=1).max()
     assert abs(corrected - found.outputs[2] - found.estimate.outputs[2]) < 1e-9
+
+
+def test_points_near_the_largest_stress_of_a_snapshot_are_all_kept(full, snapshots, reduction, small):
+    """Those beside it in the same cell too: where loads move on, they have the largest."""
+    near, at_points = False, full.equations.at_points(full.functionals[5].stress)
+    for state, point in zip(snapshots.states, snapshots.parameters, strict=True):
+        reduction.places(state[None], point[None])  # the body is in this state from then on
+        values = at_points().ravel()
+        near = near | (values >= NEAR_PEAK * values.max())
+    assert small.outputs[5].kind == "peak"
+    assert len(small.outputs[5].points.weights) == near.sum() < near.size
 
 
 def test_gradients_are_corrected_too(full, snapshots, small):

@@ -167,9 +167,9 @@ def test_candidates_that_are_reduced_models_are_not_checked_for_their_meshes(fol
 
 
 def test_the_full_model_is_asked_above_a_tolerance(folder):
-    (folder / "asked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("32", "8"))
-    assert main(["run", str(folder / "asked.toml"), "--out", str(folder / "asked"), "--quiet", "--no-report"]) == 0
-    assert json.loads((folder / "asked" / "summary.json").read_text())["work"]["factorisations"] > 0
+    (folder / "checked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("32", "8"))
+    assert main(["run", str(folder / "checked.toml"), "--out", str(folder / "checked"), "--quiet", "--no-report"]) == 0
+    assert json.loads((folder / "checked" / "summary.json").read_text())["work"]["factorisations"] > 0
 
 
 def test_it_is_a_cheap_model_beside_the_body(folder):
