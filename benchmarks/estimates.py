@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.beams import CONFIG
 
-REPEATS = 2  # in turn, so that the load of the machine is the same for both
+REPEATS = 6  # in turn, so that the load of the machine is the same for both
 COMPRESSIBLE = (
     'model.material={kind="neo-hookean", C1=40e6, D1=80e6}',
     'parameters={"material.C1"={kind="uniform", lower=32e6, upper=48e6}}',
