@@ -7,12 +7,11 @@ Trans. R. Soc. A 226 (1927) 299–361). The difference itself is an output too: 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, Work
+from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, WithoutMesh, Work
 
 Begun = tuple[tuple[FloatArray, FloatArray], ...]
 # Where all cells are halved, errors at held faces fall slowly, whatever the degree: 1/(2^1.6 − 1).
@@ -119,7 +118,7 @@ class Extrapolated(OneByOne):
 
 
 @dataclass(frozen=True)
-class ExtrapolatedSolution:
+class ExtrapolatedSolution(WithoutMesh):
     """Solutions on both meshes."""
 
     model: Extrapolated
@@ -174,11 +173,3 @@ class ExtrapolatedSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """There is no state."""
         return np.zeros((*np.shape(direction)[:-1], 0))
-
-    def mesh_error(self) -> None:
-        """None: what is estimated here are outputs without one."""
-        return
-
-    def saturation(self, spare: float = math.inf) -> None:
-        """None: there are no estimates."""
-        return

@@ -528,8 +528,20 @@ class FunctionModel(OneByOne):
         return FunctionSolution(self, point, outputs)
 
 
+class WithoutMesh:
+    """A solution of a model that has no mesh whose error could be estimated."""
+
+    def mesh_error(self) -> None:
+        """No mesh."""
+        return
+
+    def saturation(self, spare: float = math.inf) -> None:
+        """No mesh."""
+        return
+
+
 @dataclass(frozen=True)
-class FunctionSolution:
+class FunctionSolution(WithoutMesh):
     """The value of a `FunctionModel` at one parameter vector."""
 
     model: FunctionModel
@@ -572,14 +584,6 @@ class FunctionSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """No state: empty."""
         return np.empty((*np.shape(direction)[:-1], 0))
-
-    def mesh_error(self) -> None:
-        """No mesh."""
-        return
-
-    def saturation(self, spare: float = math.inf) -> None:
-        """No mesh."""
-        return
 
     def _jacobian(self) -> FloatArray:
         if self.model.jacobian is None:

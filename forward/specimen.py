@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, model_validator
@@ -15,7 +16,7 @@ from forward.fem.affordable import own_estimate
 from forward.fem.cost import Estimate, Times, sum_of
 from forward.fem.locking import Ranges
 from forward.hyperelastic import Hyperelastic
-from forward.model import Finding, ModelError
+from forward.model import Finding, ModelError, SolveError
 from forward.observables.displacement import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
@@ -256,6 +257,22 @@ class Specimen(Solid):
         for point in item.at:
             if not holds(self.body, point):
                 yield _mistake(("observed", i, "at"), "outside the body", list(point))
+
+
+@contextmanager
+def of_case(name: str) -> Iterator[None]:
+    """Name the load case in which a solve fails.
+
+    Raises
+    ------
+    SolveError
+        That which was raised, with the name.
+    """
+    try:
+        yield
+    except SolveError as error:
+        message = f"load case '{name}': {error.reason}"
+        raise type(error)(message, error.history, error.work, error.stability) from error
 
 
 def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErrorDetails:

@@ -30,11 +30,10 @@ from forward.model import (
     OneByOne,
     ReferenceSolution,
     Saturation,
-    SolveError,
     Stability,
     Work,
 )
-from forward.specimen import Observed, Specimen
+from forward.specimen import Observed, Specimen, of_case
 
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
 
@@ -192,11 +191,8 @@ class SpecimenModel(OneByOne):
         solutions = []
         guesses = self._guesses(guess or Guess())
         for case, model, where, known in zip(self.spec.cases, self.models, self.positions, guesses, strict=True):
-            try:
+            with of_case(case.name):
                 solutions.append(model.solve(parameters[where], known))
-            except SolveError as error:
-                message = f"load case '{case.name}': {error.reason}"
-                raise type(error)(message, error.history, error.work, error.stability) from error
         return SpecimenSolution(self, tuple(solutions))
 
     def _guesses(self, guess: Guess) -> Iterator[Guess]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
-from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, Work
+from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, WithoutMesh, Work
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
@@ -254,7 +254,7 @@ class ReducedSpace:
         return {label: kept for (label, _), (_, _, kept) in pairs}
 
 
-class ReducedSolution:
+class ReducedSolution(WithoutMesh):
     """An equilibrium of a reduced model, with its linearisation and an estimate of its error."""
 
     residual, converged = 0.0, True
@@ -398,14 +398,6 @@ class ReducedSolution:
         F = larger.by_parameters(c, self._whole, K)
         by_state, directly = larger.output_slopes(c, self._whole, K, F)
         return np.asarray((by_state[:, free] @ _slopes(larger, K, F)[free] + directly)[:, model.places])
-
-    def mesh_error(self) -> None:
-        """No mesh that could be refined."""
-        return
-
-    def saturation(self, spare: float = math.inf) -> None:
-        """No mesh that could be refined."""
-        return
 
 
 def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:

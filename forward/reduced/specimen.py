@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,8 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, Guess, OneByOne, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, OneByOne, Stability, WithoutMesh, Work
 from forward.reduced.model import ReducedModel, ReducedSolution
+from forward.specimen import of_case
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -65,15 +65,12 @@ class ReducedSpecimen(OneByOne):
         """
         solutions = []
         for case, model, where in zip(self.cases, self.models, self.positions, strict=True):
-            try:
+            with of_case(case):
                 solutions.append(model.reduced(parameters[where]))
-            except SolveError as error:
-                message = f"load case '{case}': {error.reason}"
-                raise type(error)(message, error.history, error.work, error.stability) from error
         return ReducedSpecimenSolution(self, tuple(solutions), len(parameters))
 
 
-class ReducedSpecimenSolution:
+class ReducedSpecimenSolution(WithoutMesh):
     """The equilibria of all cases, with derivatives of what is observed."""
 
     residual, converged = 0.0, True
@@ -122,11 +119,3 @@ class ReducedSpecimenSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state, of which there is none: (0,), or (k, 0)."""
         return np.zeros((*np.shape(direction)[:-1], 0))
-
-    def mesh_error(self) -> None:
-        """No mesh that could be refined."""
-        return
-
-    def saturation(self, spare: float = math.inf) -> None:
-        """No mesh that could be refined."""
-        return

@@ -70,10 +70,10 @@ def distances(one: xr.Dataset) -> Axes:
     """Draw how far points were from the body before they were moved onto it."""
     parts = [part for part in measured_points(one) if len(part.places)]
     found = grid(len(parts), 1, PANEL, INSIDE)
-    most = max(float(part.moved.max()) for part in parts)
+    most, ends = max(float(part.moved.max()) for part in parts), _ends(one)
     size, unit = scale(most, "m")
     for part, ax in zip(parts, found, strict=True):
-        _map(ax, _ends(one), part, part.moved / size, most / size, f"distance ({unit})")
+        _map(ax, ends, part, part.moved / size, most / size, f"distance ({unit})")
     return found[0]
 
 
