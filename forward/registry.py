@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
@@ -82,11 +86,10 @@ class Kinds:
         """Iterate over the program's own."""
         return iter(self.own)
 
-    def _installed(self) -> dict[str, importlib.metadata.EntryPoint]:
+    def _installed(self) -> dict[str, EntryPoint]:
         """Kinds that installed packages declare, by name."""
         prefix = f"{self.family}."
-        points = importlib.metadata.entry_points(group=ENTRY_POINTS)
-        return {point.name.removeprefix(prefix): point for point in points if point.name.startswith(prefix)}
+        return {point.name.removeprefix(prefix): point for point in _declared() if point.name.startswith(prefix)}
 
     def _imported(self, kind: str, module: str, name: str) -> Any:
         from forward.external.own_modules import imported
@@ -116,6 +119,27 @@ class Kinds:
         return found
 
 
+def _declared() -> tuple[EntryPoint, ...]:
+    """Entry points of our group."""
+    return _read_again(tuple((folder, _modified(folder)) for folder in sys.path))
+
+
+@lru_cache(maxsize=1)
+def _read_again(_folders: tuple[tuple[str, float], ...]) -> tuple[EntryPoint, ...]:
+    """Read those of every installed package: hundreds of files, which shared file systems are slow to open.
+
+    A solve asks for its energy many times. A package that is installed meanwhile changes a folder of the path.
+    """
+    return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
+
+
+def _modified(folder: str) -> float:
+    try:
+        return os.stat(folder or ".").st_mtime
+    except OSError:
+        return 0.0
+
+
 def named(text: str) -> Any:
     """Import and return the object that a string "module:Name" names."""
     module, _, name = text.partition(":")
@@ -132,7 +156,7 @@ def dotted(document: Any) -> Iterator[str]:
 def installed(document: Any) -> Iterator[str]:
     """Return the modules of all kinds in a document that installed packages declare, in whichever family."""
     points: dict[str, list[str]] = {}
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+    for point in _declared():
         points.setdefault(point.name.partition(".")[2], []).append(point.module)
     for kind in _kinds(document):
         yield from points.get(kind, ())

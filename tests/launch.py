@@ -23,7 +23,8 @@ def environment():
     if clean.pop(NOT_KEPT, ""):
         clean.setdefault("PYTHONPYCACHEPREFIX", f"{tempfile.gettempdir()}/tissuq-tests-{os.getuid()}")
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}  # other tests run beside
+    shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
+    shared |= {"OMPI_MCA_hwloc_base_binding_policy": "none"}  # other tests run beside, on the same cores if bound
     return clean | root | shared | {"OMP_NUM_THREADS": "1"}
 
 

@@ -324,5 +324,11 @@ def _distribution(top: str) -> str | None:
     try:
         importlib.metadata.version(top)
     except importlib.metadata.PackageNotFoundError:
-        return next(iter(importlib.metadata.packages_distributions().get(top, [])), None)
+        return next(iter(_distributions().get(top, [])), None)
     return top
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Distributions by package; finding them reads the lists of files of all."""
+    return importlib.metadata.packages_distributions()

@@ -1,5 +1,6 @@
 """Kinds by name: what is asked for is imported, what cannot be is said with its place."""
 
+import importlib.metadata
 import sys
 from typing import Annotated
 
@@ -80,3 +81,26 @@ def test_the_schema_knows_the_kinds():
     named = {one["$ref"].rpartition("/")[2] for one in schema["properties"]["first"]["anyOf"] if "$ref" in one}
     assert named == {"Gravity", "Traction"}
     assert named <= schema["$defs"].keys()
+
+
+def test_metadata_of_installed_packages_are_read_once(outside, tmp_path, monkeypatch):
+    """A solve asks for its energy many times; a package that is installed meanwhile is found."""
+    read = []
+
+    def entry_points(**group):
+        read.append(group)
+        return found(**group)
+
+    found = importlib.metadata.entry_points
+    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
+    assert "gale" not in LOADS
+    read.clear()
+    assert "gale" not in LOADS
+    assert not read
+    information = tmp_path / "my_loads-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: my-loads\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[tissuq]\nload.gale = my_loads:Wind\n")
+    for _ in range(3):
+        assert LOADS["gale"].__name__ == "Wind"
+    assert len(read) == 1
