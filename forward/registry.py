@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
@@ -135,7 +135,7 @@ def _read_again(_folders: tuple[tuple[str, float], ...]) -> tuple[EntryPoint, ..
 
 def _modified(folder: str) -> float:
     try:
-        return os.stat(folder or ".").st_mtime
+        return Path(folder).stat().st_mtime
     except OSError:
         return 0.0
 
