@@ -11,8 +11,6 @@ from forward.machine import Headroom, out_of_memory, out_of_room, reason_to_stop
 from forward.model import SolveError
 from tests.launch import run_script
 
-pytestmark = pytest.mark.unit
-
 
 def test_the_smallest_limit_counts():
     script = """
@@ -32,6 +30,7 @@ assert 20 * MIB < headroom().size < 41 * MIB
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("membership", "folder", "names"),
     [
@@ -56,6 +55,7 @@ def test_limits_of_control_groups_and_of_those_above_them(tmp_path, membership, 
     assert list(machine._of_control_groups(root, own)) == [Headroom(500, "limit of the control group")]
 
 
+@pytest.mark.unit
 def test_exceptions_that_mean_no_memory():
     with pytest.raises(MemoryError) as numpy_said:
         np.empty(2**60, dtype=np.uint8)
@@ -76,6 +76,7 @@ def test_exceptions_that_mean_no_memory():
         assert reason_to_stop(error) is None
 
 
+@pytest.mark.unit
 def test_what_came_of_a_lack_of_memory_is_one_too():
     later = ValueError("later")
     later.__cause__ = MemoryError()
@@ -87,6 +88,7 @@ def test_what_came_of_a_lack_of_memory_is_one_too():
     assert not out_of_memory(later)
 
 
+@pytest.mark.unit
 def test_a_full_disk_is_named():
     with pytest.raises(OSError, match="No space left") as raised, open("/dev/full", "wb", buffering=0) as full:  # noqa: PTH123
         full.write(b"x")

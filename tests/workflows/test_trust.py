@@ -4,11 +4,7 @@ import ast
 import re
 from functools import cache
 
-import pytest
-
 from tests.launch import ROOT
-
-pytestmark = pytest.mark.unit
 
 PAGE = (ROOT / "docs" / "trust.md").read_text()
 PASSED_ON = {"uq.findings:_kept"}  # reads what others have found

@@ -10,8 +10,6 @@ from forward.bodies.location import locate, shapes
 from forward.bodies.nested import RATIO, layers_of, within
 from forward.model import ModelError
 
-pytestmark = pytest.mark.unit
-
 CORNERS = tuple((2 * x + 0.3 * z * y, y, z + 0.2 * x) for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0))
 BODIES = {
     "box": Box(size=(2.0, 1.0, 1.0), cells=(3, 2, 2), cell="hexahedron"),
@@ -84,6 +82,7 @@ def test_cells_are_thinner_at_the_rims_of_what_is_held():
     assert plain.cell_count == 8 * BODIES["box"].cell_count
 
 
+@pytest.mark.unit
 def test_layers_make_first_cells_as_thin_as_they_are_to_be():
     body = BODIES["box"].model_copy(update={"cells": (4, 12, 40)})
     layers = layers_of(body, 2)
@@ -92,6 +91,7 @@ def test_layers_make_first_cells_as_thin_as_they_are_to_be():
     assert max(first) <= 1 / 32
 
 
+@pytest.mark.unit
 def test_meshes_that_are_too_large_are_not_made():
     large = BODIES["box"].model_copy(update={"cells": (150, 150, 150)})
     with pytest.raises(ModelError, match="unknowns, expected"):

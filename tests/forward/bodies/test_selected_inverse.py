@@ -8,8 +8,6 @@ from forward.bodies.geometry import Box
 from forward.bodies.random_fields import Matern
 from forward.bodies.selected_inverse import SMALLEST, Dissection
 
-pytestmark = pytest.mark.unit
-
 
 def problem(n, density, seed=0):
     """Symmetric matrices with the same pattern, both positive definite, at random places."""
@@ -23,6 +21,7 @@ def problem(n, density, seed=0):
     return A, M, rng.uniform(size=(n, 3))
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(("n", "density"), [(1, 1.0), (SMALLEST, 0.1), (150, 0.02), (400, 0.004), (300, 0.0)])
 @pytest.mark.parametrize("order", [0, 1, 3])
 def test_coefficients_are_those_of_dense_algebra(n, density, order):
@@ -34,6 +33,7 @@ def test_coefficients_are_those_of_dense_algebra(n, density, order):
     np.testing.assert_allclose(found, expected, rtol=1e-11)
 
 
+@pytest.mark.unit
 def test_places_only_choose_the_order():
     A, M, places = problem(200, 0.02)
     one, other = (Dissection(A, p).diagonal_of_inverse(A, M, 1) for p in (places, np.zeros((200, 3))))
@@ -50,6 +50,7 @@ def test_separators_of_a_lattice_are_layers():
     assert max(len(front.own) for front in found._fronts) <= 1.5 * n**2
 
 
+@pytest.mark.unit
 @pytest.mark.fem
 @pytest.mark.parametrize("smoothness", [2, 4])
 def test_fields_have_variance_one_at_every_vertex(smoothness):

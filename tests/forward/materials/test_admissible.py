@@ -12,9 +12,8 @@ from tests.bodies import CONSTANTS
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
-pytestmark = pytest.mark.unit
 
-
+@pytest.mark.unit
 @pytest.mark.parametrize("kind", list(MATERIALS))
 def test_moduli_are_second_derivatives_of_the_energy(kind):
     values = CONSTANTS[kind] | ({"D1": 3e4} if "D1" in constants(MATERIALS[kind]) else {})
@@ -25,6 +24,7 @@ def test_moduli_are_second_derivatives_of_the_energy(kind):
     assert admissible(kind, arrays).all()
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("kind", "values", "told"),
     [
@@ -47,6 +47,7 @@ def test_which_constants_make_a_material(kind, values, told):
     assert objection(kind, values) is None if told is None else told in objection(kind, values)
 
 
+@pytest.mark.unit
 def test_probability_of_materials():
     inputs = Inputs({"C1": Normal(mean=100.0, std=50.0), "C2": Normal(mean=0.0, std=50.0)})
     materials = Materials("mooney-rivlin", {"material": {"C1": "C1", "C2": "C2"}})
@@ -59,6 +60,7 @@ def test_probability_of_materials():
     assert bounded.admitted == 1
 
 
+@pytest.mark.unit
 def test_bodies_and_their_regions():
     block = {
         "body": {"kind": "box", "size": [1.0, 1.0, 1.0], "cells": [1, 1, 1], "cell": "hexahedron", "degree": 1},

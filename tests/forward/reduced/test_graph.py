@@ -8,8 +8,6 @@ from forward.reduced import kernels
 from forward.reduced.graph import SELECT, UNARY, Graph, from_arrays, to_arrays
 from forward.reduced.kernels import Kernel, spread
 
-pytestmark = pytest.mark.unit
-
 
 def expression(graph, ops):
     """A function of three inputs that uses every operation, as a graph and by SymPy."""
@@ -39,6 +37,7 @@ def test_first_and_second_derivatives_are_those_of_sympy():
     np.testing.assert_allclose(found, expected, rtol=1e-13)
 
 
+@pytest.mark.unit
 def test_a_choice_has_the_derivative_of_what_is_chosen():
     graph = Graph(2)
     larger = graph.apply(SELECT, 0, 1, graph.mul(1, 1), graph.mul(0, graph.constant(3)))
@@ -49,6 +48,7 @@ def test_a_choice_has_the_derivative_of_what_is_chosen():
     np.testing.assert_allclose([one[1] for one in tape((np.array([1.0, 4.0]), np.array([2.0, 2.0])))], [12, 3, 0])
 
 
+@pytest.mark.unit
 def test_compiled_and_numpy_agree_also_for_what_is_the_same_at_all_points(monkeypatch):
     graph = Graph(3)
     total, _, _ = expression(graph, None)
@@ -66,6 +66,7 @@ def test_compiled_and_numpy_agree_also_for_what_is_the_same_at_all_points(monkey
     np.testing.assert_allclose(single, compiled(points, numbers), rtol=2e-6)
 
 
+@pytest.mark.unit
 def test_spread_is_a_product_at_every_point(monkeypatch):
     H, B = np.random.default_rng(1).standard_normal((3, 4, 5)), np.random.default_rng(2).standard_normal((4, 5, 6))
     np.testing.assert_allclose(spread(H, B), np.einsum("ijq,jqk->iqk", H, B), rtol=1e-13)
@@ -73,6 +74,7 @@ def test_spread_is_a_product_at_every_point(monkeypatch):
     np.testing.assert_allclose(spread(H, B), np.einsum("ijq,jqk->iqk", H, B), rtol=1e-13)
 
 
+@pytest.mark.unit
 def test_arrays_and_back():
     graph = Graph(3)
     total, _, _ = expression(graph, None)
@@ -83,6 +85,7 @@ def test_arrays_and_back():
     assert other.tape(outputs)((0.3, 0.4, 0.5)) == pytest.approx(tape((0.3, 0.4, 0.5)), rel=1e-15)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(("name", "value"), [("outputs", 10_000), ("codes", 999), ("arguments", 10_000)])
 def test_arrays_that_are_no_tape_are_refused(name, value):
     graph = Graph(3)

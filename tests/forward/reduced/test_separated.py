@@ -18,8 +18,6 @@ from forward.reduced.separated import (
     linear_stencil,
 )
 
-pytestmark = pytest.mark.unit
-
 N, S, Z = 40, 25, 7
 K = sp.diags([-np.ones(N - 1), 2.05 * np.ones(N), -np.ones(N - 1)], [-1, 0, 1]).tocsc()
 F = np.exp(-((np.linspace(0, 1, N)[:, None] - np.linspace(0, 1, S)) ** 2) / 0.02)
@@ -36,6 +34,7 @@ def of_parameter():
     return np.array([spsolve((o * K + 0.1 * sp.eye(N)).tocsc(), F) for o in OMEGA]).transpose(1, 2, 0)
 
 
+@pytest.mark.unit
 def test_snapshots_are_separated_to_a_tolerance():
     exact = of_parameter()
     for tolerance in (1e-1, 1e-3, 1e-6):
@@ -55,12 +54,14 @@ def test_snapshots_are_separated_to_a_tolerance():
     assert relative(one.whole(), flat) == pytest.approx(left, rel=1e-6)
 
 
+@pytest.mark.unit
 def test_weights_say_what_counts():
     exact, weights = of_parameter()[:, :, 0], np.where(np.arange(N) < 5, 1e6, 1.0)
     plain, weighted = (from_snapshots(exact, 1e-9, w).first(3).whole() for w in (None, weights))
     assert relative(weighted[:5], exact[:5]) < 0.3 * relative(plain[:5], exact[:5])
 
 
+@pytest.mark.unit
 def test_alternating_directions_find_the_solution_without_one():
     exact = spsolve(K, F)
     load = Separated(np.ascontiguousarray(F.T), np.arange(S), (np.eye(S),))
@@ -85,6 +86,7 @@ def test_alternating_directions_with_a_stiffness_as_a_coordinate():
     assert relative(found.whole(), of_parameter()) < 3e-4
 
 
+@pytest.mark.unit
 def test_a_point_between_those_of_the_grids():
     exact = of_parameter()
     found = from_snapshots(exact, 1e-10)
@@ -117,6 +119,7 @@ def test_the_rod_of_the_literature():
     assert u[4, 3] == pytest.approx(u[8, 7] / 2, rel=1e-5)
 
 
+@pytest.mark.unit
 def test_the_beam_of_the_literature_stretches_as_elasticity_says():
     points, cells = beam_mesh((4, 2, 2))
     matrix = elasticity(points, cells, 1.0, 0.25)

@@ -16,8 +16,6 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
 
-pytestmark = pytest.mark.unit
-
 RNG = np.random.default_rng(5)
 B, OFFSET = RNG.standard_normal((7, 2)), RNG.standard_normal(7)
 GAP = 0.4 * RNG.standard_normal(7)
@@ -46,6 +44,7 @@ def exact(gap, scale=1.0):
     return multivariate_normal(B @ [1.0, 0.0] + OFFSET + gap, spread).logpdf(DATA)
 
 
+@pytest.mark.unit
 def test_known_errors():
     """The exact change of ln Z and of the mode."""
     given = posterior()
@@ -75,6 +74,7 @@ def test_errors_of_unknown_size():
     np.testing.assert_allclose(found.error, GAP / (factor * SIGMA), rtol=1e-12)
 
 
+@pytest.mark.unit
 def test_what_is_not_known_is_said():
     given = posterior()
 
@@ -89,6 +89,7 @@ def test_what_is_not_known_is_said():
         assert np.isnan(found.shift).all()
 
 
+@pytest.mark.unit
 def test_meshes_that_decide_are_an_error():
     values, near = {"soft": -10.0, "stiff": -14.0}, {"soft": 0.4, "stiff": 1.9}
     (note,) = meshes_too_coarse(values, {"soft": -0.3, "stiff": 0.9}, near)
@@ -104,6 +105,7 @@ def test_meshes_that_decide_are_an_error():
     assert not meshes_too_coarse(values, {"soft": np.nan, "stiff": np.nan}, near)
 
 
+@pytest.mark.unit
 def test_candidates_of_which_only_some_are_corrected_do_not_compare():
     assert not meshes_not_alike(["soft"], [])
     assert not meshes_not_alike([], ["stiff"])
@@ -112,6 +114,7 @@ def test_candidates_of_which_only_some_are_corrected_do_not_compare():
     assert "the meshes of soft are corrected, and those of stiff, other could not be looked at" in doubt.text
 
 
+@pytest.mark.unit
 def test_beyond_two_deviations_only_that_it_is_large():
     """To first order an evidence may seem to stay where it moves by more than one."""
     values = {"soft": -10.0, "stiff": -14.0}

@@ -11,8 +11,6 @@ from inverse.data.observations import distinct, files
 from inverse.data.scans import Scan
 from inverse.data.table import DataError
 
-pytestmark = pytest.mark.unit
-
 BODY = Box(size=(1.0, 1.0, 1.0), cells=(1, 1, 1))
 CASES = ("shear", "extension")
 TABLE = """\
@@ -39,6 +37,7 @@ def table(tmp_path):
     return write
 
 
+@pytest.mark.unit
 def test_patterns_say_files_also_in_full(tmp_path):
     """From the root on, in folders below, in a folder whose name looks like a pattern; folders are no files."""
     place = tmp_path / "[a]*"
@@ -57,6 +56,7 @@ def test_patterns_say_files_also_in_full(tmp_path):
             files([pattern], [tmp_path / "none"])
 
 
+@pytest.mark.unit
 def test_different_files_have_different_names():
     """Results, and what is kept of solves, are by these."""
     for paths, names in (
@@ -73,6 +73,7 @@ def test_different_files_have_different_names():
         assert found == names
 
 
+@pytest.mark.unit
 def test_a_table_is_read_component_by_component(table):
     found = read(table(), CASES, unit=1e-3)
     assert found.source == ("speckles of the camera",)
@@ -85,6 +86,7 @@ def test_a_table_is_read_component_by_component(table):
     np.testing.assert_allclose(rows.sigma, [1e-5, 2e-5, 1e-5, 1e-5])
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
@@ -115,12 +117,14 @@ def test_one_line_for_a_mistake(table, old, new, told):
     assert all(line.startswith("data.csv: ") and "\n" not in line for line in caught.value.args)
 
 
+@pytest.mark.unit
 def test_marks_of_other_programs_do_not_matter(table):
     found = read(table("\ufeff" + TABLE.replace("\n", "\r\n") + ",,,,,,\n"), CASES)
     assert len(found.places) == 3
     assert found.source == ("speckles of the camera",)
 
 
+@pytest.mark.unit
 def test_points_are_put_on_the_body(table):
     found = read(table(TABLE.replace("0, 0.5, 0.5, 0.1", "-0.01, 0.5, 0.5, 0.1")), CASES)
     with pytest.raises(DataError, match=r"data.csv: line 4: \(-0.01, 0.5, 0.5\) lies 0.01 m outside the body"):
@@ -147,6 +151,7 @@ def test_nearest_places_of_a_block():
     np.testing.assert_allclose(block.nearest(points)[3], [*foot, 0.5], atol=1e-6)
 
 
+@pytest.mark.unit
 def test_sigma_is_needed_where_something_was_measured(table):
     found = read(table(TABLE.replace("0.02", "")), CASES)
     with pytest.raises(DataError, match=r"line 5: no sigma, expected a column sigma or data\.sigma"):
@@ -154,6 +159,7 @@ def test_sigma_is_needed_where_something_was_measured(table):
     assert found.with_sigma(0.5).components().sigma[1] == 0.5
 
 
+@pytest.mark.unit
 def test_files_folders_and_patterns(tmp_path):
     for name in ("b.csv", "a.csv", "note.md"):
         (tmp_path / name).touch()

@@ -10,8 +10,6 @@ from forward.bodies.surface import Surface
 from inverse.data.registration import Given, Landmarks, Rigid, ToSurface, crosses, register, slopes, turned
 from inverse.data.table import DataError
 
-pytestmark = pytest.mark.unit
-
 SIZE = np.array([0.05, 0.04, 0.03])
 BOX = Surface.of(Box(size=tuple(SIZE), cells=(2, 2, 2)))
 TRUE = Rigid(turned((2.0, -1.0, 5.0)), np.array([0.01, -0.004, 0.002]))
@@ -38,6 +36,7 @@ def gap(found):
     return np.concatenate([turn, TRUE(origin[None])[0] - found.centre])
 
 
+@pytest.mark.unit
 def test_rotations_are_those_of_scipy():
     angles = (20.0, -35.0, 110.0)
     np.testing.assert_allclose(turned(angles), Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), atol=1e-15)
@@ -46,6 +45,7 @@ def test_rotations_are_those_of_scipy():
     np.testing.assert_allclose(crosses(u[None])[0] @ v, np.cross(u, v))
 
 
+@pytest.mark.unit
 def test_slopes_are_those_of_differences():
     points, centre, h = on_box(4), np.array([0.01, 0.02, 0.0]), 1e-7
     J = slopes(points, centre)
@@ -54,6 +54,7 @@ def test_slopes_are_those_of_differences():
         np.testing.assert_allclose((moved - points) / h, J[:, :, k], atol=1e-8)
 
 
+@pytest.mark.unit
 def test_known_motions():
     """Angles and shift, or a matrix, in the unit of the file."""
     points = back(on_box(20))
@@ -132,6 +133,7 @@ MATRIX = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 THREE = tuple(row[:3] for row in MATRIX)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("how", "settings", "told"),
     [
@@ -157,6 +159,7 @@ def test_no_rigid_motions(how, settings, told):
     assert told in str(caught.value)
 
 
+@pytest.mark.unit
 def test_what_cannot_be_registered():
     there = on_box(6)
 

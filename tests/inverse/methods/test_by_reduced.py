@@ -232,7 +232,6 @@ def direct(body):
     return invert_by_group(INPUTS, body, DATA, Invert(starts=1, samples=256), None, finer=None)
 
 
-@pytest.mark.unit
 def test_a_wrong_reduced_model_is_corrected_to_the_exact_posterior():
     """Linear errors are corrected by one solve with derivatives, curved ones by those at draws."""
     body = model(bend=0.05)
@@ -244,7 +243,6 @@ def test_a_wrong_reduced_model_is_corrected_to_the_exact_posterior():
     assert float(found["solves"]) < 30
 
 
-@pytest.mark.unit
 def test_where_no_line_corrects_it_the_weights_say_so():
     found = by_reduced(model(), model(ripple=0.3))
     share, shift = float(found["reduced_share"]), found["reduced_shift"].to_numpy()
@@ -256,7 +254,6 @@ def test_where_no_line_corrects_it_the_weights_say_so():
     assert [one.severity for one in reduced_off(0.97, {"a": 0.04}, 30)] == ["note"]
 
 
-@pytest.mark.unit
 def test_agreement_of_gaussians_is_in_closed_form():
     """Draws of N(0, 1) against N(a, 1) times a factor: share e^(−a²), shift a, log of the factor."""
     rng, a = np.random.default_rng(1), 0.3
@@ -268,7 +265,6 @@ def test_agreement_of_gaussians_is_in_closed_form():
     assert nothing.share == 0
 
 
-@pytest.mark.unit
 def test_corrections_change_as_little_as_suits_the_solves():
     start = Corrected(SerialEvaluate(model()), np.zeros(2), np.zeros(3), np.zeros((3, 2)))
     rng = np.random.default_rng(2)

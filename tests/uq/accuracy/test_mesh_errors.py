@@ -24,8 +24,6 @@ from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 from uq.methods.sobol import Sobol
 from uq.surrogates.linearisation import linearised
 
-pytestmark = pytest.mark.unit
-
 INPUTS = Inputs({"a": Beta(a=2, b=2, lower=1.0, upper=1.5), "b": Uniform(lower=1.0, upper=2.0)})
 TOLD = Told({"u": "m", "v": "Pa"})
 
@@ -276,6 +274,7 @@ def test_many_parameters_by_few_estimates(more, method):
     np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.25)
 
 
+@pytest.mark.unit
 def test_local_derivatives_alone():
     _, found = studied(LocalSensitivity(), on_mesh(lambda p: [0.05 * p[0] / p[1], 0.1 * p[0] ** 2 / p[1]]))
     np.testing.assert_allclose(found["derivative_mesh_error"][0], 0.05 * found["derivative"][0], rtol=1e-5)
@@ -405,11 +404,13 @@ def test_designs_begin_at_the_mean_and_are_spread(count, d):
         assert np.linalg.svd(inputs.coordinates.of(points))[1][1] > 0.9
 
 
+@pytest.mark.unit
 def test_the_number_of_estimates_is_a_fifth_of_the_solves():
     assert [estimates_for(n) for n in (1, 50, 100, 200, 10_000)] == [3, 3, 5, 10, MOST]
     assert [estimates_for(100, paid) for paid in (-3.0, 2.9, 3.2, 4.0, 100.0)] == [2, 2, 3, 4, 5]
 
 
+@pytest.mark.unit
 def test_results_of_other_shapes_are_left_alone():
     """As methods from outside may give them."""
     model = on_mesh(affine)

@@ -5,17 +5,17 @@ import pytest
 
 from uq.estimators.blue import Problem, informations, subsets, weights
 
-pytestmark = pytest.mark.unit
-
 C = np.array([[1.0, 0.99, 0.9], [0.99, 1.1, 0.89], [0.9, 0.89, 1.2]])
 GROUPS = subsets(3)
 COSTS = np.array([sum((1, 0.05, 0.002)[k] for k in group) for group in GROUPS])
 
 
+@pytest.mark.unit
 def test_groups_are_all_sets():
     assert GROUPS == [(0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)]
 
 
+@pytest.mark.unit
 def test_weights_are_those_of_least_squares():
     rng = np.random.default_rng(0)
     counts = np.array([5.0, 0, 3, 40, 0, 0, 100])
@@ -42,6 +42,7 @@ def test_weights_are_those_of_least_squares():
         assert other @ S @ other > best @ S @ best
 
 
+@pytest.mark.unit
 def test_two_models_are_shared_as_is_known():
     """Approximate control variate with a cheap model: N_1/N_0 = √(c_0 ρ²/(c_1 (1 − ρ²))) in closed form."""
     rho, cost = 0.95, 0.01
@@ -79,6 +80,7 @@ def test_no_other_optimiser_finds_better_numbers(several):
     assert problem.variances(problem.taken + problem.best(0.8 * cost)).max() > target
 
 
+@pytest.mark.unit
 def test_models_that_are_the_same_do_no_harm():
     same = np.ones((3, 3))
     a = weights(informations(GROUPS, same), np.array([8.0, 0, 0, 0, 0, 0, 1000]))

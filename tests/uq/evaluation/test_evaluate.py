@@ -17,8 +17,6 @@ from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
-pytestmark = pytest.mark.unit
-
 
 def product(p):
     if p[0] > 0.9:
@@ -39,6 +37,7 @@ def test_rows_are_in_the_order_of_the_points():
     np.testing.assert_array_equal(evaluations.tangents[ok, 0], POINTS[ok][:, ::-1])
 
 
+@pytest.mark.unit
 def test_failures_are_kept_with_their_reason():
     evaluations = SerialEvaluate(MODEL)(Request(POINTS))
     assert len(evaluations.failures) == (POINTS[:, 0] > 0.9).sum()
@@ -49,6 +48,7 @@ def test_failures_are_kept_with_their_reason():
         assert np.isnan(evaluations.outputs[failure.index]).all()
 
 
+@pytest.mark.unit
 def test_residuals_are_kept(tmp_path):
     request = Request(POINTS[:200], iterations=3)
     evaluations = SerialEvaluate(MODEL)(request)
@@ -63,6 +63,7 @@ def test_residuals_are_kept(tmp_path):
     np.testing.assert_array_equal(found.converged, evaluations.converged)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("n", [1, 2, BLOCKS, BLOCKS + 1, 10_000])
 def test_blocks_cover_all_points_in_order(n):
     points = np.arange(n, dtype=float)[:, None]
@@ -72,6 +73,7 @@ def test_blocks_cover_all_points_in_order(n):
     assert len(Request(points).blocks(n)) == n
 
 
+@pytest.mark.unit
 def test_points_that_begin_from_predictions_go_in_company():
     points, start = np.zeros((10_000, 1)), object()
     largest = [
@@ -81,6 +83,7 @@ def test_points_that_begin_from_predictions_go_in_company():
     assert max(len(one.points) for one in Request(points[:400], start=start).blocks()) == 16
 
 
+@pytest.mark.unit
 def test_checkpoint_returns_what_was_saved(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     request = Request(POINTS[:8], tangents=True)
@@ -99,6 +102,7 @@ def test_checkpoint_returns_what_was_saved(tmp_path):
     np.testing.assert_array_equal(load_evaluations(tmp_path / "evaluations.h5").outputs, evaluations.outputs)
 
 
+@pytest.mark.unit
 def test_a_damaged_block_is_computed_again(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     request = Request(POINTS[:8])
@@ -129,6 +133,7 @@ def test_a_flipped_bit_anywhere_is_found(tmp_path, capsys):
         )
 
 
+@pytest.mark.unit
 def test_exchanged_blocks_are_found(tmp_path, capsys):
     checkpoint = Checkpoint(tmp_path, "study")
     requests = [Request(POINTS[:8]), Request(POINTS[8:16])]
@@ -143,6 +148,7 @@ def test_exchanged_blocks_are_found(tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 2
 
 
+@pytest.mark.unit
 def test_damage_of_all_evaluations_is_found(tmp_path):
     evaluations = SerialEvaluate(MODEL)(Request(POINTS[:8]))
     Checkpoint(tmp_path, "study").consolidate({"a/b": evaluations, "c": evaluations})
@@ -154,6 +160,7 @@ def test_damage_of_all_evaluations_is_found(tmp_path):
         load_evaluations(path, "c")
 
 
+@pytest.mark.unit
 def test_a_block_is_found_by_what_was_asked(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     request = Request(POINTS[:8])
@@ -164,17 +171,20 @@ def test_a_block_is_found_by_what_was_asked(tmp_path):
     assert key != Checkpoint(tmp_path, "another study").key(request)
 
 
+@pytest.mark.unit
 def test_wrong_number_of_outputs_is_the_callers_mistake():
     model = FunctionModel(lambda p: p, ("a",), ("x", "y"))
     with pytest.raises(ValueError, match="expected"):
         SerialEvaluate(model)(Request(np.ones((1, 1))))
 
 
+@pytest.mark.unit
 def test_values_that_are_not_finite_are_failures():
     model = FunctionModel(lambda p: np.inf, ("a",), ("x",))
     assert len(SerialEvaluate(model)(Request(np.ones((3, 1)))).failures) == 3
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("scale", [1e-200, 1e-90, 1e90, 1e200])
 @pytest.mark.parametrize("kind", [MonteCarlo, QuasiMonteCarlo, Chaos])
 def test_outputs_of_which_no_moments_are_numbers_are_refused(kind, scale):
@@ -185,6 +195,7 @@ def test_outputs_of_which_no_moments_are_numbers_are_refused(kind, scale):
         kind(samples=32).run(inputs, SerialEvaluate(model))
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("scale", [1e-59, 1e59])
 def test_other_outputs_are_estimated_whatever_their_size(scale):
     inputs = Inputs({"a": Uniform(lower=1.0, upper=2.0)})

@@ -11,8 +11,6 @@ from tests.states import WithState
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.kept import KeptModel
 
-pytestmark = pytest.mark.unit
-
 NAMES = ("a", "b")
 POINT = np.array([0.3, -0.2])
 

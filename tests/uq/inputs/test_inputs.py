@@ -20,8 +20,6 @@ from uq.inputs.distributions import (
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import even_points, random_points, sobol_points
 
-pytestmark = pytest.mark.unit
-
 # Each block beside SciPy's version of the same distribution.
 PAIRS = [
     (Uniform(lower=2.0, upper=5.0), stats.uniform(2, 3)),
@@ -35,6 +33,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(("block", "reference"), PAIRS, ids=lambda p: getattr(p, "kind", ""))
 def test_distribution_agrees_with_scipy(block, reference):
     p = np.array([1e-6, 0.01, 0.3, 0.5, 0.9, 1 - 1e-6])
@@ -42,15 +41,18 @@ def test_distribution_agrees_with_scipy(block, reference):
     np.testing.assert_allclose(block.moments, (reference.mean(), reference.std()), rtol=1e-5)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("block", [block for block, _ in PAIRS], ids=lambda b: b.kind)
 def test_distribution_survives_its_own_dump(block):
     assert TypeAdapter(Distribution).validate_python(block.model_dump()) == block
 
 
+@pytest.mark.unit
 def test_log_normal_is_given_by_its_own_moments():
     assert LogNormal(mean=2.0, std=0.5).moments == pytest.approx((2.0, 0.5))
 
 
+@pytest.mark.unit
 def test_copula_gives_the_correlation_of_normals():
     inputs = Inputs({"a": Normal(mean=1.0, std=2.0), "b": Normal(mean=0.0, std=3.0)}, (("a", "b", 0.6),))
     np.testing.assert_allclose(inputs.correlation, [[1, 0.6], [0.6, 1]], rtol=1e-10)
@@ -70,12 +72,14 @@ def test_correlation_is_that_of_the_coordinates_of_points():
     np.testing.assert_allclose(points.mean(axis=0), inputs.mean, rtol=4e-3)
 
 
+@pytest.mark.unit
 def test_correlation_keeps_the_marginals():
     inputs = Inputs({"a": Uniform(lower=0, upper=1), "b": Uniform(lower=0, upper=1)}, (("a", "b", 0.9),))
     points = inputs.points(random_points(5, 0, 20_000, 2))
     assert stats.kstest(points[:, 1], "uniform").pvalue > 1e-3
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("correlations", "message"),
     [
@@ -91,6 +95,7 @@ def test_impossible_correlations(correlations, message):
         Inputs(marginals, correlations)
 
 
+@pytest.mark.unit
 def test_points_depend_on_seed_and_index_only():
     whole = random_points(7, 0, 100, 3)
     np.testing.assert_array_equal(random_points(7, 40, 60, 3), whole[40:60])
@@ -175,6 +180,7 @@ def test_moments_up_to_the_fourth(marginal, density, breaks):
     np.testing.assert_allclose(moments_of(marginal), exactly(density, *breaks), rtol=1e-7)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(("a", "b"), [(0.5, 1.5), (1.3, 0.7), (1e-3, 1e-3), (1e-2, 5.0), (1e3, 2e3), (1.0, 1.0)])
 def test_beta_at_awkward_exponents(a, b):
     skewness = 2 * (b - a) * np.sqrt(a + b + 1) / ((a + b + 2) * np.sqrt(a * b))
@@ -183,6 +189,7 @@ def test_beta_at_awkward_exponents(a, b):
     np.testing.assert_allclose(moments_of(Beta(a=a, b=b, lower=0.0, upper=1.0)), expected, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("cv", [1e-3, 0.1, 1.0, 10.0])
 def test_log_normal_from_narrow_to_wide(cv):
     marginal = LogNormal(mean=3.0, std=3 * cv)
@@ -208,6 +215,7 @@ AWKWARD = [
 ]
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("marginal", AWKWARD, ids=lambda m: m.kind)
 def test_normal_coordinates_of_awkward_distributions(marginal):
     from scipy.special import ndtr
@@ -223,6 +231,7 @@ def test_normal_coordinates_of_awkward_distributions(marginal):
     np.testing.assert_allclose(marginal.density(values) * slopes, bell, rtol=1e-5)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     "build",
     [
@@ -241,6 +250,7 @@ def test_distributions_too_narrow_for_numbers_are_refused(build):
         build()
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("dimension", [1, 2, 7, 40, 300])
 def test_sobol_points_are_those_of_scipy_before_they_are_scrambled(dimension, monkeypatch):
     """A scramble by the unit matrix and no shift leaves them."""
@@ -249,6 +259,7 @@ def test_sobol_points_are_those_of_scipy_before_they_are_scrambled(dimension, mo
     np.testing.assert_array_equal(sobol_points(1, 0, 0, 2**9, dimension) - 2.0**-53, expected)
 
 
+@pytest.mark.unit
 def test_more_dimensions_than_sobol_points_have():
     with pytest.raises(ValueError, match="30000 dimensions, expected at most 21201"):
         even_points(8, 30000)

@@ -17,8 +17,6 @@ from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
-pytestmark = pytest.mark.unit
-
 UNIT = Uniform(lower=0.0, upper=1.0)
 
 

@@ -14,8 +14,6 @@ from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
-pytestmark = pytest.mark.unit
-
 INPUTS = Inputs({"a": Uniform(lower=0.0, upper=1.0), "b": Uniform(lower=0.0, upper=1.0)})
 MODEL = FunctionModel(
     lambda p: np.exp(p[0]) * (1 + p[1]),

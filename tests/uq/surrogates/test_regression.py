@@ -14,13 +14,12 @@ from uq.surrogates.candidates import DICTIONARY, Candidate, candidates_of
 from uq.surrogates.least_squares import Data, _Products, _select
 from uq.surrogates.regression import Regression
 
-pytestmark = pytest.mark.unit
-
 
 def inputs_of(d):
     return Inputs({f"x{i}": Uniform(lower=-1, upper=1) for i in range(d)})
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("q", [0.5, 0.75, 1.0])
 @pytest.mark.parametrize(("d", "order"), [(1, 4), (2, 6), (3, 5), (5, 3)])
 def test_hyperbolic_sets_are_those_of_their_definition(d, order, q):
@@ -60,6 +59,7 @@ def by_projections(columns, right, held, steps):
     return np.array(picks).T
 
 
+@pytest.mark.unit
 def test_selection_by_inner_products_is_that_by_projections():
     inputs = inputs_of(6)
     basis = orthonormal(inputs, hyperbolic(6, 3, 0.75))

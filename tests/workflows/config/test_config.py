@@ -20,8 +20,6 @@ from workflows.run.plan import plan
 from workflows.starter import _METHODS, starter
 from workflows.studies.sampling import Study
 
-pytestmark = pytest.mark.unit
-
 CONFIGS = sorted((Path(__file__).parent.parent.parent.parent / "configs").glob("*.toml"))
 
 
@@ -36,6 +34,7 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
     assert path.read_text().startswith("# "), "a shipped study begins with what it shows and how long it takes"
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     "kind",
     [
@@ -56,6 +55,7 @@ def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind
 
 
+@pytest.mark.unit
 def test_chaos_needs_independent_parameters():
     names = list(blocks()["parameters"])
     control = blocks() | {"method": {"kind": "quasi-monte-carlo", "samples": 32, "control": "chaos"}}
@@ -69,6 +69,7 @@ def test_chaos_needs_independent_parameters():
         parse(document_ | {"correlations": [{"between": names, "value": 0.3}]})
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("kind", ["sobol", "derivative-based"])
 def test_indices_need_independent_parameters(kind):
     names = list(blocks()["parameters"])
@@ -78,6 +79,7 @@ def test_indices_need_independent_parameters(kind):
         parse(document_ | {"correlations": [{"between": names, "value": 0.3}]})
 
 
+@pytest.mark.unit
 def test_groups_are_of_known_parameters():
     method = {"kind": "sobol", "design": "saltelli", "samples": 64, "groups": {"load": ["loads.gravity.density"]}}
     document_ = blocks() | {"method": method}
@@ -87,6 +89,7 @@ def test_groups_are_of_known_parameters():
         parse(document_ | {"method": method | {"groups": {"stiffness": ["material.D2"]}}})
 
 
+@pytest.mark.unit
 def test_a_study_is_a_few_lines_of_python():
     model = Hyperelastic(
         body=Box(size=(0.1, 0.02, 0.02), cells=(4, 1, 1)),
@@ -99,6 +102,7 @@ def test_a_study_is_a_few_lines_of_python():
     assert parse(document(study)) == study
 
 
+@pytest.mark.unit
 def test_what_a_starter_mentions_can_be_used():
     text = starter("monte-carlo")
     text = text.replace("hexahedron", "tetrahedron")
@@ -133,6 +137,7 @@ def put(*way):
     return change
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -196,6 +201,7 @@ def test_one_line_for_a_mistake(change, expected):
     assert expected in lines[0]
 
 
+@pytest.mark.unit
 def test_all_mistakes_are_reported_together():
     def change(document_):
         document_["method"]["sampels"] = 5
@@ -235,6 +241,7 @@ def test_the_plan_warns_of_a_transition_narrower_than_a_cell():
     assert warned[1] == []
 
 
+@pytest.mark.unit
 def test_overrides():
     study = parse(blocks(), ["method.samples=7", "model.loads.gravity.density=800", "parameters.material.D1.a=3"])
     assert study.method.samples == 7
@@ -247,6 +254,7 @@ def test_overrides():
     assert new.parameters["material.C1"].lower == 9e3
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
@@ -263,6 +271,7 @@ def test_bad_overrides(assignment, message):
         parse(blocks(), [assignment])
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("content", "message"),
     [(None, "cannot be read: No such file"), (b"[model", "not valid TOML"), (b"\xff\xfe", "not a text file")],
@@ -275,6 +284,7 @@ def test_unreadable_files(tmp_path, content, message):
         load(path)
 
 
+@pytest.mark.unit
 def test_differences_name_the_place():
     old, new = blocks(), blocks()
     new["method"]["samples"] = 99
@@ -282,12 +292,14 @@ def test_differences_name_the_place():
     assert differences(old, new) == ["method.samples: 24 → 99"]
 
 
+@pytest.mark.unit
 def test_tails_may_not_reach_the_impossible():
     study = blocks()
     study["parameters"]["material.D1"] = {"kind": "normal", "mean": 3e5, "std": 2e4}
     assert parse(study).parameters["material.D1"] == Normal(mean=3e5, std=2e4)
 
 
+@pytest.mark.unit
 def test_tails_of_no_material_are_told():
     """A draw there is a failed sample: `check` says how many. A constant may be negative if its material is stable."""
     study = blocks()
@@ -341,6 +353,7 @@ def test_the_command_prints_the_schema(capsys):
     assert json.loads(capsys.readouterr().out) == schema()
 
 
+@pytest.mark.unit
 def test_a_displacement_larger_than_the_body_is_questioned():
     document_ = blocks()
     document_["model"]["displacements"] = [{"on": "x-max", "x": 3e-3, "y": -3.0}]
@@ -353,6 +366,7 @@ def test_a_displacement_larger_than_the_body_is_questioned():
     assert any("displacements.x-max.y reaches" in line for line in plan(parse(document_)))
 
 
+@pytest.mark.unit
 def test_a_byte_order_mark_is_no_mistake(tmp_path):
     study = tmp_path / "study.toml"
     study.write_text(starter("chaos"), encoding="utf-8-sig")

@@ -1,7 +1,6 @@
 """Maps of the places at which tools were pressed."""
 
 import numpy as np
-import pytest
 import xarray as xr
 from matplotlib.collections import PathCollection
 
@@ -28,7 +27,6 @@ SPEC = Specimen.model_validate(
 )
 
 
-@pytest.mark.unit
 def test_a_map_shows_what_each_place_tells_and_where_the_lump_is():
     names = ["inclusions.lump.x", "inclusions.lump.y", "material.mu"]
     rng = np.random.default_rng(0)
@@ -50,7 +48,6 @@ def test_a_map_shows_what_each_place_tells_and_where_the_lump_is():
     assert ax.lines[0].get_xydata().tolist() == [[0.4, 0.6]]
 
 
-@pytest.mark.unit
 def test_load_cases_without_a_tool_have_no_place():
     pulled = {"name": "pull", "clamp": ("z-min",), "displacements": ({"on": "z-max", "x": 0, "y": 0, "z": 0.1},)}
     more = Specimen.model_validate(SPEC.model_dump() | {"cases": (*SPEC.model_dump()["cases"], pulled)})

@@ -17,7 +17,6 @@ from workflows.report.scene.sliders import sliders
 from workflows.report.scene.still import still
 from workflows.results.level import crossing, level, tetrahedra
 
-pytestmark = pytest.mark.unit
 pyvista = pytest.importorskip("pyvista")
 
 

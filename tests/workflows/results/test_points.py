@@ -9,8 +9,6 @@ from workflows.report.plots.figure import png
 from workflows.report.plots.residuals import distances, residuals
 from workflows.results.points import measured_points, points_grid
 
-pytestmark = pytest.mark.unit
-
 R = turned((0.0, 0.0, 5.0))  # its columns are the axes of the scanner in the body
 PLACES = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.05]])
 MEASURED, PREDICTED = np.random.default_rng(0).normal(size=(2, 2, 3, 3))  # case, point, axis of the body

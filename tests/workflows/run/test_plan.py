@@ -13,8 +13,6 @@ from workflows.config.study import load
 from workflows.run.plan import plan
 from workflows.studies.sampling_plan import parts
 
-pytestmark = pytest.mark.unit
-
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 
 
@@ -34,6 +32,7 @@ def test_predicted_times_grow_with_the_body(cell, form):
     assert sum(found[0]) < 60  # little but the start of the program
 
 
+@pytest.mark.unit
 def test_estimates_take_a_fifth_of_the_study():
     large = ["model.body.cells=[30, 6, 12]", "model.formulation=mixed", "accuracy.memory=1e6"]
     for settings, count in (([], 3), (large, 2), ([*large, "method.samples=6144"], 16)):
@@ -56,6 +55,7 @@ def test_estimates_that_take_too_much_memory_are_left_out_and_it_is_said():
     assert not any("accuracy.memory" in one.text for one in off.findings)
 
 
+@pytest.mark.unit
 def test_the_finer_mesh_that_calibrates_estimates_counts():
     study = load(CONFIGS / "beam.toml")
     cost = study.spec.mesh_error_cost(study.spare)
@@ -88,6 +88,7 @@ def test_the_plan_is_the_sum_of_its_parts(tmp_path, monkeypatch):
     assert "are not compiled yet" in shown(1)[-1]
 
 
+@pytest.mark.unit
 def test_newton_from_zero_takes_longer_than_corrections():
     study, textbook = (load(CONFIGS / "beam.toml", [f"model.solver={kind}"]) for kind in ("predict-correct", "newton"))
     seconds = [{part.what.partition(",")[0]: part.seconds for part in parts(one)} for one in (study, textbook)]
@@ -110,6 +111,7 @@ noise = { relative = 0.03 }
 """  # noqa: E501
 
 
+@pytest.mark.unit
 def test_tools_that_are_pressed_from_afar_cost_more_than_a_step_further(tmp_path):
     """One study names no kind: it has outputs and no load cases, so it is a body."""
     (tmp_path / "once.toml").write_text(CONTACT.replace('kind = "KIND"\n', "").replace("DEPTH", "1e-3"))
@@ -136,6 +138,7 @@ def test_many_samples_share_passes_through_the_factor():
     assert each[0] == pytest.approx(cost.sample, rel=0.05)
 
 
+@pytest.mark.unit
 def test_a_million_unknowns_fit_into_the_memory_of_one_machine():
     study = load(CONFIGS / "beam-million.toml")
     assert study.spec.unknowns > 1e6
@@ -149,6 +152,7 @@ def test_a_million_unknowns_fit_into_the_memory_of_one_machine():
     assert line == "multigrid, without a factor of the stiffness"
 
 
+@pytest.mark.unit
 def test_what_takes_the_place_of_factors_is_cheaper_where_it_is_chosen():
     """And takes less memory; smaller bodies have factors."""
     body = load(CONFIGS / "beam-million.toml").spec.body

@@ -227,7 +227,6 @@ def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path):
     assert "Zero but for rounding: uz." in page
 
 
-@pytest.mark.unit
 def test_the_setting():
     on, off = load(TINY), load(TINY, [OFF])
     assert (on.estimates, off.estimates) == (3, 0)
@@ -248,7 +247,6 @@ def test_the_setting():
         load(ROOT / "configs" / "treloar.toml", [OFF])
 
 
-@pytest.mark.unit
 def test_the_plan_says_what_it_takes():
     on, off = load(TINY), load(TINY, [OFF])
     said = "\n".join(plan(on))
@@ -275,7 +273,6 @@ assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and 
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.unit
 def test_models_without_a_mesh_say_so_where_its_error_is_asked_for():
     own = ROOT / "configs" / "own-model.toml"
     texts = [one.text for one in load(own, ["accuracy.mesh_error=true"]).findings]

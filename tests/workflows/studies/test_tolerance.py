@@ -32,7 +32,6 @@ def without_method(tolerance, solves=10_000):
 # --- what is asked ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.unit
 def test_a_tolerance_stands_in_place_of_a_method():
     study = without_method(1e-3)
     assert study.method.kind == "automatic"
@@ -94,7 +93,6 @@ def test_the_solver_is_as_exact_as_the_tolerance_needs():
     assert load(TINY).spec.solver.tolerance == 1e-8
 
 
-@pytest.mark.unit
 def test_check_says_what_is_held_and_what_is_not(tmp_path):
     found = "\n".join(plan(asked(1e-2)))
     assert "0.01 of every mean and standard deviation" in found
@@ -142,7 +140,6 @@ def mesh(study, share, estimates=3, between=0.0):
     )
 
 
-@pytest.mark.unit
 def test_a_mesh_that_takes_little_is_kept():
     study = asked(1e-2)
     model, count, why = _next(study, study, [mesh(study, 0.3)])
@@ -151,7 +148,6 @@ def test_a_mesh_that_takes_little_is_kept():
     assert "takes 30 % of the tolerance" in why
 
 
-@pytest.mark.unit
 def test_where_estimates_are_few_there_are_more_of_them():
     study = asked(1e-2)
     model, count, _ = _next(study, study, [mesh(study, 0.9, between=0.89)])
@@ -159,7 +155,6 @@ def test_where_estimates_are_few_there_are_more_of_them():
     assert count > 3
 
 
-@pytest.mark.unit
 def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     study = asked(1e-2)
     first = mesh(study, 8.0)
@@ -175,7 +170,6 @@ def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     assert 8.0 / (0.7 * last) ** 2 > 0.6
 
 
-@pytest.mark.unit
 def test_a_layer_of_plane_strain_is_refined_in_its_plane():
     study = load(ROOT / "configs" / "cook.toml", ["method={kind='automatic'}", "accuracy.tolerance=1e-3"])
     first = mesh(study, 8.0)
@@ -224,7 +218,6 @@ def test_memory_ends_refinement():
 # --- whole studies ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.unit
 def test_a_function_of_two_parameters(tmp_path):
     found = without_method(1e-5).run(tmp_path / "out")
     told = json.loads(found.attrs["accuracy"])
@@ -388,7 +381,6 @@ def test_an_error_of_the_mesh_that_is_not_known_keeps_no_tolerance_unless_it_was
     assert any(said in one["text"] for one in summary["findings"])
 
 
-@pytest.mark.unit
 def test_too_few_solves_are_said(tmp_path):
     study = without_method(1e-9, solves=16)
     wide = {"kind": "uniform", "lower": 1e5, "upper": 1e6}
@@ -408,7 +400,6 @@ def test_no_number_of_estimates_is_told_that_a_tolerance_does_not_keep_to():
     assert any("3 to 9 estimates on each mesh" in line for line in plan(study))
 
 
-@pytest.mark.unit
 def test_a_number_of_samples_of_the_method_is_the_limit_that_is_named(tmp_path):
     study = without_method(1e-9, solves=100)
     wide = {"kind": "uniform", "lower": 1e5, "upper": 1e6}
@@ -422,7 +413,6 @@ def test_a_number_of_samples_of_the_method_is_the_limit_that_is_named(tmp_path):
     )
 
 
-@pytest.mark.unit
 def test_a_study_without_a_tolerance_imports_nothing_of_it():
     script = (
         "import sys; from pathlib import Path; from workflows.config.study import load\n"
