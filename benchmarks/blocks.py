@@ -35,12 +35,12 @@ UNSEEN = 64
 LEFT, RIGHT = (0.03, 0.05), (0.09, 0.045, 0.03)  # m: where the tool was, and where it is
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks blocks")
     parser.add_argument("--snapshots", type=int, default=100)
     parser.add_argument("--only", choices=["modes", "tool"], default=None)
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(words)
     study: Any = load(CONFIG, CHANGES)
     inputs = study.inputs
     model = study.spec.build(MPI.COMM_SELF, inputs.names)

@@ -88,7 +88,7 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), sigma, start=start)
 
 
-def main(given: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print how uniform the ranks are; with --forces or --palpation, which intervals hold the truth, from forces."""
     parser = ArgumentParser(prog="calibration")
     parser.add_argument("--forces", action="store_true", help="curves of force over depth, with data of another mesh")
@@ -99,7 +99,7 @@ def main(given: Sequence[str] = ()) -> None:
     parser.add_argument(
         "--inverted", type=int, default=3, help="of palpation: how many are inverted as the shipped one"
     )
-    options = parser.parse_args(given)
+    options = parser.parse_args(words)
     if options.palpation:
         calibration_palpation.main(options.specimens or 100, options.inverted)
     elif options.forces:

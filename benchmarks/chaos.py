@@ -293,14 +293,14 @@ def quiet_openturns() -> Any:
     return openturns
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print errors on samples of their own, averaged over designs (root mean squares), and times of field fits.
 
     Processor times are those of fit, moments, indices and predictions from solves that are there.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks chaos")
     parser.add_argument("--cases", default="")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(words)
     openturns = quiet_openturns()
     print(f"{SEEDS} designs each; mean and standard deviation relative, Sobol' indices the largest, of first order")
     print(f"\n{HEAD}\n|{'---|' * 9}")

@@ -302,13 +302,13 @@ def _findings(data: Any) -> list[dict[str, str]]:
     return json.loads(data.attrs.get("findings", "[]"))
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print coverage of mean, standard deviation and quantiles, claimed over true errors, and findings."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks coverage")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--cases", default="")
     parser.add_argument("--methods", default="")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(words)
     chaos.DRAWN = 13
     print("| function | method | mean | std | quantiles | claimed/true: mean | std | quantiles | with a finding |")
     print("|" + "---|" * 9, flush=True)

@@ -132,12 +132,12 @@ def load_cases(count: int) -> None:
     print(f"chosen: {chosen}; best in {count} synthetic specimens: {best}", flush=True)
 
 
-def main(given: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print what chosen observations are worth."""
     parser = ArgumentParser(prog="designs")
     parser.add_argument("--specimens", type=int, default=SPECIMENS)
     parser.add_argument("--only", choices=PARTS, nargs="*", default=PARTS, help="all of them take a quarter of an hour")
-    options = parser.parse_args(given)
+    options = parser.parse_args(words)
     if "cases" in options.only:
         load_cases(options.specimens)
     if "inclusion" in options.only:

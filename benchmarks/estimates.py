@@ -31,11 +31,11 @@ CASES: dict[str, tuple[str, int, tuple[str, ...]]] = {
 }
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print a table, a row for each study with a word in its name."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks estimates")
     parser.add_argument("--only", default="", help="part of the name of a study")
-    only = parser.parse_args(arguments).only
+    only = parser.parse_args(words).only
     print("| study | run without (s) | with (s) | more | solves (s) | estimates and their calibration (s) |")
     print("|---|---|---|---|---|---|")
     for name, (config, solves, changes) in CASES.items():

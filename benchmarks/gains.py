@@ -37,7 +37,7 @@ TAKEN = "making.json"  # beside a reduced model: what its making took
 PERCENT = (1.0, 0.5, 0.25)  # errors, of the standard deviation, for which a making is charged
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Make the reduced model, and print gains and coverage of repeated studies."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gains")
     parser.add_argument("--cells", default="[16,12,6]", help="of the slab")
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument(
         "--keep", default="", help="folder of the reduced model and of studies: what is there already counts"
     )
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(words)
     changes = [f"model.body.cells={given.cells}", FIELD, OUTPUTS]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(given.keep or folder) / "slab"

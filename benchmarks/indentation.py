@@ -12,7 +12,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,7 @@ def cost(draws: int = 12) -> None:
         sys.stdout.flush()
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print the tables that are asked for."""
     tables: dict[str, Callable[[], None]] = {
         "closed-forms": lambda: closed_forms(options.meshes, options.shapes),
@@ -142,7 +142,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--random", type=int, default=1000)
     parser.add_argument("--own", type=int, default=0, help="random ones on a mesh from a file")
     parser.add_argument("--kept", type=Path, default=Path("indentations.jsonl"))
-    options = parser.parse_args(arguments or [])
+    options = parser.parse_args(words)
     for name in options.tables:
         tables[name]()
     if options.random or options.own:

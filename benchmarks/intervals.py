@@ -155,13 +155,13 @@ def exactly(inputs: Inputs, model: dict, data: np.ndarray, sigma: np.ndarray) ->
     return np.array([quantiles(column, weights / weights.sum(), (0.025, 0.975)) for column in goals.T]).T
 
 
-def main(given: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print the coverage of 95 % intervals."""
     parser = ArgumentParser(prog="intervals")
     parser.add_argument("--count", type=int, default=COUNT, help="specimens")
     parser.add_argument("--samples", type=int, default=SAMPLES, help="points of each posterior")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args(given)
+    asked = parser.parse_args(words)
     begin = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         after, before, exact = held(Path(folder), asked.count, asked.seed, asked.samples)

@@ -7,6 +7,7 @@ the loop have a core each, which other programs of the machine want too.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import os
@@ -31,20 +32,23 @@ RADIUS, SPEED = 0.015, 0.1  # m, m/s
 EVERY = 997  # frames between those that are compared with the equilibrium
 
 
-def main(options: Sequence[str] = ()) -> None:
-    """Print latencies, and pictures a second of the page in a browser while the instrument moves.
-
-    `--modes=20 --frames=100000`, or `--model=FILE` for a reduced slab that is there, and `--pictures=10`, in seconds.
-    """
-    given = dict(one.removeprefix("--").split("=", 1) for one in options)
-    frames, modes = int(given.get("frames", FRAMES)), given.get("modes", "20")
+def main(words: Sequence[str] = ()) -> None:
+    """Print latencies, or pictures a second of the page in a browser while the instrument moves."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks live")
+    parser.add_argument("--modes", type=int, default=20)
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--model", type=Path, help="a reduced slab that is there already")
+    parser.add_argument("--pictures", type=float, metavar="SECONDS", help="count pictures of the page instead")
+    asked = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as folder:
-        model = Path(given.get("model", Path(folder) / "slab.npz"))
-        if "model" not in given:
-            words = ["--out", f"{folder}/made", "--output", str(model), "--quiet", "--no-report"]
-            command(["reduce", str(CONFIG), *words, "--set", f"method.modes={modes}", "--set", "method.unseen=0"])
-        if given.get("pictures"):
-            _pictures(model, float(given["pictures"]))
+        model = asked.model or Path(folder) / "slab.npz"
+        if asked.model is None:
+            places = ["--out", f"{folder}/made", "--output", str(model), "--quiet", "--no-report"]
+            sets = ["--set", f"method.modes={asked.modes}", "--set", "method.unseen=0"]
+            if command(["reduce", str(CONFIG), *places, *sets]):
+                return
+        if asked.pictures:
+            _pictures(model, asked.pictures)
             return
         served = subprocess.Popen(
             [sys.executable, "-m", "workflows", "live", str(model), "--port", "0", "--no-page"],
@@ -58,7 +62,7 @@ def main(options: Sequence[str] = ()) -> None:
             first, *others = sorted(os.sched_getaffinity(0))
             os.sched_setaffinity(served.pid, {first})
             os.sched_setaffinity(0, others or {first})
-            _measure(port, frames, model)
+            _measure(port, asked.frames, model)
         finally:
             served.terminate()
             served.wait()

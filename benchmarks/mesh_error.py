@@ -7,9 +7,10 @@ here.
 
 from __future__ import annotations
 
+import argparse
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -271,8 +272,16 @@ def cases(folder: str) -> Iterator[Callable[[], Case]]:
     yield lambda: tube(folder)
 
 
-def main(only: list[str] | None = None) -> None:
-    """Print effectivities, and costs."""
+def main(words: Sequence[str] = ()) -> None:
+    """Print effectivities, and costs unless problems are named."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks mesh_error")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the names of problems")
+    parser.add_argument("--costs", action="store_true", help="costs alone")
+    asked = parser.parse_args(words)
+    only = asked.only
+    if asked.costs:
+        costs()
+        return
     print(
         "| problem | unknowns | output | value | error (%) | seen over true | calibrated over true | doubt over true |"
     )

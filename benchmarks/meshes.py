@@ -163,7 +163,7 @@ def balls(model: SpecimenModel, inputs: Inputs, count: int, seed: int) -> tuple[
     return truths, made(model, f"balls-{seed}", truths, [ball(truth) for truth in truths], truths[:, -1])
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print how often intervals hold the truth: expected of linear posteriors, and counted in inversions."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks meshes")
     parser.add_argument("--truths", type=int, default=TRUTHS)
@@ -171,7 +171,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--seed", type=int, default=SEED, help="of the truths; what is uncertain was chosen on 16")
     parser.add_argument("--cells", type=int, default=CELLS, help="of the inversion, along an edge")
     parser.add_argument("--degree", type=int, default=2, help="of the inversion")
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     inputs, mesh = Inputs(PRIORS), f"{given.cells}-{given.degree}-{given.seed}"
     model: SpecimenModel = specimen(given.cells, given.degree).build(MPI.COMM_SELF, PARAMETERS)
     case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).observing(model)))

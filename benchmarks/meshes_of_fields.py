@@ -86,7 +86,7 @@ class Problem(NamedTuple):
     finer: Finer
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print how often intervals of fields hold the truth: expected of linear posteriors, and counted in inversions."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks meshes_of_fields")
     parser.add_argument("--truths", type=int, default=TRUTHS)
@@ -94,7 +94,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--cells", type=int, default=CELLS, help="of the inversion, along an edge")
     parser.add_argument("--degree", type=int, default=2, help="of the inversion")
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     spec = specimen(given.cells, given.degree, field=True)
     problem, name = _problem(spec), f"field-{given.cells}-{given.degree}-{given.seed}"
     count = max(given.truths, given.inverted)

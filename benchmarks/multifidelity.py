@@ -151,13 +151,13 @@ def beam(
             )
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print everything, or one part of it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks multifidelity")
     parser.add_argument("--repeats", type=int, default=REPEATS, help="of closed forms")
     parser.add_argument("--beam", type=int, default=20, help="repeats on the beam")
     parser.add_argument("--only", choices=["closed", "beam"], default=None)
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(words)
     if given.only in (None, "closed"):
         closed_forms(given.repeats)
     outputs = f"model.outputs=[{SAG},{STRESS}]"

@@ -194,14 +194,14 @@ def methods() -> dict[str, Any]:
 LISTS = {"odd": cases, "held-out": held_out.first, "held-out-2": held_out.second}
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print shares (%): intervals of mean and std that hold the truth; in brackets those that miss it in silence."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks oddities")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--cases", default="")
     parser.add_argument("--methods", default="")
     parser.add_argument("--list", choices=LISTS, default="odd")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(words)
     chaos.DRAWN, coverage.REFERENCE = 10, 14  # quantiles are not looked at
     chosen = {name: method for name, method in methods().items() if options.methods in name}
     print("| function | " + " | ".join(chosen) + " |")

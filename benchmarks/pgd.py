@@ -272,7 +272,7 @@ def bent(places: int = 17, sizes: int = 6, unseen: int = 20) -> None:
         )
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print everything, or one part of it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks pgd")
     parser.add_argument("--only", choices=["rod", "beam", "organ", "bent"], default=None)
@@ -281,7 +281,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument(
         "--tolerance", type=float, default=1e-4, help="of alternating directions for the organ; 0: none"
     )
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(words)
     if given.only in (None, "rod"):
         print(f"The rod: closed form {tip():.4f} mm\n\n| step of the force | tip (mm) | error | pairs | CPU (s) |")
         print("|---|---|---|---|---|")

@@ -59,11 +59,11 @@ sys.exit(code)
 """
 
 
-def main(given: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print a row for each study; one run each. A first run compiles forms; what is measured is a second."""
     options = argparse.ArgumentParser("phases", description=__doc__)
     options.add_argument("--studies", nargs="+", default=STUDIES)
-    studies = options.parse_args(given).studies
+    studies = options.parse_args(words).studies
     modules = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     print("| study | " + " | ".join(f"{name} (s)" for name in PHASES) + " |")
     print("|---|" + "---|" * len(PHASES))

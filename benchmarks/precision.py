@@ -20,12 +20,12 @@ REPEATS = 3
 TOGETHER = (1, 8, 32)  # right-hand sides
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print processor times (ms) for one of several right-hand sides and samples, and memory (MB) of the factor."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks precision")
     parser.add_argument("--unknowns", type=float, nargs="+", choices=sorted(CELLS), default=[1e4, 3e4])
     parser.add_argument("--samples", type=int, default=16)
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     sides = " | ".join(f"one of {count}" for count in TOGETHER)
     print(f"| unknowns | precision | {sides} | factorisation | sample | corrections | tangents | MB | contraction |")
     print("|---:|---|" + "---:|" * (len(TOGETHER) + 6))

@@ -1,13 +1,14 @@
 """Reduced models of shipped bodies: modes, points, errors on 100 unseen samples, effectivity, times.
 
 The slab (configs/slab.toml), or with `--organ` the organ (configs/organ.toml) in displacements alone; with `--mixed` in
-the mixed form that it has itself, whose snapshots take ten times as long.
+its own form, whose snapshots take ten times as long.
 
 All times are processor time on one core, measured side by side; frames are by the clock, since that is what counts.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import tempfile
 import time
@@ -31,31 +32,36 @@ from workflows.config.study import load as load_study
 CONFIGS = Path(__file__).parent.parent / "configs"
 OF_ORGAN = ("method.snapshots=48", "method.rounds=1", "method.unseen=100", "method.cubature=3e-4")
 MODES = {"slab": (20, 40, 80), "organ": (30,)}
+OF_METHOD = ("more", "snapshots", "unseen", "cubature")
 FRAMES, EVERY = 5_000, 100
 POINTS, LOCKSTEP = 20, 48
 
 
-def main(options: Sequence[str] = ()) -> None:
-    """Print a table for each size; `--modes=40` for one of them, `--more=320` for a larger larger one, `--organ`.
-
-    `--snapshots=40`, `--unseen=50` and `--cubature=1e-3` too are those of the method; with `--keep=FOLDER` a model that
-    is there already is taken.
-    """
-    name = "organ" if "--organ" in options else "slab"
-    given = dict(one[2:].split("=", 1) for one in options if "=" in one)
-    sizes = [int(given["modes"])] if "modes" in given else MODES[name]
-    others = [f"method.{key}={value}" for key, value in given.items() if key not in {"modes", "keep"}]
-    for modes in sizes:
+def main(words: Sequence[str] = ()) -> None:
+    """Print a table for each size."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks reduced")
+    parser.add_argument("--organ", action="store_true", help="configs/organ.toml in place of configs/slab.toml")
+    parser.add_argument("--mixed", action="store_true", help="the organ in the mixed form that it has itself")
+    parser.add_argument("--modes", type=int, nargs="*", help="sizes; those of the table if none are given")
+    parser.add_argument("--keep", type=Path, help="a folder for the models; one that is there already is taken")
+    for key in OF_METHOD:
+        parser.add_argument(f"--{key}", type=float, help=f"method.{key}")
+    asked = parser.parse_args(words)
+    name = "organ" if asked.organ else "slab"
+    others = [f"method.{key}={value:g}" for key in OF_METHOD if (value := getattr(asked, key)) is not None]
+    for modes in asked.modes or MODES[name]:
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(given.get("keep", folder)) / f"{name}-{modes}"
+            out = (asked.keep or Path(folder)) / f"{name}-{modes}"
             sets = [f"method.modes={modes}", *(OF_ORGAN if name == "organ" else ()), *others]
-            if name == "organ" and "--mixed" not in options:
+            if name == "organ" and not asked.mixed:
                 sets.append("model.formulation=displacement")
             changes = [part for one in sets for part in ("--set", one)]
-            command(["reduce", str(CONFIGS / f"{name}.toml"), "--out", str(out), "--quiet", "--no-report", *changes])
+            study = str(CONFIGS / f"{name}.toml")
+            if command(["reduce", study, "--out", str(out), "--quiet", "--no-report", *changes]):
+                return
             told = json.loads((out / "summary.json").read_text())["reduced"]
             of_body = [one for one in sets if not one.startswith("method.")]
-            _table(told, load(out / told["file"]), _full(load_study(CONFIGS / f"{name}.toml", of_body)))
+            _table(told, load(out / told["file"]), _full(load_study(study, of_body)))
 
 
 def _full(study: Any) -> float:

@@ -62,7 +62,7 @@ OF_MIXED = {
 PLACE = 0.05  # m, of the ball along x
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print a row for each number of modes and output."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks reduced_bodies")
     parser.add_argument("--snapshots", type=int, default=20)
@@ -71,7 +71,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--moving", type=float, default=0.0, help="standard deviation (m) of the place of the ball")
     parser.add_argument("--cells", type=int, nargs=3, help="of the body; by default few")
     parser.add_argument("--mixed", action="store_true", help="the nearly incompressible block, κ/μ = 10⁴")
-    given = parser.parse_args(options)
+    given = parser.parse_args(words)
     names, nominal, spread = tuple(MEANS), [*MEANS.values()], [*SPREADS.values()]
     if given.moving:
         names, nominal, spread = (*names, "loads.indenter.x"), [*nominal, PLACE], [*spread, given.moving]

@@ -36,12 +36,12 @@ TIGHT, ROUGH = 1e-10, 1e-2
 Apply = Callable[[FloatArray], FloatArray]
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print iterations to 1e-2 and 1e-10, and processor times (s), beside those of LDLᵀ."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks saddle")
     parser.add_argument("--bodies", nargs="+", choices=sorted(BODIES), default=list(BODIES))
     parser.add_argument("--ratios", type=float, nargs="+", default=[1e2, 1e4], help="κ/μ")
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     print("| body | κ/μ | unknowns | two levels: steps | (s) | blocks: steps | (s) | factor (s) | its solve (s) |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for name in given.bodies:

@@ -88,14 +88,14 @@ class Constants:
     read: float
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print the constants, the check of the simulation by a real run, and the table; draw the picture."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks scaling")
     parser.add_argument(
         "--take", type=float, help="of the counter (s), as measured on a quiet machine or on another one"
     )
     parser.add_argument("--file", type=float, help="of a block (s), likewise")
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     constants, short, wide = measured()
     constants = replace(constants, take=given.take or constants.take, file=given.file or constants.file)
     print(f"counter {constants.take * 1e6:.1f} µs; each block: key {constants.key * 1e3:.2f} ms, ", end="")

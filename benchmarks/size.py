@@ -78,7 +78,7 @@ if MPI.COMM_WORLD.rank == 0:
 """
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print processor times of one rank (s), peak memory (GiB), and their slopes against unknowns; draw them if asked.
 
     Forms are compiled. "first solve" is Newton's method from zero to the solver's tolerance, with the test for
@@ -95,7 +95,7 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument(
         "--field-on-a-million", action="store_true", help="a random field on the largest beam, in place of bodies"
     )
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     if given.fields:
         of_fields()
         return

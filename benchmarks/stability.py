@@ -11,13 +11,14 @@ anew, the Newton correction that is left, and the state that small load steps fr
 
 from __future__ import annotations
 
+import argparse
 import csv
 import itertools
 import re
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -389,8 +390,11 @@ def walk(model: HyperelasticModel, point: FloatArray, loads: FloatArray) -> tupl
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
-def main(*names: str) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print a table for each family (or those that are named), and write the table and the picture of all."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks stability")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the names of families")
+    names = parser.parse_args(words).only
     chosen = [family for family in FAMILIES if not names or any(name in family for name in names)]
     rows: list[Row] = []
     begin = time.perf_counter()

@@ -33,13 +33,13 @@ if found:
 """
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print wall-clock times until the last rank is there, and processor time and memory of all ranks."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks startup")
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 16])
     parser.add_argument("--cells", type=int, nargs=3, default=[12, 2, 4], help="of the beam")
     parser.add_argument("--cache", nargs="+", choices=("empty", "full"), default=["empty", "full"])
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     print("| ranks | cache | imported (s) | forms ready (s) | first solve (s) | processor time (s) | memory (GiB) |")
     print("|---|---|---|---|---|---|---|")
     for ranks in given.ranks:

@@ -70,13 +70,13 @@ def methods() -> dict[str, Any]:
     }
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print the coverage of the standard deviation in %; in brackets runs with a finding, and misses without one."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks tails")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--cases", default="")
     parser.add_argument("--methods", default="")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(words)
     chaos.DRAWN, coverage.REFERENCE = 13, 8  # quantiles are not looked at
     chosen = [case for case in cases() if options.cases in case.name]
     print("| method | " + " | ".join(case.name for case in chosen) + " |")

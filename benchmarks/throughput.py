@@ -41,11 +41,11 @@ ensemble.run(model, task)
 """
 
 
-def main(options: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print the ratios, measured in turn without start-up, and the memory of many realisations; or the memory only."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks throughput")
     parser.add_argument("--memory", type=int, metavar="N", help="only the memory, of so many realisations")
-    given = parser.parse_args(list(options))
+    given = parser.parse_args(words)
     if given.memory is not None:
         print(memory(given.memory))
         return

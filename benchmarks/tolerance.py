@@ -242,12 +242,12 @@ def _ways(body: Body, exact: FloatArray, sizes: FloatArray) -> Iterator[Way]:
                     yield Way(summary["cpu_seconds"] + more, what, claimed)
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks tolerance")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--only", default="", help="part of the name of a problem")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(words)
     chaos.DRAWN = 13
     head = "within it | said that it is not | 95 % of errors over it | chosen"
     print(f"| function | tolerance | {head} | solves | best by hand | ratio |\n|{'---|' * 9}", flush=True)

@@ -35,11 +35,11 @@ TIMED = """(() => {{ const v = document.querySelector('.viewer').viewer, x = v.e
     x.regroup(); x.outputs(); v.update(); v.paint(); }} }})()"""
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print a line for each number of surface triangles."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks turning")
     parser.add_argument("--triangles", type=float, nargs="+", default=[1e4, 1e5])
-    asked = parser.parse_args(arguments)
+    asked = parser.parse_args(words)
     if executable() is None:
         sys.stdout.write("needs Chromium\n")
         return
