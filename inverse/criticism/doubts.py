@@ -314,7 +314,7 @@ def mesh_corrected(
         why = "that is more than was tested of fields on such meshes: what the data determine best may be off"
         short = "its mesh is too coarse for what the data determine best"
         return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
-    if from_file and not len(nodes) and size > OF_FILES:
+    if from_file and not len(nodes) and beyond_files(size):
         why = (
             "that is more than corrections of meshes from files were found to hold for: unknowns may be off by several"
         )
@@ -326,6 +326,11 @@ def mesh_corrected(
 def decides(shift: Any, left: Any) -> Any:
     """Whether a correction of the mesh decides on a result, by its largest shift and what is uncertain of it."""
     return (shift > EXTREME) | (left > DECIDES)
+
+
+def beyond_files(size: Any) -> Any:
+    """Whether errors of this size, over the noise, are more than corrections on meshes of files hold for."""
+    return size > OF_FILES
 
 
 def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
@@ -368,6 +373,18 @@ def meshes_too_coarse(
         return [Doubt("note", f"{text}; {best} stays the most probable", "")]
     text = f"{text}; {best} stays the most probable. An evidence that moves by more than {MOVED:g} is not to be trusted"
     return [Doubt("warning", f"{text}: {ADVICE}", "meshes too coarse")]
+
+
+def meshes_of_files(which: Sequence[str]) -> list[Doubt]:
+    """Doubt evidences of candidates, by name, on meshes of files which err by more than corrections hold for."""
+    if not which:
+        return []
+    text = (
+        f"the corrected errors of the meshes of {', '.join(which)} are more than {OF_FILES:g} standard deviations of "
+        "the noise, which is more than corrections of meshes from files were found to hold for: a mesh alone may make "
+        "a candidate win or lose; take finer ones"
+    )
+    return [Doubt("warning", text, "meshes of files too coarse")]
 
 
 def meshes_not_alike(corrected: Sequence[str], unknown: Sequence[str]) -> list[Doubt]:

@@ -12,7 +12,7 @@ from forward.readable import told
 from forward.registry import named
 from inverse.data.shared_motion import said
 from uq.findings import add
-from workflows.studies.predictions import has_mesh
+from workflows.studies.predictions import has_mesh, of_file
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,8 +135,7 @@ def _of_mesh(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]
     if bool(one["mesh_corrected"]):
         left = dict(zip(names, one["mesh_left"].to_numpy().tolist(), strict=True))
         settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
-        of_file = getattr(getattr(study.model, "body", None), "kind", "") == "mesh"
         return found + criticism.mesh_corrected(
-            error, shifts, left, nodes, settled=settled, counted=counted, from_file=of_file
+            error, shifts, left, nodes, settled=settled, counted=counted, from_file=of_file(study.model)
         )
     return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)

@@ -200,7 +200,8 @@ def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Doubt]:
         for key in ("mesh_shift", "mesh_left")
     )
     if bool(of["mesh_corrected"]):
-        return criticism.mesh_corrected(error, shifts, left, np.zeros(0), settled=True)
+        of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
+        return criticism.mesh_corrected(error, shifts, left, np.zeros(0), settled=True, from_file=of_file)
     why = str(of["mesh_why"].item())
     return criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
 
@@ -235,7 +236,9 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     ]
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
+    coarse = _too_coarse_for_files(dataset).any("group")
     doubts = criticism.meshes_not_alike(corrected, unknown)
+    doubts += criticism.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
     doubts += criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
 
@@ -264,8 +267,23 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
     mended = dataset["mesh_corrected"] & ~decides(shift, dataset["mesh_left"].max("parameter"))
+    mended &= ~_too_coarse_for_files(dataset)
     known = mended | (~dataset["mesh_corrected"] & certain(dataset["mesh_log_evidence"], shift))
     return dataset.assign(trusted=dataset["trusted"] & known)
+
+
+def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
+    """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
+    from inverse.criticism.doubts import beyond_files
+
+    corrected = dataset["mesh_corrected"]
+    if "mesh_of_file" not in dataset:
+        return corrected & False
+    squares = (dataset["mesh_error"] ** 2).where(np.isfinite(dataset["measured"]))
+    of_group = dataset["output_group"] == dataset["group"]
+    size = np.sqrt(squares.where(of_group).mean("output"))
+    found: xr.DataArray = corrected & dataset["mesh_of_file"] & beyond_files(size)
+    return found.transpose(*corrected.dims)
 
 
 def _stacked(dataset: xr.Dataset, order: list[str]) -> list[Finding]:

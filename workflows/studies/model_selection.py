@@ -24,7 +24,7 @@ from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
 from workflows.studies.material_tests import WHOLE
-from workflows.studies.predictions import has_mesh, mesh_check, meshes_of
+from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison
 
 if TYPE_CHECKING:
@@ -183,6 +183,11 @@ class ModelSelection(Comparison):
         except ValueError as error:  # a mesh that is not divided, or would be too large
             return one_line(str(error))
         return ""
+
+    @property
+    def of_files(self) -> frozenset[str]:
+        """Candidates whose meshes are those of files."""
+        return frozenset(name for name, spec in self.of_candidates.items() if of_file(spec))
 
     @property
     def mesh_checks(self) -> list[tuple[float, str]]:

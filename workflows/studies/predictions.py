@@ -49,6 +49,11 @@ def has_mesh(spec: ModelSpec) -> bool:
     return spec.meshed or hasattr(spec, "body")
 
 
+def of_file(spec: ModelSpec) -> bool:
+    """Whether the mesh of a model, if it has one, is that of a file."""
+    return getattr(getattr(spec, "body", None), "kind", "") == "mesh"
+
+
 def never_estimable(spec: ModelSpec, names: Collection[str]) -> tuple[str, ...]:
     """Return those outputs of a body, of some by their names, of which no error of a mesh can be estimated."""
     outputs = spec.returned if has_mesh(spec) else ()

@@ -159,6 +159,11 @@ class Comparison(StudyKind):
         return {}
 
     @property
+    def of_files(self) -> frozenset[str]:
+        """Candidates whose meshes are those of files."""
+        return frozenset()
+
+    @property
     def mesh_checks(self) -> list[tuple[float, str]]:
         """Processor time (s) of a solve on a finer mesh of each candidate, and what is solved, where that is known."""
         return []

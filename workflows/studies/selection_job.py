@@ -64,6 +64,8 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
+        if "mesh_checked" in found:
+            found = found.assign(mesh_of_file=("model", [str(name) in study.of_files for name in found.model.values]))
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
         units = {name: study.units_of(name) for name in candidates}
         doubts = doubts_of_selection(found, candidates, study.method.noise.factor, units)

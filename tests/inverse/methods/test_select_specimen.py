@@ -251,6 +251,18 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     assert trusted_on_meshes(far)["trusted"].values[1 - second].item() is True
     texts = [one.text for one in doubts_of_selection(far, inputs, None) if "It decides on the result" in one.text]
     assert [text.partition(":")[0] for text in texts] == [str(found["model"].values[second])]
+    # On meshes of files, corrections hold for errors up to twice the noise, as for inversions.
+    assert not it.of_files
+    error = xr.zeros_like(found["mesh_error"]) + 1.5
+    of_files = far.assign(mesh_shift=found["mesh_shift"], mesh_error=error, mesh_of_file=("model", [True, True]))
+    assert trusted_on_meshes(of_files)["trusted"].values.all()
+    of_files["mesh_error"][second] = 3.0
+    assert trusted_on_meshes(of_files)["trusted"].values[:, 0].tolist() == [k != second for k in range(2)]
+    warnings = [one.text for one in doubts_of_selection(of_files, inputs, None) if one.severity == "warning"]
+    name = str(found["model"].values[second])
+    assert any(text.startswith(f"{name}: the error of the mesh") and "take a finer one" in text for text in warnings)
+    assert any(text.startswith(f"The corrected errors of the meshes of {name} are") for text in warnings)
+    assert trusted_on_meshes(of_files.assign(mesh_of_file=("model", [False, False])))["trusted"].values.all()
     # Evidences of candidates that are corrected are not said to move; one that could not be looked at does not compare.
     assert not any("Finer meshes move" in text or "could not be looked at" in text for text in said)
     blind = found.assign({name: found[name].copy() for name in ("mesh_checked", "mesh_corrected")})
