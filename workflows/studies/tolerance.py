@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.adapt import OF_ROUNDING, Adapt, largest_bytes
-from forward.machine import MIB
+from forward.adapt import OF_ROUNDING, Adapt
+from forward.machine import MIB, StopError
 from forward.model import FloatArray, SolveError
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
@@ -39,6 +39,19 @@ from workflows.run.version import version
 from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
+from workflows.studies.reach import (
+    AIM,
+    HOPELESS,
+    RATE,
+    STEP,
+    Assessed,
+    cells,
+    factor,
+    least_share,
+    most_unknowns,
+    out_of_reach,
+    rate_of,
+)
 from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance_asked import COUNTS, goal, refinement
 
@@ -50,78 +63,25 @@ if TYPE_CHECKING:
     from workflows.studies.sampling import Study
 
 FILE = "tolerance.json"
-KEPT = 0.8  # of the tolerance: what a mesh may take that was not predicted
-AIM = 0.6  # the same of one that is predicted
+KEPT = 0.8  # of the tolerance: what a mesh may take that was not predicted (`AIM`: one that is)
+BETWEEN = 0.1  # error of a mesh between the given one and one that may be out of reach, over that of the former
 OF_ADAPTED = 0.4  # the same of one that is refined where errors arise, which stops soon below what it is asked for
-RATE = 1.6  # at which errors are assumed to fall with the size of cells: slowly, as at edges that are held
-RATES = 0.8, 4.0  # that are believed of two meshes
 MOST_MESHES = 4
-STEP = 1.1  # ratio of the numbers of cells that are looked at
 FAR = 2.0  # times as many cells: farther, an assumed rate says too little
 DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
 LARGEST = 16.0  # times as many cells along an edge
-FALL = {1: 2.0, 2: 2.0}  # power of their number with which what they leave open falls, by the number of parameters
-OF_MANY = 1.5  # the same of more parameters
 POINTS = 4096  # at which tangents are drawn
 SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
 
 
-@dataclass(frozen=True)
-class Assessed:
-    """A mesh and its error.
-
-    Attributes
-    ----------
-    unknowns, cells
-        Of the mesh; the cells along each edge, where a body has such.
-    estimates
-        Number of estimates of its error.
-    share
-        Largest part of the tolerance that it takes; infinite where that cannot be estimated.
-    parameters
-        Number of random parameters.
-    output, of
-        Of which estimate of which output that is.
-    close, between
-        Parts of the tolerance that each estimate of each output (2, m) takes, since estimates of the error are not
-        exact, and since there are few; empty where there are none.
-    relative
-        Largest error of an output at the mean parameters, relative to it.
-    means
-        Of each output with an estimate: its name, its mean by tangents, the error of that, and what is not known of it.
-    solves, seconds
-        What it took to find out; the time depends on the machine, and nothing on the time.
-    """
-
-    unknowns: int
-    cells: tuple[int, ...]
-    estimates: int
-    share: float
-    parameters: int
-    output: str
-    of: str
-    close: list[list[float]]
-    between: list[list[float]]
-    relative: float
-    means: list[tuple[str, float, float, float]]
-    solves: int
-    seconds: float
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """As it is written down."""
-        return {name: None if value is np.inf else value for name, value in vars(self).items()}
-
-    def share_with(self, factor: float, estimates: int) -> float:
-        """Predict the share where errors are so many times smaller, and with another number of estimates."""
-        if not self.close:
-            return np.inf
-        few = (self.estimates / estimates) ** FALL.get(self.parameters, OF_MANY)
-        return float(np.hypot(self.close, few * np.array(self.between)).max() / factor)
-
-
 def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
-    """Return the study on a mesh that is fine enough, or on the finest that there may be; collective."""
+    """Return the study on a mesh that is fine enough, or on the finest that there may be; collective.
+
+    Raises
+    ------
+    StopError
+        If meshes seen so far say that memory ends far from the tolerance.
+    """
     world, path = ensemble.world, directory.resolve() / FILE
     told = world.bcast(_read(path) if world.rank == 0 else None)
     first, meshes, count = study, list[Assessed](), COUNTS[0]
@@ -141,6 +101,8 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
             if world.rank == 0:
                 write_text(path, json.dumps(told, indent=2, ensure_ascii=False) + "\n")
             return study
+        if finer is not study.model and (said := out_of_reach(study, first, meshes)):
+            raise StopError(said)
         if finer.unrefined:
             _forget(first, world, directory)
         study = _refined(study, finer, ensemble, directory, say)
@@ -272,7 +234,7 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
         return Assessed(
             study.spec.unknowns,
-            _cells(study),
+            cells(study),
             count,
             float(shares.max()),
             len(inputs.names),
@@ -323,10 +285,12 @@ def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[Model
             return None, now.estimates, f"{takes}; finer ones would take more than {_memory(study)}"
         error = now.relative if before is None else before.tolerance
         to = 0.1 if now.share == np.inf else float(np.clip(error * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
+        if len(meshes) == 1 and now.close and least_share(first, now, RATE) > HOPELESS:
+            to = max(to, min(BETWEEN * error, 0.5))  # it may be out of reach: a mesh between them tells the rate
         return _adapting(first, to), COUNTS[0], ""
     if len(meshes) > MOST_MESHES and now.share > KEPT:
         return None, now.estimates, f"{takes}, and {len(meshes)} meshes are enough"
-    ways = list(_ways(study, now, _rate(meshes)))
+    ways = list(_ways(study, now, rate_of(meshes)))
     here = [way for way in ways if way.times == 1 and way.estimates == now.estimates and way.share <= KEPT]
     enough = [*here, *(way for way in ways if way.share <= AIM)]
     best = min(enough, key=lambda way: way.seconds) if enough else min(ways, key=lambda way: way.share)
@@ -341,28 +305,6 @@ def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[Model
 
 def _memory(study: Study) -> str:
     return f"accuracy.memory = {study.accuracy.memory:,.0f} MiB"
-
-
-def _cells(study: Study) -> tuple[int, ...]:
-    """Cells along each edge, or how often those of a file are halved."""
-    body = study.model.body  # type: ignore[attr-defined]
-    return tuple(body.cells) if hasattr(body, "cells") else (2**body.levels,)
-
-
-def _factor(before: Sequence[int], after: Sequence[int]) -> float:
-    """By what the longest edges of cells have become shorter, but for a layer of plane strain, which stays one cell."""
-    return min((n / m for m, n in zip(before, after, strict=True) if max(m, n) > 1), default=1.0)
-
-
-def _rate(meshes: Sequence[Assessed]) -> float:
-    """The rate at which errors fall with the size of cells, by the last two meshes."""
-    factors = [_factor(meshes[0].cells, one.cells) for one in meshes]
-    sizes = [float(np.max(one.close, initial=0.0)) for one in meshes]
-    known = {factor: size for factor, size in zip(factors, sizes, strict=True) if size > 0}
-    if len(known) < 2:
-        return RATE
-    (coarse, before), (fine, after) = list(known.items())[-2:]
-    return float(np.clip(np.log(before / after) / np.log(fine / coarse), *RATES))
 
 
 @dataclass(frozen=True)
@@ -394,7 +336,7 @@ def _ways(study: Study, now: Assessed, rate: float) -> Iterator[_Way]:
         assert estimating is not None
         if cost.bytes + estimating.bytes > MIB * study.accuracy.memory and model is not study.model:
             return
-        finer = _factor(_cells(study), _cells(other))
+        finer = factor(cells(study), cells(other))
         for count in COUNTS:
             if model is study.model and count < now.estimates:
                 continue
@@ -409,12 +351,7 @@ def _ways(study: Study, now: Assessed, rate: float) -> Iterator[_Way]:
 
 def _adapting(study: Study, tolerance: float) -> ModelSpec:
     """Return the model with a mesh that is refined until its relative error is so much, or memory ends."""
-    model: Any = study.model
-    most = model.unknowns
-    while most < 10**7:
-        asked = Adapt(tolerance=tolerance, unknowns=int(most * STEP) + 1)
-        if largest_bytes(model.model_copy(update={"adapt": asked})) > MIB * study.accuracy.memory:
-            break
-        most = asked.unknowns
-    found: ModelSpec = model.model_copy(update={"adapt": Adapt(tolerance=tolerance, unknowns=most)})
+    found: ModelSpec = study.model.model_copy(
+        update={"adapt": Adapt(tolerance=tolerance, unknowns=most_unknowns(study))}
+    )
     return found

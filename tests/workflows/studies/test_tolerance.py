@@ -1,5 +1,6 @@
 """Studies with one tolerance for all errors: what they choose, what they refuse, and that restarts change nothing."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 from forward.machine import Headroom
 from tests import meshes
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
-from workflows.studies.tolerance import Assessed, _next, _rate
+from workflows.studies.reach import Assessed, dimension, out_of_reach, rate_of
+from workflows.studies.tolerance import _next
 from workflows.studies.within import contradictions
 
 TINY = ROOT / "configs" / "tiny.toml"
@@ -163,7 +166,7 @@ def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     finer = study.of(model)
     factor = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     meshes_seen = [first, mesh(finer, 8.0 / factor**2)]
-    assert _rate(meshes_seen) == pytest.approx(2.0)
+    assert rate_of(meshes_seen) == pytest.approx(2.0)
     model, _, _ = _next(finer, study, meshes_seen)
     last = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     assert 8.0 / last**2 <= 0.61
@@ -178,7 +181,7 @@ def test_a_layer_of_plane_strain_is_refined_in_its_plane():
     assert model.body.cells[0] > study.model.body.cells[0]
     finer = study.of(model)
     factor = model.body.cells[0] / study.model.body.cells[0]
-    assert _rate([first, mesh(finer, 8.0 / factor**2)]) == pytest.approx(2.0)
+    assert rate_of([first, mesh(finer, 8.0 / factor**2)]) == pytest.approx(2.0)
 
 
 @pytest.mark.unit
@@ -213,6 +216,24 @@ def test_memory_ends_refinement():
         seen.append(mesh(study, 0.8 * seen[-1].share))
     assert model is None
     assert "accuracy.memory = 50 MiB" in why
+
+
+@pytest.mark.unit
+def test_what_memory_is_too_small_for_is_known_by_one_mesh_or_two():
+    study = asked(1e-4, "accuracy.memory=400", "model.body.cell=tetrahedron", "model.body.degree=1")
+    assert out_of_reach(study, study, [mesh(study, 5.0)]) is None
+    assert out_of_reach(study, study, [mesh(study, np.inf)]) is None
+    said = out_of_reach(study, study, [mesh(study, 2000.0)])
+    assert "even where errors fall as fast as they can" in said
+    assert "elements of degree 2 (model.body.degree), more accuracy.memory or a tolerance of" in said
+    # What one mesh leaves open, the rate between two tells.
+    finer = dataclasses.replace(mesh(study, 20.0 / 2.0), unknowns=8 * study.spec.unknowns)
+    assert out_of_reach(study, study, [mesh(study, 20.0)]) is None
+    assert "as errors have fallen so far" in out_of_reach(study, study, [mesh(study, 20.0), finer])
+    better = dataclasses.replace(finer, share=20.0 / 4, close=[[20.0 / 4], [0.0]])
+    assert out_of_reach(study, study, [mesh(study, 20.0), better]) is None
+    flat = load(ROOT / "configs" / "cook.toml", ["method={kind='automatic'}", "accuracy.tolerance=1e-3"])
+    assert (dimension(study), dimension(flat)) == (3, 2)
 
 
 # --- whole studies ---------------------------------------------------------------------------------------------------
@@ -355,6 +376,16 @@ def test_what_is_not_reached_is_said(tmp_path):
     ]
     assert len(texts) == 1
     assert "accuracy.memory = 16 MiB" in texts[0]
+
+
+@pytest.mark.fem
+def test_what_is_out_of_reach_is_refused_in_a_line_before_the_long_work(tmp_path, capsys):
+    tiny = ("model.body.cell=tetrahedron", "model.body.degree=1", "accuracy={tolerance=1e-6, memory=400}")
+    settings = (word for one in (*COARSE, *tiny) for word in ("--set", one))
+    assert main(["run", str(TINY), "--out", str(tmp_path / "out"), "--quiet", *settings]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "accuracy.tolerance = 1e-06 is out of reach: the mesh of" in line
+    assert not (tmp_path / "out" / "results.nc").exists()
 
 
 @pytest.mark.fem
