@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from workflows.results.vtu import Grid
@@ -51,7 +52,7 @@ class MeasuredPoints:
 
 def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
     """Return the points of each load case of one data set that was inverted, ``dataset.sel(data_set=name)``."""
-    seen = np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)  # no other outputs
+    seen = displacements(one)
     axes = one["datum_axis"].to_numpy()[seen].astype(int)
     along = one["datum_direction"].to_numpy()[seen] if "datum_direction" in one else np.eye(3)[axes]
     numbers = {name: one[name].to_numpy()[seen] for name in ("measured", "predicted", "residual", "datum_case")}
@@ -71,6 +72,11 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
         over = np.sqrt(squares / np.maximum(counts, 1))
         found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[rows][first]))
     return found
+
+
+def displacements(one: xr.Dataset) -> NDArray[np.bool_]:
+    """Which data (n,) of one data set are displacements that were measured, rather than gaps or other outputs."""
+    return np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)
 
 
 def has_points(one: xr.Dataset) -> bool:

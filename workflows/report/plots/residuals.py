@@ -9,7 +9,7 @@ import numpy as np
 from forward.readable import scale
 from workflows.report.plots.figure import COLOURS, DARK, HIGH, axes, grid, text_of
 from workflows.report.plots.view import box, seen
-from workflows.results.points import MeasuredPoints, N, measured_points
+from workflows.results.points import MeasuredPoints, displacements, measured_points
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,8 +41,8 @@ def residuals(one: xr.Dataset) -> Axes:
 def agreement(one: xr.Dataset) -> Axes:
     """Draw the measured over the predicted displacements of each load case, and the line on which both are equal."""
     ax = axes(height=3.6)
-    seen_ = np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)
-    measured, predicted, case = (one[name].to_numpy()[seen_] for name in ("measured", "predicted", "datum_case"))
+    rows = displacements(one)
+    measured, predicted, case = (one[name].to_numpy()[rows] for name in ("measured", "predicted", "datum_case"))
     size, unit = scale(float(np.abs(measured).max()), "m")
     for k, name in enumerate(one["case"].values):
         here = case == k
