@@ -1,5 +1,6 @@
 """What every test gets, and in which order they run."""
 
+import os
 import sys
 from collections import Counter
 from pathlib import Path
@@ -11,6 +12,12 @@ def pytest_configure(config):
     """Let pytest-xdist keep the order below; its own begins with the files of most tests, which are the short ones."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """One worker more than cores: in a third of their time tests wait for programs to begin, for disks and for clocks."""
+    return len(os.sched_getaffinity(0)) + 1
 
 
 def pytest_collection_modifyitems(items):

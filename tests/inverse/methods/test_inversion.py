@@ -27,6 +27,7 @@ from inverse.methods.record import as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
 from tests.launch import TISSUQ, run, run_script
 from tests.problems import curved
+from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
@@ -403,8 +404,24 @@ def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
     assert any("of 6 rigid motions that are uncertain, the data determine" in one for one in said)
 
 
+@pytest.fixture(scope="module")
+def one(folder):
+    """The batch, run in this process: how many blocks it kept."""
+    saved = []
+
+    def counted(self, key, block):
+        saved.append(key)
+        save(self, key, block)
+
+    save = Checkpoint.save
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Checkpoint, "save", counted)
+        assert here(folder / "few.toml", folder / "one") == 3
+    return len(saved)
+
+
+@pytest.mark.usefixtures("one")
 def test_one_bad_file_does_not_stop_the_others(folder, looked_at):
-    assert here(folder / "few.toml", folder / "one") == 3
     rows = list(csv.DictReader((folder / "one" / "batch.csv").read_text().splitlines()))
     assert [(row["data_set"], row["ok"]) for row in rows] == [("made-1", "yes"), ("made-2", "yes"), ("wrong", "no")]
     assert "unknown column" in rows[2]["why"]
@@ -483,9 +500,8 @@ sys.exit(code)
 )
 
 
-def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch):
+def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, one, monkeypatch):
     """Killed in the first data set, and in the second: nothing is solved twice, and what is finished is shown."""
-    assert (folder / "one").exists()
     study, out = folder / "few.toml", folder / "killed"
     blocks, rows = [], []
     for count in ("10", "30", ""):
@@ -499,57 +515,66 @@ def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch)
     assert not (out / "evaluations").exists()
     assert (folder / "one/batch.csv").read_bytes() == (out / "batch.csv").read_bytes()
     assert (folder / "one/results.nc").read_bytes() == (out / "results.nc").read_bytes()
-    monkeypatch.setenv("BLOCKS", "0")
-    whole = run_script(None, KILLED, "run", study, "--out", folder / "unkilled")
-    assert sum(map(int, blocks)) == int(whole.stdout.rpartition(" blocks")[0].split()[-1])
+    assert sum(map(int, blocks)) == one
 
 
-def test_an_interrupted_field_keeps_its_solves(folder, monkeypatch):
+def field_by_program(folder, out, blocks=0, ranks=None):
+    """A field whose mesh is too coarse, which is found; killed once so many blocks are kept."""
+    command = ("run", folder / "field.toml", "--out", folder / out, "--set", "method.samples=32", "--quiet")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("BLOCKS", str(blocks))
+        done = run_script(ranks, KILLED, *command)
+    assert done.returncode == (9 if blocks else 3), done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def whole_field(folder):
+    """The run of a field: how many blocks it kept; so quiet, it says nothing but a line of progress a minute."""
+    done = field_by_program(folder, "field-whole")
+    assert all(line.endswith(" left") for line in done.stderr.splitlines())
+    return int(done.stdout.removesuffix(" blocks\n"))
+
+
+def test_an_interrupted_field_keeps_its_solves(folder, whole_field):
     """States, products with the Hessian, finer meshes: nothing is computed twice, and the result is the same."""
-    study, settings = folder / "field.toml", ("--set", "method.samples=32")
-    counts = []
-    for out, count in (("field-whole", "0"), ("field-killed", "60"), ("field-killed", "0")):
-        monkeypatch.setenv("BLOCKS", count)
-        done = run_script(None, KILLED, "run", study, "--out", folder / out, *settings)
-        assert done.returncode in (9, 0, 3), done.stderr
-        counts.append(60 if count == "60" else int(done.stdout.rpartition(" blocks")[0].split()[-1]))
-    assert counts[0] == counts[1] + counts[2] > 80
+    field_by_program(folder, "field-killed", blocks=60)
+    rest = field_by_program(folder, "field-killed").stdout.removesuffix(" blocks\n")
+    assert whole_field == 60 + int(rest) > 80
     assert not (folder / "field-killed" / "evaluations").exists()
     assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
 
 
-def test_progress_counts_the_solves_of_inversions(folder):
+@pytest.mark.usefixtures("one")
+def test_two_ranks_give_the_same_bytes_and_count_their_solves(folder):
     """Of all data sets, in a line off the terminal."""
-    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "counted")
-    solves = json.loads((folder / "counted/summary.json").read_text())["solves"]
-    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
-    quiet = run_script(None, WITHOUT_REPORT, "run", "--quiet", folder / "few.toml", "--out", folder / "counted2")
-    assert (quiet.stdout, quiet.stderr) == ("", "")
-
-
-def test_two_ranks_give_the_same_bytes(folder):
-    assert (folder / "one").exists()  # of the test before
     done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "two")
     assert done.returncode == 3, done.stderr
     assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
     assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
+    solves = json.loads((folder / "two/summary.json").read_text())["solves"]
+    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
+
+
+IDLE = "{} groups of ranks were started for {} task"
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(
-    ("study", "tasks", "code"),
-    [("field.toml", 1, 3), ("made.toml", 2, 0)],  # the mesh of the field is too coarse, which is found
-)
-def test_fewer_tasks_than_ranks(folder, study, tasks, code):
-    one, two = (folder / f"{study}-{ranks}" for ranks in (1, tasks + 1))
-    done = [
-        run_script(ranks, WITHOUT_REPORT, "run", folder / study, "--out", out, "--quiet")
-        for ranks, out in ((None, one), (tasks + 1, two))
-    ]
-    assert [each.returncode for each in done] == [code, code], done[1].stderr
-    assert f"{tasks + 1} groups of ranks were started for {tasks} task" in done[1].stderr
-    assert ": 1 of them will be idle" in done[1].stderr
-    assert (one / "results.nc").read_bytes() == (two / "results.nc").read_bytes()
+@pytest.mark.usefixtures("whole_field")
+def test_a_field_leaves_a_rank_idle(folder):
+    done = field_by_program(folder, "field-two", ranks=2)
+    assert IDLE.format(2, 1) in done.stderr
+    assert ": 1 of them will be idle" in done.stderr
+    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-two/results.nc").read_bytes()
+
+
+@pytest.mark.mpi
+def test_fewer_data_sets_than_ranks(folder):
+    done = run_script(3, WITHOUT_REPORT, "run", folder / "made.toml", "--out", folder / "made-three", "--quiet")
+    assert done.returncode == 0, done.stderr
+    assert IDLE.format(3, 2) in done.stderr
+    assert ": 1 of them will be idle" in done.stderr
+    assert (folder / "made/results.nc").read_bytes() == (folder / "made-three/results.nc").read_bytes()
 
 
 REPORTED = "method.mesh_error='report'"
@@ -732,8 +757,9 @@ def test_starters(tmp_path):
     (tmp_path / "measured.csv").write_text("x,y,z,uz\n0.025,0.025,0.05,0.002\n")
     study = parse(tomllib.loads(starter("invert")), folder=tmp_path)
     assert study.method.kind == "invert"
+    validator = jsonschema.Draft202012Validator(schema())
     for blocks in (tomllib.loads(starter("invert")), document(study)):
-        jsonschema.validate(blocks, schema())
+        validator.validate(blocks)
     assert parse(document(study)) == study
     assert parse(tomllib.loads(starter("synthesize"))).method.kind == "synthesize"
 

@@ -180,15 +180,16 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("name", "how"), [("a.vtu", {"binary": False}), ("a.vtu", {}), ("a.xdmf", {}), ("a.vtk", {})])
-def test_meshes_with_mistakes(tmp_path, name, how):
+def test_meshes_with_mistakes(tmp_path, name, how, count):
     """As bodies and as files of displacements in turn: some formats are read by a process of their own each time."""
     whole = numbered(box())
     whole.point_data["displacement"] = whole.points / 100
     meshio.write(tmp_path / name, whole, **how)
     path = tmp_path / name
     good, chance = path.read_bytes(), random.Random(2)
-    for number in range(60):
+    for number in range(count):
         data, done = damaged_bytes(good, chance)
         path.write_bytes(data)
         said = []

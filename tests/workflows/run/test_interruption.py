@@ -189,12 +189,12 @@ def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
-    limited = ("--set", "model.solve_seconds=0.1", "--set", "method.samples=20")
+    limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=8")
     done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks, case="loop")
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert 0 < summary["failed"] < 20
-    assert {one["reason"] for one in summary["failures"]} == {"endless.value took longer than solve_seconds = 0.1"}
+    assert 0 < summary["failed"] < 8
+    assert {one["reason"] for one in summary["failures"]} == {"endless.value took longer than solve_seconds = 0.4"}
     assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
 
 
@@ -250,13 +250,13 @@ def test_a_server_that_never_ends_is_a_failed_solve(study, tmp_path, monkeypatch
         url = f"http://127.0.0.1:{server.server_port}"
         there = STUDY.replace('"python"', '"um-bridge"').replace('function = "endless.value"', f'url = "{url}"')
         study.write_text(there)
-        limited = ("--set", "model.solve_seconds=0.2", "--set", "method.samples=20")
+        limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=8")
         done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks)
         server.shutdown()
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert 0 < summary["failed"] < 20
-    assert {one["reason"] for one in summary["failures"]} == {f"{url} took longer than solve_seconds = 0.2"}
+    assert 0 < summary["failed"] < 8
+    assert {one["reason"] for one in summary["failures"]} == {f"{url} took longer than solve_seconds = 0.4"}
     assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
 
 
