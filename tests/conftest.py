@@ -16,7 +16,7 @@ def pytest_configure(config):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """One worker more than cores: in a third of their time tests wait for programs to begin, for disks and for clocks."""
+    """One worker more than cores: a third of the time tests wait, for programs that begin, disks and clocks."""
     return len(os.sched_getaffinity(0)) + 1
 
 
