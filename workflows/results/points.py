@@ -76,7 +76,8 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
 
 def displacements(one: xr.Dataset) -> NDArray[np.bool_]:
     """Which data (n,) of one data set are displacements that were measured, rather than gaps or other outputs."""
-    return np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)
+    found: NDArray[np.bool_] = np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)
+    return found
 
 
 def has_points(one: xr.Dataset) -> bool:
