@@ -33,14 +33,15 @@ if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
 
 
-ROUGH = 0.01  # tolerance of solves with the stiffness of the body, relative to the solution
+ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
 SETTLED = 0.01  # part of the energy of e that the conjugate gradients may miss
-LEFT = 0.05  # of the forces, where pressures leave no energy to go by; a second step takes as much of what is left
+LEFT = 0.05  # of the forces, where pressures leave no energy to go by; a second step takes most of what is left
 STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 LITTLE = 0.01  # the same before the steps, after which these forces are met again
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 5e-3  # relative tolerance of the same solves
+CLOSE_MIXED = 0.02  # the same of the first with pressures, after which another takes as much of what is left
 CLOSER = 0.1  # that of further steps, which change a tenth, and the part of their energy that these may miss
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
@@ -264,7 +265,7 @@ class Enriched:
         equations = self.equations
         equations.work = Work()
         forces = -self.imbalance(solution)
-        (change,) = self._solve(solution, forces[None])
+        (change,) = self._solve(solution, forces[None], close=CLOSE_MIXED if equations.spec.mixed else CLOSE)
         start = self.up(solution.state)
         # In the mixed form the energy has a saddle point, and the pressures count with the opposite sign.
         energy = 0.5 * equations.curvature(change, forces)
@@ -327,7 +328,7 @@ class Enriched:
         """
         found = None
         if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
-            found = self._solve_by_smoothing(solution, right, max(close, SETTLED), transpose=transpose)
+            found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
             found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
         if found is None:
@@ -336,7 +337,7 @@ class Enriched:
         return found
 
     def _solve_by_smoothing(
-        self, solution: Solved, right: FloatArray, missing: float, *, transpose: bool
+        self, solution: Solved, right: FloatArray, close: float, *, transpose: bool
     ) -> FloatArray | None:
         """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
 
@@ -353,15 +354,16 @@ class Enriched:
             y[fixed] = 0
             return y
 
-        little = LITTLE if inverse.weights is None else ORTHOGONAL
-        found = self._on_the_body(solution, right, little, transpose=transpose)
+        found = self._on_the_body(solution, right, LITTLE, transpose=transpose)
         for i, b in enumerate(right):
             residual = b - multiply(found[i]) if found[i].any() else b
             if inverse.weights is None:
+                missing = max(close, SETTLED)
                 change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, missing, STEPS)
             else:
+                left_over = max(close, LEFT)
                 change, _, settled = minimised(
-                    multiply, inverse.apply, residual, inverse.weights, equations.total, LEFT, STEPS
+                    multiply, inverse.apply, residual, inverse.weights, equations.total, left_over, STEPS
                 )
             if not settled:
                 return None

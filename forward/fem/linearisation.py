@@ -261,13 +261,13 @@ class Linearisation(Forms):
     def new_factor(self) -> LinearSolver:
         """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own.
 
-        For estimates in double precision: a factor in single precision is tested first, which is as much work as most
-        of them have for it.
+        Estimates count no signs of it.
         """
         matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
         alone = self.comm.size == 1  # entries and right-hand sides are not distributed
-        small = self.spec.single and self._lasting and alone
-        return single.SingleSolver(matrix) if small else linear.DirectSolver(matrix)
+        if self.spec.single and alone:
+            return single.SingleSolver(matrix, counted=self._lasting)
+        return linear.DirectSolver(matrix)
 
     def new_symmetric_solver(self) -> LinearSolver:
         """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""

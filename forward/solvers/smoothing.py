@@ -89,26 +89,28 @@ def minimised(
     tolerance
         Of the residual, relative to b.
     """
-    x, r = np.zeros_like(right), weights * right
+    r = weights * right
     directions, images = (np.empty((iterations, len(right))) for _ in range(2))
+    triangle, parts = np.zeros((iterations, iterations)), np.zeros(iterations)  # of QR of the images, Qᵀb
     size = np.sqrt(total(np.array([r @ r]))[0])
     if size == 0:
-        return x, np.array(right), True
-    for k in range(iterations):
-        direction = precondition(r / weights)
-        image = weights * multiply(direction)
-        for _ in range(2):  # orthogonal to rounding
-            along = total(images[:k] @ image)
-            image, direction = image - along @ images[:k], direction - along @ directions[:k]
+        return np.zeros_like(right), np.array(right), True
+    found, k = False, 0
+    while k < iterations and not found:
+        directions[k] = precondition(r / weights)
+        image = weights * multiply(directions[k])
+        triangle[:k, k] = total(images[:k] @ image)
+        image -= triangle[:k, k] @ images[:k]
         length = np.sqrt(total(np.array([image @ image]))[0])
         if not np.isfinite(length) or length == 0:
-            return x, r / weights, False
-        directions[k], images[k] = direction / length, image / length
-        part = total(np.array([images[k] @ r]))[0]
-        x, r = x + part * directions[k], r - part * images[k]
-        if np.sqrt(total(np.array([r @ r]))[0]) <= tolerance * size:
-            return x, r / weights, True
-    return x, r / weights, False
+            break
+        images[k], triangle[k, k] = image / length, length
+        parts[k] = total(np.array([images[k] @ r]))[0]
+        r -= parts[k] * images[k]
+        k += 1
+        found = bool(np.sqrt(total(np.array([r @ r]))[0]) <= tolerance * size)
+    x = np.linalg.solve(triangle[:k, :k], parts[:k]) @ directions[:k]
+    return x, r / weights, found
 
 
 def _missing(reached: list[float]) -> float:

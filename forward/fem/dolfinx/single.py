@@ -64,14 +64,22 @@ class SingleSolver:
     sides. Then ρ(I − S⁻¹K) < 1, so that no S + t(K − S) with 0 ≤ t ≤ 1 is singular: S has as many negative eigenvalues
     as K.
 
+    Parameters
+    ----------
+    stiffness
+        The matrix.
+    counted
+        Whether its negative eigenvalues are. Where the factor only preconditions what says itself whether it converges,
+        that test is left out: it takes as long as several solutions.
+
     Attributes
     ----------
     contraction
-        That share, of the last factor in single precision.
+        That share, of the last factor in single precision that was tested.
     """
 
-    def __init__(self, stiffness: StiffnessMatrix) -> None:
-        self._stiffness = stiffness
+    def __init__(self, stiffness: StiffnessMatrix, *, counted: bool = True) -> None:
+        self._stiffness, self._counted = stiffness, counted
         self._symmetric = stiffness.symmetric
         self._factor: Any = None
         self._analysed, self._room = False, ROOM
@@ -122,6 +130,8 @@ class SingleSolver:
             if status not in TOO_LITTLE_ROOM or self._room >= MOST_ROOM:
                 break
             self._room *= 4
+        if not self._counted:
+            return bool(self._analysed)
         self.contraction = self._contracted() if self._analysed else np.inf
         return self.contraction <= CONTRACTION
 
