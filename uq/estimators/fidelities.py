@@ -201,7 +201,7 @@ def estimated(
     mean = np.sum([one.first for one in terms], axis=0)
     moved = tuple(b - 2 * mean * a for a, b in zip(first, second, strict=True))
     moved = tuple(one - one.mean(axis=0) for one in moved)
-    factors, relative = zip(*(_uncertainty(parts) for parts in (first, moved)), strict=True)
+    factors, relative = zip(*(uncertainty(parts) for parts in (first, moved)), strict=True)
     estimates = replace(found, mean_error=found.mean_error * factors[0], std_error=found.std_error * factors[1])
     return Found(estimates, terms, moved, tuple(fitted), np.array(relative))
 
@@ -216,7 +216,7 @@ def _middle(samples: Sequence[Samples], j: int) -> tuple[FloatArray, FloatArray]
     return found[0], found[1]
 
 
-def _uncertainty(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def uncertainty(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Student's factor (m,) of the error of a sum of means of samples (n, m), and relative variance of its square."""
     squares, spread, freedom = [], [], []
     for one in parts:

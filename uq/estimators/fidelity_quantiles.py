@@ -10,12 +10,13 @@ distance from their outputs at the mean parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from forward.model import FloatArray
 from uq.estimators.blue import informations, weights
+from uq.estimators.chosen import Chosen, Pooled
 from uq.estimators.fidelities import Samples, folds
 from uq.estimators.moments import Quantiles, quantiles_of_shares
 
@@ -40,12 +41,53 @@ def quantiles_of_groups(
     apart
         Samples of all models that tell the weights, and nothing else; by default the first group does.
     """
+
+    def known(j: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        thresholds = _thresholds(np.concatenate([one.deviations[:, list(one.group), j].ravel() for one in samples]))
+        return thresholds, *below(samples, j, thresholds, apart)
+
+    return _between(known, offset, probabilities)
+
+
+def quantiles_of_chosen(
+    pooled: Pooled, found: Chosen, offset: FloatArray, probabilities: tuple[float, ...]
+) -> Quantiles:
+    """Return quantiles of the outputs of model 0, of pools of which some points were chosen (`uq.estimators.chosen`).
+
+    The share below a threshold is that of the predictions, and what the chosen points say they miss.
+    """
+    ok = np.isfinite(pooled.values).all(axis=1)
+
+    def known(j: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        values = found.predicted[:, j]
+        thresholds = _thresholds(np.concatenate([values, pooled.values[ok, j]]))
+        parts = (values[:, None] <= thresholds) / len(values)
+        rows, weights = pooled.rows[ok], 1 / pooled.expected[ok, None]
+        parts[rows] += weights * (
+            (pooled.values[ok, j, None] <= thresholds).astype(float) - (values[rows, None] <= thresholds)
+        )
+        variance = FEWER / len(rows) ** 2 + np.zeros(len(thresholds))
+        for a, b in zip(pooled.starts[:-1], pooled.starts[1:], strict=True):
+            variance += parts[a:b].var(axis=0, ddof=1) * (b - a)
+        return thresholds, parts.sum(axis=0), np.sqrt(variance)
+
+    return _between(known, offset, probabilities)
+
+
+def _thresholds(values: FloatArray) -> FloatArray:
+    return np.asarray(np.unique(np.quantile(values, np.linspace(0, 1, THRESHOLDS))))
+
+
+def _between(
+    known: Callable[[int], tuple[FloatArray, FloatArray, FloatArray]],
+    offset: FloatArray,
+    probabilities: tuple[float, ...],
+) -> Quantiles:
+    """Quantiles from thresholds, shares below them and errors of these, by output."""
     p, levels = np.array(probabilities), (np.arange(EQUIVALENT) + 0.5) / EQUIVALENT
     values, errors = np.empty((EQUIVALENT, offset.size)), np.empty((len(p), offset.size))
     for j in range(offset.size):
-        pooled = np.concatenate([one.deviations[:, list(one.group), j].ravel() for one in samples])
-        thresholds = np.unique(np.quantile(pooled, np.linspace(0, 1, THRESHOLDS)))
-        share, error = below(samples, j, thresholds, apart)
+        thresholds, share, error = known(j)
         # Differences of shares may fall where they should rise; between the largest before and the least after.
         up, down = np.maximum.accumulate(share), np.minimum.accumulate(share[::-1])[::-1]
         rising = np.clip((up + down) / 2, 0, 1)

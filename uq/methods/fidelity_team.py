@@ -56,13 +56,36 @@ class Member:
         )
 
 
-@dataclass
+@dataclass(frozen=True)
 class Taken:
     """The samples of a group: points (n, d), outputs (n, K, m), NaN for models outside it, and reasons of failures."""
 
     points: FloatArray
     values: FloatArray
     reasons: set[str] = field(default_factory=set)
+
+    def extended(self, more: Taken) -> Taken:
+        """Return these samples and others behind them."""
+        return Taken(
+            np.concatenate([self.points, more.points]),
+            np.concatenate([self.values, more.values]),
+            self.reasons | more.reasons,
+        )
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples of a group, as results have them: of a pilot that does not count, or of a pool with a choice."""
+
+    group: Group
+    taken: Taken
+    pilot: bool = False
+    chosen: bool = False
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which samples (n,) have answers of all models of the group."""
+        return ok_rows(self.taken.values, self.group)
 
 
 class Team:
@@ -86,7 +109,7 @@ class Team:
         self, cheap: Sequence[CheapModel], inputs: Inputs, evaluate: Recorder, seed: int, *, controlled: bool
     ) -> None:
         self.inputs, self.evaluate = inputs, evaluate
-        self._seed, self.controlled = seed, controlled and evaluate.differentiable
+        self.seed, self.controlled = seed, controlled and evaluate.differentiable
         centre = linearise(inputs, evaluate)
         self.members = [Member(OWN_LABEL, evaluate, None, 1.0, centre)]
         self.spent = 0.0
@@ -121,10 +144,9 @@ class Team:
         first = self.members[0].centre.output_slopes
         return first if self.controlled else np.zeros_like(first)
 
-    @property
-    def count(self) -> int:
-        """Number of samples of all groups, each of one or several models."""
-        return sum(len(one.points) for one in self.taken.values())
+    def blocks(self) -> list[Block]:
+        """What was taken of each group."""
+        return [Block(self.groups[max(g, 0)], self.taken[g], pilot=g == PILOT) for g in sorted(self.taken)]
 
     def begin(self, count: int, *, counts: bool, tangents: bool) -> None:
         """Take the pilot, which counts in estimates or does not, with derivatives of the study's model or without."""
@@ -133,21 +155,30 @@ class Team:
     def take(self, g: int, count: int, *, tangents: bool = False, keep: bool = False) -> None:
         """Take further samples of a group, or of all models for a pilot that does not count."""
         d, K, m = len(self.inputs.names), len(self.members), len(self.evaluate.outputs)
-        group = self.groups[max(g, 0)]
         before = self.taken.setdefault(g, Taken(np.empty((0, d)), np.empty((0, K, m))))
-        n = len(before.points)
+        found = self.drawn(g, len(before.points), count, tangents=tangents, keep=keep)
+        self.taken[g] = before.extended(found)
+
+    def drawn(self, g: int, start: int, count: int, *, tangents: bool = False, keep: bool = False) -> Taken:
+        """Draw points of a group's stream and solve its models there; others have NaN."""
+        d, K, m = len(self.inputs.names), len(self.members), len(self.evaluate.outputs)
         stream = g if g >= 0 else len(self.groups)
-        points = self.inputs.points(random_points((self._seed, stream), n, n + count, d))
-        values = np.full((count, K, m), np.nan)
-        for k in group:
-            found = self.members[k].solve(points, tangents=tangents and k == 0)
-            values[:, k] = np.where(found.ok[:, None], found.outputs, np.nan)
-            before.reasons.update(f"{self.members[k].label}: {failure.reason}" for failure in found.failures)
-            if keep and k == 0:
-                self.pilot = found
-        before.points = np.concatenate([before.points, points])
-        before.values = np.concatenate([before.values, values])
-        self.spent += count * self.costs[max(g, 0)]
+        points = self.inputs.points(random_points((self.seed, stream), start, start + count, d))
+        found = Taken(points, np.full((count, K, m), np.nan))
+        for k in self.groups[max(g, 0)] if count else ():
+            found.values[:, k] = self.solved(k, points, found.reasons, tangents=tangents and k == 0, keep=keep)
+        return found
+
+    def solved(
+        self, k: int, points: FloatArray, reasons: set[str], *, tangents: bool = False, keep: bool = False
+    ) -> FloatArray:
+        """Solve a model at points, and pay for it; NaN where it has no answer, with the reasons added to others."""
+        found = self.members[k].solve(points, tangents=tangents)
+        reasons.update(f"{self.members[k].label}: {failure.reason}" for failure in found.failures)
+        if keep and k == 0:
+            self.pilot = found
+        self.spent += len(points) * self.members[k].cost
+        return np.asarray(np.where(found.ok[:, None], found.outputs, np.nan))
 
     def counts(self) -> FloatArray:
         """Numbers of samples (G,) of the groups that count."""

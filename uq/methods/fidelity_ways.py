@@ -11,10 +11,9 @@ import numpy as np
 from forward.model import Finding, FloatArray, SolveError
 from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
-from uq.estimators.fidelities import Found, Samples, correlations, estimated, gains
+from uq.estimators.fidelities import Found, Samples, estimated, gains
 from uq.estimators.fidelity_quantiles import quantiles_of_groups
 from uq.estimators.moments import (
-    ESTIMATES,
     Estimates,
     Quantiles,
     Z,
@@ -27,20 +26,17 @@ from uq.estimators.moments import (
 )
 from uq.estimators.tails import of_influences, unseen
 from uq.evaluation.request import Evaluations
-from uq.findings import add
 from uq.methods.chaos import objection
-from uq.methods.fidelity_team import PILOT, Team
+from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
-from uq.surrogates.linearisation import local_dataset
 from uq.surrogates.regression import Regression
 from uq.surrogates.taylor import Control, expansion
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 FEWEST = 8  # samples of a group that gets any
 ORDER = 6  # largest order of the expansion
-UNRELATED = 0.1  # squared correlation of remainders up to which a cheap model is of no use
 UNLIMITED = 1e9
 
 
@@ -77,10 +73,23 @@ class ByModels:
         found = estimated(samples, team.offsets[0], team.variances, apart)
         return replace(found, estimates=with_tails(team, found.estimates, found.moved))
 
+    def blocks(self) -> list[Block]:
+        """What was taken."""
+        return self._team.blocks()
+
     @property
     def estimates(self) -> Estimates:
         """Mean and standard deviation."""
         return self.found.estimates
+
+    @property
+    def plain(self) -> FloatArray:
+        """Variances (m,) of plain samples."""
+        return np.asarray(own_values(self._team).var(axis=0, ddof=1))
+
+    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
+        return gains(own_values(self._team), cost, self.found)
 
     def _sizes(self) -> FloatArray:
         """What errors of means are relative to (m,)."""
@@ -178,6 +187,20 @@ class ByExpansion:
             Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
         )
 
+    def blocks(self) -> list[Block]:
+        """What was taken."""
+        return self._team.blocks()
+
+    @property
+    def plain(self) -> FloatArray:
+        """Variances (m,) of plain samples."""
+        return np.asarray(own_values(self._team).var(axis=0, ddof=1))
+
+    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield how many plain samples each unit of cost was worth, and the standard error, for means."""
+        gain = ratio(self.plain, self.estimates.mean_error**2 * cost, empty=1.0)
+        yield gain, gain * np.sqrt(2 / len(own_values(self._team)))
+
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs, of the samples of the study's model alone."""
         samples = self._team.samples(self._own)
@@ -251,119 +274,6 @@ def with_tails(team: Team, found: Estimates, moved: tuple[FloatArray, ...]) -> E
     return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
 
 
-# --- what it says of itself ------------------------------------------------------------------------------------------
-
-
-def described(team: Team, way: ByModels | ByExpansion, models: ByModels, expanded: ByExpansion | None) -> xr.Dataset:
-    """Return estimates, what was spent on what, and what other methods are predicted to need, as labelled arrays."""
-    by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
-    estimates, pilot = way.estimates, models.pilot
-    dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=True)
-    numbers = sorted(team.taken)
-    taken = [team.taken[g] for g in numbers]
-    K = len(team.members)
-    inside = np.array([np.isin(np.arange(K), team.groups[max(g, 0)]) for g in numbers])
-    sizes_of = np.array([len(one.points) for one in taken])
-    own = np.concatenate(
-        [t.values[team.ok(g)][:, 0] for g, t in zip(numbers, taken, strict=True) if inside_own(team, g)]
-    )
-    plain = own.var(axis=0, ddof=1)
-    dataset = dataset.assign_coords(fidelity=[one.label for one in team.members], group=np.arange(len(numbers)))
-    dataset = dataset.assign(
-        {
-            **{name: (by_output, getattr(estimates, name)) for name in ESTIMATES},
-            "fidelity_cost": (fidelity, np.array([one.cost for one in team.members])),
-            "fidelity_samples": (fidelity, sizes_of @ inside),
-            "fidelity_nominal": (("output", "fidelity"), np.array([m.centre.outputs for m in team.members]).T),
-            "fidelity_correlation": (("output", "fidelity"), plain_correlations(team)),
-            "fidelity_remainder_correlation": (("output", "fidelity"), correlations(pilot.covariance)),
-            "group_models": (("group", "fidelity"), inside),
-            "group_pilot": (group, np.array([g == PILOT for g in numbers])),
-            "group_samples": (group, sizes_of),
-            "group_failed": (group, np.array([int((~team.ok(g)).sum()) for g in numbers])),
-            "group_cost": (group, np.array([team.costs[max(g, 0)] for g in numbers])),
-            "spent": ((), team.spent),
-            "points": (("sample", "parameter"), np.concatenate([one.points for one in taken])),
-            "sample_group": (("sample",), np.repeat(np.arange(len(numbers)), sizes_of)),
-            "fidelity_values": (("sample", "fidelity", "output"), np.concatenate([one.values for one in taken])),
-            "ok": (("sample",), np.concatenate([team.ok(g) for g in numbers])),
-        }
-    )
-    if isinstance(way, ByModels):
-        (mean, mean_error), (std, std_error) = gains(own, team.spent, way.found)
-        worth = {"gain": mean, "gain_error": mean_error, "std_gain": std, "std_gain_error": std_error}
-        dataset = dataset.assign({name: (by_output, value) for name, value in worth.items()})
-    else:
-        gain = ratio(plain, estimates.mean_error**2 * team.spent, empty=1.0)
-        dataset = dataset.assign(gain=(by_output, gain), gain_error=(by_output, gain * np.sqrt(2 / len(own))))
-    squares = np.where(estimates.mean_error > 0, estimates.mean_error, np.nan) ** 2
-    others = {"monte-carlo": plain / squares}
-    if team.controlled:
-        others["sensitivity-monte-carlo"] = np.einsum("mkk->mk", pilot.covariance)[:, 0] / squares
-    if expanded is not None:
-        others["expansion"] = expanded.left**2 / squares + sizes_of[0]
-    dataset = dataset.assign_coords(alternative=list(others))
-    dataset = dataset.assign(alternative_solves=(("alternative", "output"), np.array(list(others.values()))))
-    add(dataset, compared(others, team.spent, expanded_used=isinstance(way, ByExpansion)))
-    failed = int(dataset["group_failed"].sum())
-    if failed:
-        total = int(sizes_of.sum())
-        dataset.attrs["note"] = (
-            f"{failed} of {total} samples have no answer of all models of their group; estimates are over the others, "
-            "that is, conditional on the models having an answer"
-        )
-    return dataset
-
-
-def inside_own(team: Team, g: int) -> bool:
-    """Whether a group includes the model of the study."""
-    return 0 in team.groups[max(g, 0)]
-
-
-def plain_correlations(team: Team) -> FloatArray:
-    """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
-    samples = team.samples(PILOT if PILOT in team.taken else 0)
-    centred = samples.deviations - samples.deviations.mean(axis=0)
-    return correlations(np.einsum("nkm,nlm->mkl", centred, centred))
-
-
-def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool) -> Finding:
-    """Say what other methods are predicted to need for the errors that were reached."""
-    words = {
-        "monte-carlo": "plain Monte Carlo {} solves",
-        "sensitivity-monte-carlo": "the tangent alone {}",
-        "expansion": "an expansion of the pilot, corrected by further solves, {}",
-    }
-    needed = {name: float(np.nanmax(found, initial=0.0)) for name, found in others.items()}
-    told = ", ".join(words[name].format(f"{number:,.0f}") for name, number in needed.items())
-    text = f"The errors of the means took the work of {spent:,.0f} solves; others are predicted to need: {told}."
-    least = min(needed, key=lambda name: needed[name])
-    if needed[least] < spent and not expanded_used:
-        instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least
-        text += f" The cheap models are not worth their cost here: take {instead}."
-    elif expanded_used:
-        text += " The expansion was taken in place of the cheap models."
-    return Finding("note", text)
-
-
-def preferred(by_models: float, by_expansion: float) -> Finding:
-    """Say that an expansion takes the place of the cheap models."""
-    times = f"{by_models / by_expansion:.3g} times" if by_expansion > 0 else "infinitely"
-    return Finding(
-        "note",
-        f"An expansion of the pilot leaves so little that, by prediction, the variance of the worst mean is {times} "
-        "smaller than with the cheap models for the same cost: it is taken in their place.",
-    )
-
-
-def useless(team: Team, found: Found) -> Iterator[Finding]:
-    """Find cheap models that do not follow the model of the study."""
-    squares = correlations(found.covariance) ** 2
-    for k, one in enumerate(team.members[1:], 1):
-        if (squares[:, k] <= UNRELATED).all():
-            beside = "what the tangents leave of it" if team.controlled else "it"
-            yield Finding(
-                "note",
-                f"The cheap model '{one.label}' does not follow {beside} (squared correlations up to "
-                f"{squares[:, k].max():.2g} in the pilot): it is of no use for these outputs.",
-            )
+def own_values(team: Team) -> FloatArray:
+    """Outputs (n, m) of the study's model in samples with answers of all models of their group."""
+    return np.concatenate([one.taken.values[one.ok][:, 0] for one in team.blocks() if 0 in one.group])

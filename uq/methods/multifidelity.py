@@ -24,8 +24,10 @@ from uq.evaluation.request import OWN, Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.cheap import CHEAP, CheapModel
+from uq.methods.fidelity_choice import ByChoice
+from uq.methods.fidelity_results import described, preferred, useless
 from uq.methods.fidelity_team import OWN_LABEL, Team
-from uq.methods.fidelity_ways import ByExpansion, ByModels, described, preferred, useless
+from uq.methods.fidelity_ways import ByExpansion, ByModels
 from uq.methods.method import MESH
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED, Probability
 from uq.methods.stopping import Amount
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 MOST_MODELS = 6  # cheap ones: 127 groups
 FEWEST = 8  # samples of a pilot
 PILOT, PER_MODEL = 16, 4  # samples of a pilot, and how many more for each cheap model
+UNSEEN = 1.5  # predicted variance, over that of even full solves, up to which those where models differ are taken
 BETTER = 0.8  # predicted variance, over that of the models, from which an expansion takes their place
 LITTLE = 0.01  # of what was spent: not worth another round
 MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
@@ -70,6 +73,11 @@ class Multifidelity(Amount):
     control
         What is taken off every model first: "tangent", its tangent at the mean parameters, or "none". "auto": its
         tangent, and where an expansion is predicted to be better than all models, that in their place.
+    full_solves
+        Which points the study's model is solved at: "differences", with probabilities that grow with the difference of
+        the two cheap models that follow it best, so that it is asked where they are least to be trusted; "evenly", as
+        any point. "auto": "differences", unless the pilot predicts for them a variance half as large again, since it
+        has seen no tails; with a single cheap model, evenly.
     quantiles
         Probabilities of the quantiles of the outputs.
     seed
@@ -81,6 +89,7 @@ class Multifidelity(Amount):
     pilot: Annotated[int, Field(ge=FEWEST)] | None = None
     reuse: bool = True
     control: Literal["auto", "tangent", "none"] = "auto"
+    full_solves: Literal["auto", "evenly", "differences"] = "auto"
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -94,6 +103,8 @@ class Multifidelity(Amount):
             if label == OWN_LABEL or label.startswith(MESH):
                 message = f"a cheap model is called '{label}', expected another name"
                 raise ValueError(message)
+        if self.full_solves == "differences" and len(self.cheap) < 2:
+            raise ValueError("full_solves = 'differences' with a single cheap model, expected two or more")
         if self.samples is not None and self.samples <= self.first:
             message = f"samples = {self.samples}, expected more than the {self.first} of the pilot"
             raise ValueError(message)
@@ -180,17 +191,19 @@ class Multifidelity(Amount):
         models = ByModels(team)
         told = list(useless(team, models.pilot))
         expansion = ByExpansion.of(team) if self.control == "auto" else None
-        way: ByModels | ByExpansion = models
-        if expansion is not None:
-            cost = self._left(team) if self.tolerance is None else models.needed(self.tolerance**2)
-            cost = max(min(cost, self._left(team)), FEWEST)
-            by_models, by_expansion = models.expected(cost), expansion.expected(cost)
-            if by_expansion < BETTER * by_models:
-                told.append(preferred(by_models, by_expansion))
-                way = expansion
-                way.spend(max(FEWEST, min(cost, MOST_GROWTH * team.spent)))
+        cost = self._left(team) if self.tolerance is None else models.needed(self.tolerance**2)
+        cost = max(min(cost, self._left(team)), FEWEST)
+        way: ByModels | ByExpansion | ByChoice = models
+        if len(self.cheap) > 1 and self.full_solves != "evenly":
+            choice = ByChoice(team, models.pilot, known=self.control != "none")
+            if self.full_solves == "differences" or choice.expected(cost) <= UNSEEN * models.expected(cost):
+                way = choice
+        if expansion is not None and expansion.expected(cost) < BETTER * way.expected(cost):
+            told.append(preferred(way.expected(cost), expansion.expected(cost)))
+            way = expansion
+            way.spend(max(FEWEST, min(cost, MOST_GROWTH * team.spent)))
         elif not self.reuse:
-            models.spend(max(FEWEST, min(self._left(team), team.spent)))
+            way.spend(max(FEWEST, min(self._left(team), team.spent)))
         while True:
             reached, left = float(way.estimates.relative_error.max()), self._left(team)
             if self.met(reached) or left < max(1.0, LITTLE * team.spent):
@@ -203,7 +216,8 @@ class Multifidelity(Amount):
             if team.spent == before:  # what is left pays for no further sample
                 break
         poor = self.budget_seconds is not None and self._left(team) < self.limit - team.spent
-        amount = f"{team.count} samples that cost {team.spent:.3g} solves"
+        count = sum(len(one.taken.points) for one in way.blocks())
+        amount = f"{count} samples that cost {team.spent:.3g} solves"
         stopped = self.why_stopped(reached, f"relative error {reached:.3g}", 1 - int(poor), 1, amount)
         dataset = described(team, way, models, expansion)
         if self.quantiles:

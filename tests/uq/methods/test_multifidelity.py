@@ -184,6 +184,63 @@ def test_a_control_that_leaves_nothing():
         assert data["mean_error"][0] < 1e-7
 
 
+# --- full solves where cheap models differ -------------------------------------------------------------------------
+
+
+def cut(*bends):
+    """A peak that models cut off, the one less than the other, with a ripple each."""
+    return [
+        FunctionModel(lambda p, b=b: [1 / (1.02 - p[0] + b) + p[1] + b * np.sin(9 * p[1])] * 2, ("a", "b"), ("f", "g"))
+        for b in bends
+    ]
+
+
+def test_full_solves_where_cheap_models_differ():
+    own, *others = cut(0.0, 0.02, 0.06)
+    method = Multifidelity(samples=60, cheap=cheap(0.01, 0.005), control="none", full_solves="differences")
+    data = method.run(INPUTS, team(*others, own=own))
+    mean = np.log(51) + 0.5
+    assert abs(float(data["mean"][0]) - mean) < 4 * float(data["mean_error"][0])
+    assert data["mean_error"][0] < 0.3 * np.sqrt(34 / 60)  # of plain Monte Carlo
+    assert abs(float(data["std"][0]) - np.sqrt(50 / 1.02 - np.log(51) ** 2 + 1 / 12)) < 4 * float(data["std_error"][0])
+    assert "Full solves were chosen where cheap models differ" in texts(data)
+    assert 50 < float(data["spent"]) <= 60
+    inside, counts = data["group_models"].values, data["group_samples"].values
+    assert float(data["spent"]) == pytest.approx(counts @ data["group_cost"].values + 15 * 0.015)
+    assert data["group_chosen"].values.tolist()[0] is False
+    assert inside[1:].tolist() == [[True] * 3, [False, True, True]] * ((len(counts) - 1) // 2)
+    values, group = data["fidelity_values"].values[:, :, 0], data["sample_group"].values
+    np.testing.assert_array_equal(np.isfinite(values[:, 0]), inside[group, 0])
+    # those that were chosen are where the models differ, near the peak
+    chosen = np.isin(group, np.flatnonzero(data["group_chosen"].values & inside[:, 0]))
+    apart = np.abs(values[:, 1] - values[:, 2])
+    assert apart[chosen].mean() > 2 * apart[~chosen].mean()
+    third = float(data["quantiles"].sel(quantile=0.5)[0])
+    plain = np.median(1 / (1.02 - np.linspace(0, 1, 1001)[:, None]) + np.linspace(0, 1, 1001))
+    assert third == pytest.approx(plain, rel=0.1)
+    again = method.run(INPUTS, team(*others, own=own))
+    for name in ("mean", "std_error", "quantiles", "fidelity_values"):
+        np.testing.assert_array_equal(again[name], data[name])
+
+
+def test_full_solves_are_even_where_the_difference_tells_nothing():
+    """The better model costs half of a solve: all that is spent on asking it everywhere is lost."""
+    models = team(wave(0.29, 0.1), wave(0, 0.3))
+    data = Multifidelity(samples=60, cheap=cheap(0.5, 0.001), control="none").run(INPUTS, models)
+    assert not data["group_chosen"].values.any()
+    with pytest.raises(ValidationError, match="with a single cheap model, expected two or more"):
+        Multifidelity(samples=60, cheap=cheap(0.5), full_solves="differences")
+
+
+def test_a_pilot_that_does_not_count_chooses_too():
+    own, *others = cut(0.0, 0.02, 0.06)
+    method = Multifidelity(tolerance=0.05, cheap=cheap(0.01, 0.005), reuse=False, full_solves="differences")
+    data = method.run(INPUTS, team(*others, own=own))
+    assert data["group_pilot"].values.tolist()[:2] == [True, False]
+    assert (data["mean_error"] / data["mean"]).max() <= 0.05
+    assert abs(float(data["mean"][0]) - np.log(51) - 0.5) < 4 * float(data["mean_error"][0])
+
+
 # --- amounts, failures ---------------------------------------------------------------------------------------------
 
 
@@ -307,7 +364,9 @@ def small(tmp_path_factory):
     place = tmp_path_factory.mktemp("multifidelity")
     text = (ROOT / "configs" / "tiny.toml").read_text()
     cheap_ = "cheap = [{ kind = 'mesh', coarser = 2 }, { kind = 'iterations', iterations = 1 }]\n"
-    method = f"[method]\nkind = 'multifidelity'\nsamples = 40\ncontrol = 'tangent'\n{cheap_}"
+    method = (
+        f"[method]\nkind = 'multifidelity'\nsamples = 40\ncontrol = 'tangent'\nfull_solves = 'differences'\n{cheap_}"
+    )
     (place / "small.toml").write_text(text[: text.index("[method]")] + method)
     done = run(None, TISSUQ, "run", place / "small.toml", "--out", place / "out")
     assert done.returncode == 0, done.stderr

@@ -9,6 +9,17 @@ from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
 
 
+EVENLY = (
+    "Models of a group get the same random parameters. Weights make the estimates those of the first model, whatever the "
+    "others are; numbers of samples make the largest relative error of a mean least for the cost."
+)
+CHOSEN = (
+    "All cheap models are asked at all points. Those at which the model of the study is solved as well are drawn with "
+    "probabilities that grow with the difference of two cheap models, and count with the inverse of these: the estimates "
+    "are those of the first model, whatever the others are. Numbers make the largest relative error of a mean least."
+)
+
+
 class Fidelities(Section):
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
 
@@ -25,10 +36,7 @@ class Fidelities(Section):
             "the tangents leave. It is what a cheap model can explain."
         )
         yield groups(results)
-        yield Text(
-            "Models of a group get the same random parameters. Weights make the estimates those of the first model, "
-            "whatever the others are; numbers of samples make the largest relative error of a mean least for the cost."
-        )
+        yield Text(CHOSEN if results.dataset["group_chosen"].values.any() else EVENLY)
         yield worth(results)
 
 
@@ -61,6 +69,8 @@ def groups(results: Results) -> Table:
         here = dataset.sel(group=g)
         members = [label for label, inside in zip(labels, here["group_models"].values, strict=True) if inside]
         pilot = " (pilot, which does not count)" if bool(here["group_pilot"]) else ""
+        if bool(here["group_chosen"]):
+            pilot = " (chosen where two cheap models differ)" if len(members) == len(labels) else " (the other points)"
         count, cost = int(here["group_samples"]), float(here["group_cost"])
         rows.append(
             (", ".join(members) + pilot, f"{count:,}", f"{int(here['group_failed']):,}", number(count * cost, 3))

@@ -1,0 +1,215 @@
+"""A third way to spend what a multifidelity study has: full solves where two cheap models differ.
+
+The pilot tells which two cheap models follow the model of the study best, and, with the points taken since, how much
+of its variance the choice leaves (`uq.estimators.chosen`). From that and predicted costs follow how many points a pool
+gets and how many of them are chosen, such that the largest relative error of a mean is least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import Finding, FloatArray
+from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
+from uq.estimators.doubts import of_tails
+from uq.estimators.fidelities import Found, correlations
+from uq.estimators.fidelity_quantiles import quantiles_of_chosen
+from uq.estimators.moments import Estimates, Quantiles, ratio
+from uq.estimators.tails import of_influences, unseen
+from uq.inputs.sampling import random_points
+from uq.methods.fidelity_team import PILOT, Block, Taken, Team
+from uq.methods.fidelity_ways import FEWEST, UNLIMITED, sizes
+
+TRIED = 60  # numbers of full solves
+OF_POOL = 0.5  # largest part of a pool that is chosen
+
+
+class Amounts(NamedTuple):
+    """What a cost is spent on, and the largest relative variance of a mean afterwards."""
+
+    full: int
+    points: int
+    variance: float
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A pool, and what was asked for it."""
+
+    pool: Pool
+    taken: Taken
+    chosen: NDArray[np.bool_]
+
+
+class ByChoice:
+    """A pool of all cheap models, and full solves of those points where two of them differ.
+
+    Attributes
+    ----------
+    found
+        What all pools so far tell.
+    """
+
+    def __init__(self, team: Team, pilot: Found, *, known: bool) -> None:
+        self._team, self._known = team, known
+        g = PILOT if PILOT in team.taken else 0
+        first = self._pool(team.taken[g], np.arange(len(team.taken[g].points)))
+        self._pilot, self._counts = first, g == 0
+        follows = (correlations(pilot.covariance)[:, 1:] ** 2).mean(axis=0)
+        best = np.argsort(-follows, kind="stable")[:2] + 1
+        self._pair = (int(best[0]), int(best[1]))
+        self._pools: list[_Taken] = []
+        self._all = team.groups.index(tuple(range(1, len(team.members))))
+        self.found = self._estimated()
+
+    @property
+    def estimates(self) -> Estimates:
+        """Mean and standard deviation."""
+        return self.found.estimates
+
+    def _pool(self, taken: Taken, asked: NDArray[np.intp]) -> _Taken:
+        """A pool whose points are all chosen, or none yet, without those where a cheap model has no answer."""
+        team = self._team
+        deviations = taken.values - team.offsets
+        ok = np.isfinite(deviations[:, 1:]).all(axis=(1, 2))
+        chosen = np.zeros(len(ok), dtype=bool)
+        chosen[asked] = ok[asked]
+        t = team.members[0].centre.coordinates.of(taken.points[ok])
+        places = np.flatnonzero(chosen[ok])
+        return _Taken(Pool(deviations[ok, 1:], t, places, deviations[ok, 0][places]), taken, chosen)
+
+    def _pooled(self) -> Pooled:
+        pools = [one.pool for one in self._pools]
+        if self._counts or not pools:
+            pools = [self._pilot.pool, *pools]
+        return Pooled(pools, self._team.slopes[0], self._team.inputs.correlation, self._known)
+
+    def _estimated(self) -> Chosen:
+        team, pooled = self._team, self._pooled()
+        found = pooled.estimated(team.offsets[0])
+        estimates = found.estimates
+        chosen = found.rest[1] * len(found.rows)
+        tails = [
+            of_influences(estimates, team.inputs, one - one.mean(axis=0))
+            for one in (chosen, found.cheap[1] * len(found.cheap[1]))
+        ]
+        tails[1] = np.maximum(tails[1], unseen(team.inputs, team.offsets[0] + found.predicted) * estimates.std)
+        error = np.linalg.norm([estimates.std_error, *tails], axis=0)
+        return replace(found, estimates=replace(estimates, std_error=error))
+
+    def _design(self) -> Design:
+        """Which differences count now."""
+        found = self.found
+        middle = found.estimates.mean - self._team.offsets[0]
+        squares = ((found.predicted - middle) ** 2).std(axis=0)
+        scale = np.where(found.estimates.std > 0, found.estimates.std, 1.0)
+        return Design(self._pair, middle, scale, np.maximum(squares, scale**2))
+
+    def best(self, cost: float) -> Amounts:
+        """Return how many full solves and points of a pool are best for a cost."""
+        team, found, pooled = self._team, self.found, self._pooled()
+        design = self._design()
+        d = design.differences(pooled.cheap)
+        size = np.hypot(FLOOR * np.sqrt((d**2).mean()) or 1.0, d)
+        errors = found.rest[0] * found.expected[:, None]
+        # Variance of a full solve by the choice, and of a point of the pool.
+        rest = (errors**2 / (size[found.rows] * found.expected)[:, None]).sum(axis=0) * size.mean()
+        cheap = found.cheap[0].var(axis=0) * len(pooled.cheap) ** 2
+        counts = bool(self._counts or self._pools)
+        before, points = counts * ratio(rest, (found.rest[0] ** 2).sum(axis=0)), counts * len(pooled.cheap)
+        per_point, least = float(team.costs[self._all]), min(FEWEST, cost / 2)
+        full = np.geomspace(least, max(OF_POOL * cost / (per_point + OF_POOL), least), TRIED)[:, None]
+        more = (cost - full) / per_point
+        variances = (ratio(rest, before + full) + cheap / (points + more)) / sizes(self.estimates) ** 2
+        i = int(variances.max(axis=1).argmin())
+        number = int(full[i, 0] + 1e-9)
+        return Amounts(number, int((cost - number) / per_point + 1e-9), float(variances[i].max()))
+
+    def expected(self, cost: float) -> float:
+        """Predict the largest relative variance of a mean once so much more is spent."""
+        return self.best(cost).variance
+
+    def needed(self, target: float) -> float:
+        """Predict what has to be spent for a largest relative variance."""
+        low, high = 0.0, 1.0
+        while self.expected(high) > target and high < UNLIMITED:
+            low, high = high, 2 * high
+        while high - low > 0.02 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if self.expected(middle) > target else (low, middle)
+        return high
+
+    def spend(self, cost: float) -> None:
+        """Take a pool for a cost, or a little less, and estimate again."""
+        team = self._team
+        amounts = self.best(cost)
+        full, count = amounts.full, amounts.points
+        if not 0 < full < count:
+            return
+        design, number = self._design(), len(self._pools)
+        taken = team.drawn(self._all, sum(len(one.taken.points) for one in self._pools), count)
+        bare = self._pool(taken, np.empty(0, dtype=int))
+        start = float(random_points((team.seed, len(team.groups) + 1), number, number + 1, 1)[0, 0])
+        floor, intensity, places = choice(design, bare.pool.cheap, full, start)
+        ok = np.isfinite(taken.values[:, 1:]).all(axis=(1, 2))
+        rows = np.flatnonzero(ok)[places]
+        taken.values[rows, 0] = team.solved(0, taken.points[rows], taken.reasons)
+        pool = self._pool(taken, rows)
+        pool = replace(pool, pool=replace(pool.pool, design=design, floor=floor, intensity=intensity))
+        self._pools.append(pool)
+        self.found = self._estimated()
+
+    def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
+        """Return quantiles of the outputs."""
+        pooled = self._pooled()
+        return quantiles_of_chosen(pooled, self.found, self._team.offsets[0], probabilities)
+
+    def blocks(self) -> list[Block]:
+        """What was taken: of each pool the points that were chosen, and the others."""
+        team = self._team
+        found = [Block(team.groups[0], self._pilot.taken, pilot=not self._counts)]
+        for one in self._pools:
+            for group, rows in ((team.groups[0], one.chosen), (team.groups[self._all], ~one.chosen)):
+                found.append(
+                    Block(group, Taken(one.taken.points[rows], one.taken.values[rows], one.taken.reasons), chosen=True)
+                )
+        return found
+
+    def doubts(self) -> Iterator[Finding]:
+        """Say how full solves were chosen, and find what a few of them decide."""
+        team, found = self._team, self.found
+        chosen, points = (
+            sum(f(one) for one in self._pools) for f in (lambda p: p.chosen.sum(), lambda p: len(p.chosen))
+        )
+        labels = [team.members[k].label for k in self._pair]
+        least, most = (f(found.expected) / len(found.predicted) for f in (np.min, np.max))
+        yield Finding(
+            "note",
+            f"Full solves were chosen where cheap models differ: {chosen:,} of {points:,} points, with probabilities "
+            f"from {least:.2g} to {most:.2g} that grow with the difference of '{labels[0]}' and '{labels[1]}', and "
+            "weighted by their inverse. Another choice would change the errors, but not what is estimated.",
+        )
+        values = team.offsets[0] + found.predicted
+        moved = found.rest[1] * len(found.rows)
+        relative = ratio(found.estimates.std_error, found.estimates.std)
+        yield from of_tails(team.evaluate.outputs, values, relative, moved - moved.mean(axis=0))
+
+    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
+        found, e = self.found, self.found.estimates
+        centred = found.predicted - found.predicted.mean(axis=0)
+        kurtosis = ratio((centred**4).mean(axis=0), (centred**2).mean(axis=0) ** 2, empty=3.0)
+        plain = (e.std**2, (kurtosis - 1) * e.std**4)
+        for which, (variance, error) in enumerate(zip(plain, (e.mean_error, 2 * e.std * e.std_error), strict=True)):
+            gain = ratio(variance, error**2 * cost, empty=1.0)
+            yield gain, gain * np.sqrt(found.relative[which] + 4 * ratio(e.std_error, e.std) ** 2)
+
+    @property
+    def plain(self) -> FloatArray:
+        """Variances (m,) of plain samples."""
+        return self.estimates.std**2

@@ -1,0 +1,125 @@
+"""What a multifidelity study says of itself: estimates, what was spent on what, and what other methods need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.model import Finding, FloatArray
+from uq.estimators.fidelities import Found, correlations
+from uq.estimators.moments import ESTIMATES
+from uq.findings import add
+from uq.methods.fidelity_choice import ByChoice
+from uq.methods.fidelity_team import PILOT, Team
+from uq.methods.fidelity_ways import ByExpansion, ByModels
+from uq.surrogates.linearisation import local_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+UNRELATED = 0.1  # squared correlation of remainders up to which a cheap model is of no use
+
+
+def described(
+    team: Team, way: ByModels | ByExpansion | ByChoice, models: ByModels, expanded: ByExpansion | None
+) -> xr.Dataset:
+    """Return estimates, what was spent on what, and what other methods are predicted to need, as labelled arrays."""
+    by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
+    estimates, pilot, blocks = way.estimates, models.pilot, way.blocks()
+    dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=True)
+    K = len(team.members)
+    inside = np.array([np.isin(np.arange(K), one.group) for one in blocks])
+    sizes_of = np.array([len(one.taken.points) for one in blocks])
+    dataset = dataset.assign_coords(fidelity=[one.label for one in team.members], group=np.arange(len(blocks)))
+    dataset = dataset.assign(
+        {
+            **{name: (by_output, getattr(estimates, name)) for name in ESTIMATES},
+            "fidelity_cost": (fidelity, np.array([one.cost for one in team.members])),
+            "fidelity_samples": (fidelity, sizes_of @ inside),
+            "fidelity_nominal": (("output", "fidelity"), np.array([m.centre.outputs for m in team.members]).T),
+            "fidelity_correlation": (("output", "fidelity"), plain_correlations(team)),
+            "fidelity_remainder_correlation": (("output", "fidelity"), correlations(pilot.covariance)),
+            "group_models": (("group", "fidelity"), inside),
+            "group_pilot": (group, np.array([one.pilot for one in blocks])),
+            "group_chosen": (group, np.array([one.chosen for one in blocks])),
+            "group_samples": (group, sizes_of),
+            "group_failed": (group, np.array([int((~one.ok).sum()) for one in blocks])),
+            "group_cost": (group, inside @ np.array([one.cost for one in team.members])),
+            "spent": ((), team.spent),
+            "points": (("sample", "parameter"), np.concatenate([one.taken.points for one in blocks])),
+            "sample_group": (("sample",), np.repeat(np.arange(len(blocks)), sizes_of)),
+            "fidelity_values": (("sample", "fidelity", "output"), np.concatenate([one.taken.values for one in blocks])),
+            "ok": (("sample",), np.concatenate([one.ok for one in blocks])),
+        }
+    )
+    for name, (worth, error) in zip(("gain", "std_gain"), way.gains(team.spent), strict=False):
+        dataset = dataset.assign({name: (by_output, worth), f"{name}_error": (by_output, error)})
+    squares = np.where(estimates.mean_error > 0, estimates.mean_error, np.nan) ** 2
+    others = {"monte-carlo": way.plain / squares}
+    if team.controlled:
+        left = way.found.left if isinstance(way, ByChoice) else np.einsum("mkk->mk", pilot.covariance)[:, 0]
+        others["sensitivity-monte-carlo"] = left / squares
+    if expanded is not None:
+        others["expansion"] = expanded.left**2 / squares + sizes_of[0]
+    dataset = dataset.assign_coords(alternative=list(others))
+    dataset = dataset.assign(alternative_solves=(("alternative", "output"), np.array(list(others.values()))))
+    add(dataset, compared(others, team.spent, expanded_used=isinstance(way, ByExpansion)))
+    failed = int(dataset["group_failed"].sum())
+    if failed:
+        total = int(sizes_of.sum())
+        dataset.attrs["note"] = (
+            f"{failed} of {total} samples have no answer of all models of their group; estimates are over the others, "
+            "that is, conditional on the models having an answer"
+        )
+    return dataset
+
+
+def plain_correlations(team: Team) -> FloatArray:
+    """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
+    samples = team.samples(PILOT if PILOT in team.taken else 0)
+    centred = samples.deviations - samples.deviations.mean(axis=0)
+    return correlations(np.einsum("nkm,nlm->mkl", centred, centred))
+
+
+def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool) -> Finding:
+    """Say what other methods are predicted to need for the errors that were reached."""
+    words = {
+        "monte-carlo": "plain Monte Carlo {} solves",
+        "sensitivity-monte-carlo": "the tangent alone {}",
+        "expansion": "an expansion of the pilot, corrected by further solves, {}",
+    }
+    needed = {name: float(np.nanmax(found, initial=0.0)) for name, found in others.items()}
+    told = ", ".join(words[name].format(f"{number:,.0f}") for name, number in needed.items())
+    text = f"The errors of the means took the work of {spent:,.0f} solves; others are predicted to need: {told}."
+    least = min(needed, key=lambda name: needed[name])
+    if needed[least] < spent and not expanded_used:
+        instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least
+        text += f" The cheap models are not worth their cost here: take {instead}."
+    elif expanded_used:
+        text += " The expansion was taken in place of the cheap models."
+    return Finding("note", text)
+
+
+def preferred(by_models: float, by_expansion: float) -> Finding:
+    """Say that an expansion takes the place of the cheap models."""
+    times = f"{by_models / by_expansion:.3g} times" if by_expansion > 0 else "infinitely"
+    return Finding(
+        "note",
+        f"An expansion of the pilot leaves so little that, by prediction, the variance of the worst mean is {times} "
+        "smaller than with the cheap models for the same cost: it is taken in their place.",
+    )
+
+
+def useless(team: Team, found: Found) -> Iterator[Finding]:
+    """Find cheap models that do not follow the model of the study."""
+    squares = correlations(found.covariance) ** 2
+    for k, one in enumerate(team.members[1:], 1):
+        if (squares[:, k] <= UNRELATED).all():
+            beside = "what the tangents leave of it" if team.controlled else "it"
+            yield Finding(
+                "note",
+                f"The cheap model '{one.label}' does not follow {beside} (squared correlations up to "
+                f"{squares[:, k].max():.2g} in the pilot): it is of no use for these outputs.",
+            )
