@@ -8,15 +8,15 @@ from forward.words import duration, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
 
-
 EVENLY = (
-    "Models of a group get the same random parameters. Weights make the estimates those of the first model, whatever the "
-    "others are; numbers of samples make the largest relative error of a mean least for the cost."
+    "Models of a group get the same random parameters. Weights make the estimates those of the first model, whatever "
+    "the others are; numbers of samples make the largest relative error of a mean least for the cost."
 )
 CHOSEN = (
     "All cheap models are asked at all points. Those at which the model of the study is solved as well are drawn with "
-    "probabilities that grow with the difference of two cheap models, and count with the inverse of these: the estimates "
-    "are those of the first model, whatever the others are. Numbers make the largest relative error of a mean least."
+    "probabilities that grow with the difference of two cheap models, and count with the inverse of these: the "
+    "estimates are those of the first model, whatever the others are. Numbers make the "
+    "largest relative error of a mean least."
 )
 
 
