@@ -22,12 +22,13 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import FloatArray, SolveError
+from uq.estimators.indices import shares
 from uq.estimators.moments import student
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
-from uq.methods.chaos import LARGEST, Chaos, Expanded, Probability
+from uq.methods.chaos import LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
 from uq.methods.method import Method
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
 from uq.methods.stopping import UNASKED
@@ -50,6 +51,7 @@ WORTH = 1.5  # times fewer solves, predicted: then what was begun is given up,
 PATIENCE = 0.5  # but not before it has taken this share of what would follow: expansions may begin slowly
 FUNCTIONS, LEAST_ORDER, LARGEST_ORDER = 500, 6, 20  # of the largest whole basis, and orders
 SCRAMBLES = 16
+GAIN = 0.25  # power of the points in a scramble with which errors fall besides, usually
 LIMITLESS = 10**9
 WITH_DERIVATIVES = 2.0  # solves that one with derivatives counts as
 Control = Literal["none", "tangent", "chaos"]
@@ -240,8 +242,10 @@ def _further(trail: Sequence[tuple[int, float]]) -> float:
     if not np.isfinite(first) or not np.isfinite(last):
         return np.inf
     power = np.log(first / last) / np.log(count / before) if count > before and last < first else 0.0
+    # A claim that is larger than one before it is that of an unlucky choice of functions: both say how many are enough.
     with np.errstate(over="ignore"):
-        return float(count * (np.float64(last) ** (1 / max(power, LEAST_POWER)) - 1))
+        enough = [n * np.float64(claim) ** (1 / max(power, LEAST_POWER)) for n, claim in trail[-SEEN:] if claim <= last]
+    return float(max(min(enough) - count, (LEAST_GROWTH - 1) * count))
 
 
 @dataclass(frozen=True)
@@ -258,28 +262,45 @@ class _Outlook:
         inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
         std = np.asarray(estimates["std"])
         left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
+        missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
         if gradients:
             linear = centre.middle + inputs.coordinates.of(data.points) @ centre.output_slopes.T
-            left["tangent"] = np.minimum((data.values - linear).std(axis=0), std)
+            missed["tangent"] = data.values - linear
+            left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
         points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
         outside = beyond(inputs, regression.basis.values, fit.coefficients, points).share
         ways = []
         for way, of in left.items():
             missing = regression.rest() if way == "chaos" else None
+            gain = GAIN if missing is None else 0.0  # what an expansion misses in tails is at few of the points
             tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
-            ways.append(cls(way, _samples(goal, estimates, of, tails)))
+            ways.append(cls(way, _samples(goal, estimates, (of, _left_of_std(data.values, missed[way])), tails, gain)))
         return min(ways, key=lambda way: way.samples)
 
 
-def _samples(goal: Goal, estimates: dict[str, FloatArray], left: FloatArray, tails: FloatArray) -> int:
-    """Predict the samples of quasi-Monte Carlo whose control leaves so much (m,) of the standard deviations.
+def _left_of_std(values: FloatArray, missed: FloatArray) -> FloatArray:
+    """What a control leaves (m,) of standard deviations by one sample, from values and what it misses of them (n, m).
 
-    And so much (m,) of it in tails, however many samples there are.
+    Where values are large it misses most: the difference of squares is more than independent errors of its size make.
+    """
+    deviations = values - values.mean(axis=0)
+    squares = missed * (2 * deviations - missed)
+    return np.asarray(shares(squares.std(axis=0), 2 * deviations.std(axis=0)))
+
+
+def _samples(
+    goal: Goal, estimates: dict[str, FloatArray], left: tuple[FloatArray, FloatArray], tails: FloatArray, gain: float
+) -> int:
+    """Predict the samples of quasi-Monte Carlo whose control leaves so much (m,) of means and standard deviations.
+
+    And so much (m,) of the latter in tails, however many samples there are. Errors fall by such a power (`gain`) of the
+    points in a scramble faster than those of independent samples.
     """
     n, half_width = 4 * SCRAMBLES, student(SCRAMBLES - 1)
     while n < goal.most:
-        error = left * n**-0.5 * (n / SCRAMBLES) ** -0.25
-        then = {**estimates, "mean_error": error, "std_error": np.hypot(np.sqrt(2) * error, tails)}
+        falls = n**-0.5 * (n / SCRAMBLES) ** -gain
+        of_std = np.maximum(np.sqrt(2) * left[0], left[1]) * falls
+        then = {**estimates, "mean_error": left[0] * falls, "std_error": np.hypot(of_std, tails)}
         if goal.reached(then, half_width) <= 1:
             break
         n *= 2

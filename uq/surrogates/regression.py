@@ -22,7 +22,8 @@ from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis, IntArray, orthonormal, recurrence
-from uq.surrogates.candidates import DICTIONARY, Candidates, candidates_of, rows_of
+from uq.surrogates.candidates import DICTIONARY, FULL, Candidates, candidates_of, rows_of
+from uq.surrogates.hidden import of_std
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 
 BoolArray = NDArray[np.bool_]
@@ -127,7 +128,9 @@ class Regression:
         """
         if of is None and not self.inputs.independent:
             return self._dependent()
-        return _estimates(self.fit, self.largest.indices, self.data, self.missing(), of or coefficient_moments)
+        missing = self.missing()
+        hidden = None if missing is None else self._hidden(missing)
+        return _estimates(self.fit, self.largest.indices, self.data, missing, of or coefficient_moments, hidden)
 
     def _dependent(self) -> dict[str, FloatArray]:
         """Moments and, of few parameters, Shapley effects."""
@@ -167,6 +170,13 @@ class Regression:
             if places.size:
                 least = np.minimum(least, self._left_of_following(places, q))
         return np.sqrt(shares(self.fit.squares, least))
+
+    def _hidden(self, missing: FloatArray) -> FloatArray:
+        """Return errors (m,) of standard deviations by what is `missing` (m,): that itself of many parameters."""
+        tails = _tails(self.inputs)
+        if tails.size > FULL or self.inputs.draws is not None:
+            return missing
+        return of_std(self.inputs, tails, self.basis, self.data, self.fit, missing)
 
     def _left_of_following(self, places: IntArray, q: FloatArray) -> FloatArray:
         """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
@@ -243,7 +253,12 @@ def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, F
 
 
 def _estimates(
-    fit: Fit, largest: IntArray, data: Data, missing: FloatArray | None, of: Analysis
+    fit: Fit,
+    largest: IntArray,
+    data: Data,
+    missing: FloatArray | None,
+    of: Analysis,
+    hidden: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
     """Moments and indices by output, with standard errors from the jackknife over samples and the residual variance.
 
@@ -262,9 +277,9 @@ def _estimates(
     they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
 
     In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have tails,
-    the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for
-    the mean, whose error is the jackknife's. What the fit leaves where samples are, λ, is no such error of the standard
-    deviation: it is known by samples, as of bounded parameters.
+    the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, or what this
+    does to it (`hidden`), and over √n for the mean, whose error is the jackknife's. What the fit leaves where samples
+    are, λ, is no such error of the standard deviation: it is known by samples, as of bounded parameters.
 
     Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
     """
@@ -287,7 +302,12 @@ def _estimates(
             + (seen["mean"] - central["mean"]) ** 2 / 4
             + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
         ),
-        "std": np.sqrt(beyond_samples**2 + unsure**2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
+        "std": np.sqrt(
+            (beyond_samples if hidden is None else hidden) ** 2
+            + unsure**2
+            + bias**2
+            + (seen["std"] - central["std"]) ** 2 / 4
+        ),
     }
     for name, values in left_out.items():
         spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
