@@ -86,12 +86,12 @@ def mistake(path):
 def test_draws_give_the_moments_of_a_loop_over_them_with_any_ranks(folder):
     path = study(folder, 'from = "draws.csv"\nc = { kind = "normal", mean = 0, std = 0.1 }')
     files = []
-    for ranks in (None, 2, 3):
+    for ranks in (None, 3):
         out = folder / f"out-{ranks}"
         done = on_ranks(ranks, TISSUQ, "run", path, "--out", out, "--no-report", "--quiet")
         assert done.returncode == 0, done.stderr
         files.append((out / "results.nc").read_bytes())
-    assert files[0] == files[1] == files[2]
+    assert files[0] == files[1]
     found = xr.load_dataset(folder / "out-None" / "results.nc")
     assert found.parameter.values.tolist() == ["c", "a", "b"]
     points = found["points"].to_numpy()
