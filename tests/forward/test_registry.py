@@ -93,6 +93,7 @@ def test_metadata_of_installed_packages_are_read_once(outside, tmp_path, monkeyp
 
     found = importlib.metadata.entry_points
     monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # compiled modules would change their folder once more
     assert "gale" not in LOADS
     read.clear()
     assert "gale" not in LOADS
