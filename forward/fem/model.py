@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from forward.fem.affordable import allowance, richer
-from forward.fem.cost import MOST_BYTES, Linear, estimate, together
+from forward.fem.cost import MOST_BYTES, Linear, Way, estimate, together
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
@@ -111,7 +111,10 @@ class HyperelasticModel(OneByOne):
 
     @property
     def enriched_twice(self) -> Enriched | None:
-        """The same in elements of two degrees more, which calibrate that; None where they take too much memory."""
+        """The same in elements of two degrees more, which calibrate that.
+
+        None where they take too much memory, or are solved too roughly.
+        """
         return self._enrichments.twice
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
@@ -322,7 +325,9 @@ class _Enrichments:
     def twice(self) -> Enriched | None:
         spec = self._spec.enriched().enriched()
         cost = estimate(self._spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        return Enriched(self._equations, spec, self._functionals) if cost.bytes <= MOST_BYTES else None
+        # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
+        rough = spec.mixed and cost.way == Way.SMOOTHING
+        return Enriched(self._equations, spec, self._functionals) if cost.bytes <= MOST_BYTES and not rough else None
 
 
 class _Way:
@@ -583,7 +588,7 @@ class FiniteElementSolution:
     def saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
         """Find the state in elements of two degrees more too, and the factors of state and energy; collective.
 
-        None where that takes too much memory.
+        None where that takes too much memory, or is too rough.
         """
         model = self._model
         model.visit(self)

@@ -1,12 +1,14 @@
 """What the mesh adds to outputs and states, as elements of one degree more see it."""
 
+from dataclasses import replace
+
 import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from forward.external.models import PythonModel
-from forward.fem.cost import Way
+from forward.fem.cost import Way, estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import FunctionModel, Guess, ReferenceSolution
 from forward.specimen import Specimen
@@ -383,3 +385,17 @@ def test_ranks_agree(tmp_path):
         for here, expected in zip(other, found[0], strict=True):
             for name, values in expected.items():
                 np.testing.assert_allclose(here[name], values, rtol=0, atol=1e-8 * np.abs(values).max(), err_msg=name)
+
+
+def test_elements_of_two_degrees_more_say_too_little_by_steps_with_pressures(monkeypatch):
+    """What is left by steps is a large part of what they say more than elements of one degree more."""
+    ways = []
+
+    def by_steps(*bodies, **form):
+        ways.append(Way.SMOOTHING)
+        return replace(estimate(*bodies, **form), way=Way.SMOOTHING)
+
+    monkeypatch.setattr("forward.fem.model.estimate", by_steps)
+    model = loaded_body("neo-hookean mixed").build(MPI.COMM_SELF, ())
+    assert model.enriched_twice is None
+    assert ways
