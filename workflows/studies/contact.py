@@ -76,7 +76,7 @@ def with_contact(
         return dataset
     of_nodes = found.fields[:, : places.size].reshape(len(tools), -1, 3)
     tool, node = np.nonzero(of_nodes[:, :, 1])
-    order = np.lexsort((*places[node].T, np.array(tools)[tool]))
+    order = np.lexsort((node, np.array(tools)[tool]))  # nodes have an order that ranks do not change
     tool, node = tool[order], node[order]
     vertex = ("contact_vertex",)
     return dataset.assign_coords(contact_tool=(vertex, np.array(tools)[tool])).assign(

@@ -56,7 +56,7 @@ def test_any_number_of_ranks(tmp_path):
     for name, ranks, words in (
         ("one", None, ()),
         ("three", 3, ()),
-        ("shared", 3, ("--set", "parallel.ranks_per_model=3")),
+        ("shared", 2, ("--set", "parallel.ranks_per_model=2")),
     ):
         done = run(ranks, TISSUQ, "run", study, "--out", tmp_path / name, "--no-report", "--quiet", *words)
         assert done.returncode == 0, done.stderr
