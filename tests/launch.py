@@ -11,6 +11,7 @@ import xarray as xr
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
 NOT_KEPT = "PYTHONDONTWRITEBYTECODE"
+HANGS = 900  # s, after which a program hangs: busy machines that compile all forms are slow
 
 
 def environment():
@@ -35,20 +36,20 @@ def on_ranks(ranks, *command):
     return list(map(str, command if ranks is None else (mpirun, "-n", ranks, *command)))
 
 
-def run(ranks, *command, path=None, timeout=300):
+def run(ranks, *command, path=None, timeout=HANGS):
     """Run to the end, with packages in a folder of their own; exit code and output are in what is returned."""
     return subprocess.run(
         on_ranks(ranks, *command),
         capture_output=True,
         text=True,
-        timeout=timeout,  # a hang; busy machines are slow
+        timeout=timeout,
         env=environment() | ({} if path is None else {"PYTHONPATH": str(path)}),
         check=False,
         cwd=ROOT,
     )
 
 
-def run_script(ranks, script, *arguments, timeout=300):
+def run_script(ranks, script, *arguments, timeout=HANGS):
     """Run a Python script."""
     return run(ranks, sys.executable, "-c", script, *arguments, timeout=timeout)
 

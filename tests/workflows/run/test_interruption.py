@@ -14,7 +14,7 @@ from threading import Thread
 
 import pytest
 
-from tests.launch import NOT_KEPT, ROOT, TISSUQ, environment, on_ranks, run_script
+from tests.launch import HANGS, NOT_KEPT, ROOT, TISSUQ, environment, on_ranks, run_script
 from workflows.__main__ import main
 
 MODEL = """
@@ -77,7 +77,7 @@ def tissuq(*arguments, ranks=None, case="", limits=()):
         on_ranks(ranks, TISSUQ, *arguments),
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=HANGS,
         # Of compiled modules too Python keeps what it could write, and stumbles over it later.
         env=environment() | {"CASE": case} | ({NOT_KEPT: "1"} if limits else {}),
         check=False,
