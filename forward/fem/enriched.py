@@ -43,6 +43,7 @@ ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 5e-3  # relative tolerance of the same solves
 CLOSE_MIXED = 0.05  # the same of the first with pressures, which another always follows
 CLOSER = 0.1  # that of further steps, which change a tenth, and the part of their energy that these may miss
+ONCE = 1.0  # the same with pressures and the factor of a reference: one correction
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
 BENT_MIXED = 0.0  # the same with pressures, whose part of the work has the other sign: always
@@ -306,7 +307,8 @@ class Enriched:
                 far = far if far < BARELY else np.inf
                 break
             moved = Moved(solution, found.state)
-            (step,) = self._solve(solution, -left[None], close=CLOSER) if near else self._solve(moved, -left[None])
+            close = ONCE if equations.spec.mixed and self.way == Way.REFERENCE else CLOSER
+            (step,) = self._solve(solution, -left[None], close=close) if near else self._solve(moved, -left[None])
             change = found.change + step
             before, linearised = found.state, start if near else found.state
             found = found._replace(state=start + change, change=change, before=before, step=step, linearised=linearised)
