@@ -1,6 +1,5 @@
 """What every test gets, and in which order they run."""
 
-import os
 import sys
 from collections import Counter
 from pathlib import Path
@@ -12,12 +11,6 @@ def pytest_configure(config):
     """Let pytest-xdist keep the order below; its own begins with the files of most tests, which are the short ones."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers():
-    """One worker more than cores: a third of the time tests wait, for programs that begin, disks and clocks."""
-    return len(os.sched_getaffinity(0)) + 1
 
 
 def pytest_collection_modifyitems(items):
