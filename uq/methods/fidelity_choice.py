@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from forward.model import Finding, FloatArray
 from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.doubts import of_tails
-from uq.estimators.fidelities import Found, correlations
+from uq.estimators.fidelities import Found, correlations, ok_rows
 from uq.estimators.fidelity_quantiles import quantiles_of_chosen
 from uq.estimators.moments import Estimates, Quantiles, ratio
 from uq.estimators.tails import of_influences, unseen
@@ -57,6 +57,7 @@ class ByChoice:
 
     def __init__(self, team: Team, pilot: Found, *, known: bool) -> None:
         self._team, self._known = team, known
+        self._all = team.groups.index(tuple(range(1, len(team.members))))
         g = PILOT if PILOT in team.taken else 0
         first = self._pool(team.taken[g], np.arange(len(team.taken[g].points)))
         self._pilot, self._counts = first, g == 0
@@ -64,7 +65,6 @@ class ByChoice:
         best = np.argsort(-follows, kind="stable")[:2] + 1
         self._pair = (int(best[0]), int(best[1]))
         self._pools: list[_Taken] = []
-        self._all = team.groups.index(tuple(range(1, len(team.members))))
         self.found = self._estimated()
 
     @property
@@ -76,12 +76,16 @@ class ByChoice:
         """A pool whose points are all chosen, or none yet, without those where a cheap model has no answer."""
         team = self._team
         deviations = taken.values - team.offsets
-        ok = np.isfinite(deviations[:, 1:]).all(axis=(1, 2))
+        ok = self._answered(taken)
         chosen = np.zeros(len(ok), dtype=bool)
         chosen[asked] = ok[asked]
         t = team.members[0].centre.coordinates.of(taken.points[ok])
         places = np.flatnonzero(chosen[ok])
         return _Taken(Pool(deviations[ok, 1:], t, places, deviations[ok, 0][places]), taken, chosen)
+
+    def _answered(self, taken: Taken) -> NDArray[np.bool_]:
+        """Which points (n,) have answers of all cheap models."""
+        return ok_rows(taken.values, self._team.groups[self._all])
 
     def _pooled(self) -> Pooled:
         pools = [one.pool for one in self._pools]
@@ -156,8 +160,7 @@ class ByChoice:
         bare = self._pool(taken, np.empty(0, dtype=int))
         start = float(random_points((team.seed, len(team.groups) + 1), number, number + 1, 1)[0, 0])
         floor, intensity, places = choice(design, bare.pool.cheap, full, start)
-        ok = np.isfinite(taken.values[:, 1:]).all(axis=(1, 2))
-        rows = np.flatnonzero(ok)[places]
+        rows = np.flatnonzero(self._answered(taken))[places]
         taken.values[rows, 0] = team.solved(0, taken.points[rows], taken.reasons)
         pool = self._pool(taken, rows)
         pool = replace(pool, pool=replace(pool.pool, design=design, floor=floor, intensity=intensity))

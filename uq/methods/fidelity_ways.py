@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,9 +30,6 @@ from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
 from uq.surrogates.regression import Regression
 from uq.surrogates.taylor import Control, expansion
-
-if TYPE_CHECKING:
-    pass
 
 FEWEST = 8  # samples of a group that gets any
 ORDER = 6  # largest order of the expansion
