@@ -231,7 +231,7 @@ class _Largest(_Output):
     def _there(self, c: FloatArray) -> tuple[int, FloatArray]:
         u = self._rows @ c
         sizes = np.sqrt((u**2).sum(axis=0))
-        node = int(np.flatnonzero(sizes >= sizes.max() * (1 - 1e-10))[0])
+        node = int(np.argmax(~(sizes < sizes.max() * (1 - 1e-10))))  # also where there are no numbers
         return node, u[:, node]
 
     def value(self, c: FloatArray, parameters: FloatArray) -> float:

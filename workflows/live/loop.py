@@ -9,12 +9,14 @@ the `outputs`, and which of them come from the `local` model alone. Then each li
 parameters that have changed, is answered by one line: `outputs`, estimated `errors` to be added, `spread` (one standard
 deviation due to the parameters that nobody has set), the `residual`, the number of `corrections`, whether the frame is
 `late`, the age of the local model (`local_ms`), and the `microseconds` that the answer took. `id` comes back as sent.
+There is one body: what one client sets moves it for all. One that does not read its answers is not read either.
 
 A frame is corrected as long as that is done within `WITHIN`. Where a correction takes longer, the answer is the last
 frame moved along the slopes of the local model (`corrections` is 0), and the correction follows once it has been sent.
 When it is late, that is, when more than one line waits, only the last one is solved for; the others are answered in
 that way, and say so. Where the model cannot follow (a jump), frames are those of the nearest local model until the next
-one is there.
+one is there; they say so in `doubt`, and so do those where no local model can be made, since there is no equilibrium or
+none that is stable. Errors and spread are null then: those that are known are of another place.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
 from forward.reduced.stream import Local, Stream, local
+from workflows.config.mistakes import StudyError
 from workflows.live.mail import Mail, pair
 
 WITHIN = 0.5e-3  # s that the corrections of a frame may take
@@ -46,6 +49,7 @@ REST = 5e-5  # s in which the system delivers an answer before its correction is
 SHOWN = 1 / 60  # s between states that are sent to the page
 BEHIND = 5  # how much nicer the other processes are than the loop
 LONGEST = 2**16  # bytes of a line
+FAR = "the body has moved too far at once: outputs are on the tangent at another place, until this one is solved"
 NOT_PROMPT = "the usual one: frames are late where others want the processors (`ulimit -r 1` would let it be real time)"
 
 
@@ -73,13 +77,13 @@ class Loop:
     ----------
     path
         The reduced model.
-    host, port
-        Where it listens; port 0 is any free one.
+    listening
+        Where clients connect.
     view
         Sends what the page shows, and what its sliders say comes back; None without a page.
     """
 
-    def __init__(self, path: Path, host: str, port: int, view: Mail | None = None) -> None:
+    def __init__(self, path: Path, listening: socket.socket, view: Mail | None = None) -> None:
         data = load(path)
         self._model = ReducedModel(data, data.parameters)
         self._data, self._view = data, view
@@ -94,14 +98,15 @@ class Loop:
         self._process.start()
         theirs.close()
         self._busy, self._shown, self._asked = False, 0.0, data.nominal.copy()
-        self._listening = socket.create_server((host, port))
-        self.port = int(self._listening.getsockname()[1])
+        self._refused = ""  # why there is no local model where one was asked for last
+        self._listening = listening
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
         self._selector.register(self._helper, selectors.EVENT_READ, self._local)
         if view is not None:
             self._selector.register(view, selectors.EVENT_READ, self._slid)
         self._buffers: dict[socket.socket, bytearray] = {}
+        self._unsent: dict[socket.socket, bytes] = {}
         self.ended = False
 
     def run(self) -> None:
@@ -149,11 +154,15 @@ class Loop:
     def _accept(self, listening: socket.socket) -> None:
         client, _ = listening.accept()
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setblocking(False)
         self._buffers[client] = bytearray()
         self._selector.register(client, selectors.EVENT_READ, self._read)
-        self._send(client, self.greeting())
+        self._send(client, [self.greeting()])
 
     def _read(self, client: socket.socket) -> None:
+        if client in self._unsent:
+            self._send(client, [])
+            return
         try:
             arrived = client.recv(LONGEST)
         except OSError:
@@ -162,53 +171,74 @@ class Loop:
         buffer += arrived
         *lines, rest = bytes(buffer).split(b"\n")
         self._buffers[client] = bytearray(rest)
-        if not arrived or len(rest) > LONGEST:
+        if not arrived:
             self._leave(client)
             return
-        for line in lines[:-1]:
-            self._send(client, self.answer(line, late=True))
-        if lines:
-            self._send(client, self.answer(lines[-1]))
+        self._send(client, [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)])
+        if len(rest) > LONGEST:
+            self._send(client, [{"error": f"a line of more than {LONGEST} bytes, expected a table of numbers"}])
+            self._leave(client)
 
     def _leave(self, client: socket.socket) -> None:
-        self._selector.unregister(client)
-        del self._buffers[client]
-        client.close()
+        if client in self._buffers:
+            self._selector.unregister(client)
+            del self._buffers[client]
+            self._unsent.pop(client, None)
+            client.close()
 
-    def _send(self, client: socket.socket, table: dict[str, Any]) -> None:
+    def _send(self, client: socket.socket, tables: list[dict[str, Any]]) -> None:
+        """Send answers; of what there is no room for now, the rest once there is, and nothing is read before."""
+        lines = b"".join(json.dumps(table).encode() + b"\n" for table in tables)
+        before = self._unsent.pop(client, b"")
+        content = before + lines
         try:
-            client.sendall(json.dumps(table).encode() + b"\n")
-        except OSError:  # it has gone; the next read says so
+            sent = client.send(content) if content else 0
+        except BlockingIOError:
+            sent = 0
+        except OSError:  # it has gone
+            self._leave(client)
             return
+        if sent < len(content):
+            self._unsent[client] = content[sent:]
+        if before or client in self._unsent:
+            wanted = selectors.EVENT_WRITE if client in self._unsent else selectors.EVENT_READ
+            self._selector.modify(client, wanted, self._read)
 
     def answer(self, line: bytes, *, late: bool = False) -> dict[str, Any]:
         """Return the answer to a line."""
         begin = time.perf_counter()
+        own: dict[str, Any] = {}
         try:
-            table = json.loads(line)
-            assert isinstance(table, dict)
-            own = {"id": table.pop("id")} if "id" in table else {}
-            self._set({str(path): float(value) for path, value in table.items()})
-        except (ValueError, TypeError, AssertionError) as error:
-            said = (
-                str(error) if isinstance(error, _UnknownError) else "expected a table of numbers by parameter, in JSON"
-            )
-            return {"error": said}
+            table = _table(line)
+            number = table.pop("id", None)
+            if isinstance(number, str) or (number is not None and np.isfinite(number)):
+                own = {"id": number}
+            self._set({str(path): _number(value) for path, value in table.items()})
+        except _UnknownError as error:
+            return {**own, "error": str(error)}
+        except (ValueError, TypeError, OverflowError, RecursionError):
+            return {**own, "error": "expected a table of numbers by parameter, in JSON"}
         frame = self.stream.linear(self._now) if late else self.stream.frame(self._now, WITHIN)
-        here = self.stream.here
-        beyond = outside_of(self._data, self._now)
+        here, beyond, doubt = self.stream.here, outside_of(self._data, self._now), self._doubt
+        unknown = np.full(len(frame.outputs), np.nan)
         return {
             **own,
-            "outputs": frame.outputs.tolist(),
-            "errors": here.errors.tolist(),
-            "spread": here.spread.tolist(),
-            "residual": None if np.isnan(frame.residual) else frame.residual,
+            "outputs": _known(frame.outputs),
+            "errors": _known(unknown if doubt else here.errors),
+            "spread": _known(unknown if doubt else here.spread),
+            "residual": _known([frame.residual])[0],
             "corrections": frame.corrections,
             "late": late,
             **({"outside": beyond} if beyond else {}),
+            **({"doubt": doubt} if doubt else {}),
             "local_ms": round(1e3 * (time.monotonic() - self._made), 1),
             "microseconds": round(1e6 * (time.perf_counter() - begin)),
         }
+
+    @property
+    def _doubt(self) -> str:
+        """Why the newest frame is not an answer of the model; empty if it is one."""
+        return self._refused or (FAR if self.stream.lost else "")
 
     def _set(self, values: dict[str, float]) -> None:
         names = self._data.parameters
@@ -216,8 +246,6 @@ class Loop:
             if path not in names:
                 message = f"'{path}' is not a parameter, expected one of: {', '.join(names)}"
                 raise _UnknownError(message)
-        if not all(np.isfinite(value) for value in values.values()):
-            raise ValueError
         self._now = self._now.copy()
         for path, value in values.items():
             self._now[names.index(path)] = value
@@ -232,6 +260,7 @@ class Loop:
             self.ended = True
             return
         self._busy = False
+        self._refused = found if isinstance(found, str) else ""
         if isinstance(found, Local):
             self.stream.moved(replace(found, inverse=found.inverse.astype(float)))
             self._made = time.monotonic()
@@ -247,8 +276,9 @@ class Loop:
 
     def _share(self) -> None:
         """Have the newest place linearised, and show it."""
-        if not self._busy and (self.stream.lost or not np.array_equal(self._asked, self._now)):
-            start = None if self.stream.lost else self.stream.modes
+        again = self.stream.lost and not self._refused  # what has no equilibrium has none the next time
+        if not self._busy and (again or not np.array_equal(self._asked, self._now)):
+            start = None if self.stream.lost or self._refused else self.stream.modes
             try:
                 self._busy = self._helper.send((self._now, start, self._uncertain))
             except OSError:  # it has ended
@@ -260,8 +290,9 @@ class Loop:
             self._shown = now
             outputs: FloatArray = self.stream.linear(self._now).outputs
             here = self.stream.here
+            errors, spread = (np.full(len(outputs), np.nan) if self._doubt else x for x in (here.errors, here.spread))
             try:
-                self._view.send((self._now, self.stream.modes, outputs, here.errors, here.spread))
+                self._view.send((self._now, self.stream.modes, outputs, errors, spread))
             except OSError:  # the page has ended; frames go on
                 self._selector.unregister(self._view)
                 self._view = None
@@ -280,6 +311,42 @@ class _UnknownError(ValueError):
     """A parameter that the model does not have."""
 
 
+def _table(line: bytes) -> dict[str, Any]:
+    found = json.loads(line)
+    if isinstance(found, dict):
+        return found
+    raise TypeError
+
+
+def _number(value: Any) -> float:
+    """Return a number of a table; text, truth values and what is not finite are none."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(float(value)):
+        raise ValueError
+    return float(value)
+
+
+def _known(values: Any) -> list[float | None]:
+    """Return numbers for JSON, which has none that are not finite."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def listen(host: str, port: int, option: str) -> socket.socket:
+    """Return a socket at a port; 0 is any free one.
+
+    Raises
+    ------
+    StudyError
+        If it is taken.
+    """
+    try:
+        return socket.create_server((host, port))
+    except (OSError, OverflowError) as error:
+        number = getattr(error, "errno", None) or 0
+        reason = os.strerror(number) if number > 0 else error
+        message = f"{option} {port}: cannot be used on {host}: {reason}"
+        raise StudyError(message) from None
+
+
 def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False) -> None:
     """Serve a reduced model until the user ends it.
 
@@ -293,20 +360,29 @@ def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = F
         Port of the page; None for no page.
     quiet
         Say nothing.
+
+    Raises
+    ------
+    StudyError
+        If a port is taken.
     """
     from workflows.live.page import show
 
     context = multiprocessing.get_context("spawn")
+    listening = listen(host, port, "--port")
     view = process = None
     if page is not None:
+        shown = listen("127.0.0.1", page, "--page")
+        page = shown.getsockname()[1]
         view, theirs = pair()
-        process = context.Process(target=show, args=(str(path), page, theirs), daemon=True)
+        process = context.Process(target=show, args=(str(path), shown, theirs), daemon=True)
         process.start()
         theirs.close()
-    loop = Loop(path, host, port, view)
+        shown.close()
+    loop = Loop(path, listening, view)
     prompt = real_time()
     if not quiet:
-        sys.stdout.write(f"frames: {host}:{loop.port}, a line of JSON each\n")
+        sys.stdout.write(f"frames: {host}:{listening.getsockname()[1]}, a line of JSON each\n")
         if page is not None:
             sys.stdout.write(f"page: http://127.0.0.1:{page}/\n")
         sys.stdout.write(f"priority: {'that of real time' if prompt else NOT_PROMPT}\n")

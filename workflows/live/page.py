@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -55,6 +56,7 @@ class Scene:
                 )
             ],
         }
+        self.parameters = frozenset(data.parameters)
         self._latest: tuple[FloatArray, ...] = ()
 
     def take(self, latest: tuple[FloatArray, ...]) -> None:
@@ -71,8 +73,8 @@ class Scene:
         return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
 
 
-def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
-    """Return the server of a scene; `move` is called with what sliders say."""
+def server(scene: Scene, listening: socket.socket, move: Any) -> ThreadingHTTPServer:
+    """Return the server of a scene at a socket; `move` is called with what sliders say."""
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -107,19 +109,25 @@ def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
                 case _:
                     self.send_error(404)
 
-        def do_POST(self) -> None:
+        def _values(self) -> dict[str, float]:
             length = int(self.headers.get("Content-Length", "0"))
+            # A page elsewhere may send text, but no JSON, without being allowed to.
+            if self.headers.get("Content-Type") == "application/json" and 0 < length <= LARGEST:
+                values = {str(k): float(v) for k, v in json.loads(self.rfile.read(length)).items()}
+                if values.keys() <= scene.parameters and np.isfinite(list(values.values())).all():
+                    return values
+            raise ValueError
+
+        def do_POST(self) -> None:
             if not self._own():
                 return
-            # A page elsewhere may send text, but no JSON, without being allowed to.
-            if self.headers.get("Content-Type") != "application/json" or not 0 < length <= LARGEST:
-                self.send_error(400)
-                return
             try:
-                move({str(k): float(v) for k, v in json.loads(self.rfile.read(length)).items()})
-            except (ValueError, TypeError, AttributeError):
+                values = self._values()
+            except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
+                self.close_connection = True  # what has not been read would be taken for the next request
                 self.send_error(400)
                 return
+            move(values)
             self._answer(b"{}", "application/json")
 
         def log_message(self, format: str, *arguments: Any) -> None:
@@ -131,13 +139,16 @@ def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
             if not isinstance(sys.exception(), ConnectionError):
                 super().handle_error(request, client_address)
 
-    return Server(("127.0.0.1", port), Handler)
+    found = Server(listening.getsockname(), Handler, bind_and_activate=False)
+    found.socket.close()
+    found.socket = listening
+    return found
 
 
-def show(path: str, port: int, mail: Mail) -> None:
+def show(path: str, listening: socket.socket, mail: Mail) -> None:
     """Serve the page of a model whose newest frames come by mail, until that is closed."""
     scene = Scene(load(Path(path)))
-    found = server(scene, port, mail.send)
+    found = server(scene, listening, mail.send)
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:

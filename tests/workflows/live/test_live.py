@@ -1,5 +1,6 @@
 """`tissuq live`: a socket and a page."""
 
+import contextlib
 import json
 import socket
 import subprocess
@@ -59,6 +60,7 @@ def test_frames_over_a_socket_and_the_body_on_a_page(small, tmp_path):  # noqa: 
             client.sendall(b'{"loads.pressure.size": 231}\n{"loads.pressure.size": 232}\n')
             first, last = json.loads(lines.readline()), json.loads(lines.readline())
             assert (first["late"], last["late"]) in {(True, False), (False, False)}
+            _rude(port, client, lines)
         base = f"http://127.0.0.1:{page}"
         scene = json.loads(_patiently(f"{base}/scene"))
         size = 4 * (3 * len(small.outputs) + len(scene["places"]))
@@ -72,10 +74,38 @@ def test_frames_over_a_socket_and_the_body_on_a_page(small, tmp_path):  # noqa: 
             urllib.request.urlopen(urllib.request.Request(f"{base}/frame", headers={"Host": "elsewhere"}), timeout=10)
         with pytest.raises(urllib.error.HTTPError, match="400"):
             urllib.request.urlopen(f"{base}/move", data=b'{"loads.pressure.size": 1}', timeout=10)
+        for wrong in (b'{"x": 1}', b"[" * 9999, b'{"loads.pressure.size": %s}' % (b"1" * 400)):
+            asked = urllib.request.Request(f"{base}/move", wrong, {"Content-Type": "application/json"})
+            with pytest.raises(urllib.error.HTTPError, match="400"):
+                urllib.request.urlopen(asked, timeout=10)
         assert b"<canvas" in _patiently(base)
+        _taken(tmp_path / "model.npz", port, page)
     finally:
         served.terminate()
         served.wait(20)
+
+
+def _rude(port, client, lines):
+    """One that asks and never reads keeps nobody waiting, and a line too long is refused in words."""
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as other:
+        other.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(20_000):
+                other.send(b"{}\n" * 20)
+        client.sendall(b"{}\n")
+        assert "outputs" in json.loads(lines.readline())
+    client.sendall(b"x" * 200_000)
+    assert "more than 65536 bytes" in json.loads(lines.readline())["error"]
+
+
+def _taken(file, port, page):
+    """Ports that are taken are named in one line."""
+    for taken in ("port", "page"):
+        again = list(map(str, [TISSUQ, "live", file, "--port", "0", "--page", "0"]))
+        again[again.index(f"--{taken}") + 1] = number = str(port if taken == "port" else page)
+        found = subprocess.run(again, env=environment(), capture_output=True, text=True, timeout=60, check=False)
+        assert found.returncode == 2
+        assert found.stderr == f"--{taken} {number}: cannot be used on 127.0.0.1: Address already in use\n"
 
 
 @pytest.mark.skipif(executable() is None, reason="no Chromium is installed (Debian: chromium)")
