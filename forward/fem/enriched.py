@@ -12,100 +12,63 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from forward.fem.cost import Way, estimate
+from forward.fem.cost import Way
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
-from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.enriched_equations import EnrichedEquations, Moved, Solved
 from forward.fem.equations import Discretisation
-from forward.fem.linearisation import Preconditioner
-from forward.fem.reference import ReferenceFactor
-from forward.model import FloatArray, ReferenceSolution, Work
+from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
-from forward.solvers.anderson import block_galerkin
-from forward.solvers.smoothing import minimised, smoothed
 
 if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
 
 
-ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
-SETTLED = 0.01  # part of the energy of e that the conjugate gradients may miss
-LEFT = 0.05  # of the forces, where pressures leave no energy to go by; a second step takes most of what is left
-STEPS = 100  # of conjugate gradients or residuals, at most
-ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
-LITTLE = 0.01  # the same before the steps, after which these forces are met again
-ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
-CLOSE = 5e-3  # relative tolerance of the same solves
-CLOSE_MIXED = 0.05  # the same of the first with pressures, which another always follows
-CLOSER = 0.1  # that of further steps, which change a tenth, and the part of their energy that these may miss
-ONCE = 1.0  # the same with pressures and the factor of a reference: one correction
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
-BENT = 0.05  # nonlinearity above which more steps are made
-BENT_MIXED = 0.0  # the same with pressures, whose part of the work has the other sign: always
-NEAR = 0.1  # nonlinearity below which these need no other stiffness
-MORE = 6  # of these, at most: bodies that lock so that they bend half as far as richer ones take four
-AFFORDED = 40_000  # unknowns up to which they have a factor of their own, where the first one does without
-BARELY = 0.3  # nonlinearity up to which a larger body does without them
+NEAR = 0.1  # nonlinearity below which the stiffness at the solution will do for further steps
+BARELY = 0.3  # the same with pressures and without a factor; up to it, a large body without one needs no further steps
+MORE = 6  # steps at most: bodies that lock so that they bend half as far as richer ones take four
+AFFORDED = 40_000  # unknowns up to which steps have a factor of their own, where the first one does without
 
 
-class Solved(Protocol):
-    """A solution of the body."""
+@dataclass(frozen=True)
+class Rule:
+    """How closely the enriched equations are solved, and when they are solved on.
 
-    @property
-    def parameters(self) -> FloatArray:
-        """Parameters (d,)."""
+    Tolerances are relative to the solution, and mean nothing to a factor of their own. Of steps without a factor they
+    are the part of the energy of e that may be missing or, with pressures, which leave no energy to go by, of the
+    forces.
 
-    @property
-    def state(self) -> FloatArray:
-        """This rank's part (U_local,) of the state."""
+    Attributes
+    ----------
+    first, further, other
+        Tolerance of the first solve, of those of further steps with the same stiffness, which change a tenth, and of
+        all others: adjoints, and steps with the stiffness at another state.
+    bent
+        Nonlinearity above which further steps are made.
+    near
+        That below which these need no other stiffness.
+    """
 
-    @property
-    def stiffer(self) -> float:
-        """Factor on the stiffness of tools."""
-
-    @property
-    def reference(self) -> ReferenceSolution | None:
-        """The nearby solution whose factor was used to find it."""
-
-    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
-        """Solve with the stiffness of the body at this state, or its transpose, for rows (k, U_local)."""
+    first: float
+    further: float
+    other: float
+    bent: float
+    near: float
 
 
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """A solution of the body, moved to a state (U⁺_local,) of the enriched space."""
-
-    origin: Solved
-    enriched: FloatArray
-
-    @property
-    def parameters(self) -> FloatArray:
-        """Parameters (d,)."""
-        return self.origin.parameters
-
-    @property
-    def state(self) -> FloatArray:
-        """State (U_local,) of the solution itself."""
-        return self.origin.state
-
-    @property
-    def stiffer(self) -> float:
-        """As of the solution."""
-        return self.origin.stiffer
-
-    @property
-    def reference(self) -> ReferenceSolution | None:
-        """As of the solution."""
-        return self.origin.reference
-
-    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
-        """Solve with the stiffness of the body at the solution itself, for rows (k, U_local)."""
-        return self.origin.solve(right, transpose=transpose, tolerance=tolerance)
+# With pressures, whose part of the work has the other sign, a second step follows always. With the factor of a
+# reference one correction is enough for that, and steps without a factor have left part of the forces to it.
+RULES = {  # by whether it is done by steps without a factor, and whether there are pressures
+    (False, False): Rule(first=5e-3, further=0.1, other=5e-3, bent=0.05, near=NEAR),
+    (False, True): Rule(first=0.05, further=1.0, other=5e-3, bent=0.0, near=NEAR),
+    (True, False): Rule(first=0.01, further=0.1, other=0.01, bent=0.05, near=NEAR),
+    (True, True): Rule(first=0.05, further=0.1, other=0.05, bent=0.0, near=BARELY),
+}
 
 
 class EnrichedState(NamedTuple):
@@ -173,79 +136,29 @@ def nonlinearity(energy: float, stored: float, after: float) -> float:
     return abs(after) / (2 * energy) if energy > 0 else np.inf
 
 
-class Enriched:
-    """The equations of a body in an enriched space, and its transfer to and from the space of the body.
+class Enriched(EnrichedEquations):
+    """What the equations of a body in an enriched space say of the error of its solutions.
 
     Parameters
     ----------
-    equations
-        Those of the body.
-    spec
-        Specification of the body in elements of a higher degree.
+    equations, spec
+        As of `EnrichedEquations`.
     functionals
         The outputs of the body.
-
-    Attributes
-    ----------
-    equations
-        The equations of the body in the enriched space.
-    way
-        How they are solved; depends only on sizes, form and degree.
     """
 
     def __init__(self, equations: Discretisation, spec: Hyperelastic, functionals: Sequence[Functional]) -> None:
-        self._coarse = equations
-        self.equations = Discretisation(spec, equations.comm, equations.parameters, equations)
-        pairs = [(equations.unknowns.displacement, self.equations.unknowns.displacement)]
-        if equations.unknowns.pressure is not None:
-            pairs.append((equations.unknowns.pressure, self.equations.unknowns.pressure))
-        self._up = [Transfer(coarse, fine) for coarse, fine in pairs]
-        self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
+        super().__init__(equations, spec)
         self._of_forces = [output.of_held for output in spec.outputs]
         self._functionals = [
             output.enriched(functional, self.equations, self.up) if output.estimable else None
             for output, functional in zip(spec.outputs, functionals, strict=True)
         ]
         self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
-        cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        self.way, self._alone = cost.way, cost.alone
-        self._blocks: tuple[ReferenceSolution | Solved, Preconditioner | None] | None = None
 
-    def up(self, u: FloatArray) -> FloatArray:
-        """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
-        parts = np.split(u, [3 * self._coarse.nodes_owned])
-        return np.concatenate([up(part) for up, part in zip(self._up, parts, strict=False)])
-
-    def down(self, u: FloatArray) -> FloatArray:
-        """Interpolate a vector (U⁺_local,) of the enriched space at the nodes of the body (U_local,)."""
-        parts = np.split(u, [3 * self.equations.nodes_owned])
-        return np.concatenate([down(part) for down, part in zip(self._down, parts, strict=False)])
-
-    def restrict(self, forces: FloatArray) -> FloatArray:
-        """Restrict forces (U⁺_local,) of the enriched space to those (U_local,) of the body: the transpose of `up`."""
-        parts = np.split(forces, [3 * self.equations.nodes_owned])
-        return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
-
-    def _state_of(self, solution: Solved) -> FloatArray:
-        return solution.enriched if isinstance(solution, Moved) else self.up(solution.state)
-
-    def visit(self, solution: Solved) -> Discretisation:
-        """Set parameters, loads and state to those of a solution of the body."""
-        equations = self.equations
-        if equations.latest.solution is not solution:
-            equations.set_parameters(solution.parameters, solution.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(self._state_of(solution))
-            equations.latest.solution = solution
-        return equations
-
-    def imbalance(self, solution: Solved) -> FloatArray:
-        """F⁺(u_h) (U⁺_local,) of a solution, zero on prescribed unknowns."""
-        equations = self.visit(solution)
-        forces = equations.imbalance()
-        equations.work.residuals += 1
-        forces[equations.fixed] = 0
-        return forces
+    @property
+    def _rule(self) -> Rule:
+        return RULES[self.way == Way.SMOOTHING, self.equations.spec.mixed]
 
     def state(self, solution: Solved, bent: float | None = None) -> EnrichedState:
         """Find u_h + e; collective.
@@ -266,7 +179,7 @@ class Enriched:
         equations = self.equations
         equations.work = Work()
         forces = -self.imbalance(solution)
-        (change,) = self._solve(solution, forces[None], close=CLOSE_MIXED if equations.spec.mixed else CLOSE)
+        (change,) = self.solve(solution, forces[None], self._rule.first)
         start = self.up(solution.state)
         # In the mixed form the energy has a saddle point, and the pressures count with the opposite sign.
         energy = 0.5 * equations.curvature(change, forces)
@@ -276,7 +189,7 @@ class Enriched:
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         found = EnrichedState(start + change, change, energy, stored, far, Work(), start, change, start)
         if bent is None:
-            bent = BENT_MIXED if equations.spec.mixed else BENT
+            bent = self._rule.bent
         return self._nearer(solution, found, left, bent, once=True)
 
     def nearer(self, solution: Solved, found: EnrichedState, bent: float) -> EnrichedState:
@@ -297,18 +210,18 @@ class Enriched:
 
         Outputs of second order need u_h + e to be in equilibrium.
         """
-        equations, start, far = self.equations, self.up(solution.state), found.nonlinearity
+        equations, rule = self.equations, self._rule
+        start, far = self.up(solution.state), found.nonlinearity
         for _ in range(MORE):
             if not bent < far < np.inf:
                 break
-            # The stiffness at u_h will do; also where steps have left a part of the forces, and no factor is at hand.
-            near = far < (BARELY if self.way == Way.SMOOTHING and equations.spec.mixed else NEAR)
-            if not near and self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
+            near = far < rule.near
+            if not near and self.way == Way.SMOOTHING and equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
             moved = Moved(solution, found.state)
-            close = ONCE if equations.spec.mixed and self.way == Way.REFERENCE else CLOSER
-            (step,) = self._solve(solution, -left[None], close=close) if near else self._solve(moved, -left[None])
+            at, close = (solution, rule.further) if near else (moved, rule.other)
+            (step,) = self.solve(at, -left[None], close)
             change = found.change + step
             before, linearised = found.state, start if near else found.state
             found = found._replace(state=start + change, change=change, before=before, step=step, linearised=linearised)
@@ -319,120 +232,6 @@ class Enriched:
             if near and once:
                 break
         return found._replace(nonlinearity=far, work=equations.work)
-
-    def _solve(
-        self, solution: Solved, right: FloatArray, *, transpose: bool = False, close: float = CLOSE
-    ) -> FloatArray:
-        """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
-
-        To rounding with its own factor, or roughly in one of the other ways: with that of a reference, to a relative
-        tolerance.
-        """
-        found = None
-        if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
-            found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
-        elif self.way == Way.REFERENCE and solution.reference is not None:
-            found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
-        if found is None:
-            self._factorise(solution)
-            found = self.equations.back_substitute(right, transpose=transpose)
-        return found
-
-    def _solve_by_smoothing(
-        self, solution: Solved, right: FloatArray, close: float, *, transpose: bool
-    ) -> FloatArray | None:
-        """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
-
-        The former may miss such a part of the energy. The solve afterwards corrects what affects outputs most: it makes
-        the residual orthogonal to V_h.
-        """
-        inverse = self._preconditioner(solution)
-        if inverse is None:
-            return None
-        equations, fixed = self.visit(solution), self.equations.fixed
-
-        def multiply(x: FloatArray) -> FloatArray:
-            y = equations.stiffness_times(x, transpose=transpose)
-            y[fixed] = 0
-            return y
-
-        found = self._on_the_body(solution, right, LITTLE, transpose=transpose)
-        for i, b in enumerate(right):
-            residual = b - multiply(found[i]) if found[i].any() else b
-            if inverse.weights is None:
-                missing = max(close, SETTLED)
-                change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, missing, STEPS)
-            else:
-                left_over = max(close, LEFT)
-                change, _, settled = minimised(
-                    multiply, inverse.apply, residual, inverse.weights, equations.total, left_over, STEPS
-                )
-            if not settled:
-                return None
-            found[i] += change
-        left = right - np.array([multiply(x) for x in found])
-        return found + self._on_the_body(solution, left, ORTHOGONAL, transpose=transpose)
-
-    def _on_the_body(self, solution: Solved, right: FloatArray, negligible: float, *, transpose: bool) -> FloatArray:
-        """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
-        forces = np.array([self.restrict(row) for row in right])
-        forces[:, self._coarse.fixed] = 0
-        sizes, wholes = self._coarse.norms(forces), self.equations.norms(right)
-        worth = sizes > negligible * wholes
-        found = np.zeros_like(right)
-        if worth.any():
-            solved = solution.solve(forces[worth], transpose=transpose, tolerance=ROUGH)
-            found[worth] = [self.up(row) for row in solved]
-            found[:, self.equations.fixed] = 0
-        self.visit(solution)
-        return found
-
-    def _preconditioner(self, solution: Solved) -> Preconditioner | None:
-        """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
-        origin = solution.origin if isinstance(solution, Moved) else solution
-        at: ReferenceSolution | Solved = origin.reference or origin
-        if self._blocks is None or not _same(self._blocks[0], at):
-            equations = self.equations
-            kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
-            equations.set_parameters(at.parameters)
-            equations.at_load(1.0)
-            equations.set_state(self.up(at.state))
-            self._blocks = (at, equations.preconditioner())
-            equations.work = kept
-        return self._blocks[1]
-
-    @cached_property
-    def _reference(self) -> ReferenceFactor:
-        return ReferenceFactor(self.equations)
-
-    def _solve_near(
-        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, close: float, *, transpose: bool
-    ) -> FloatArray | None:
-        """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
-        equations = self.equations
-        if self._alone:
-            equations.release()
-        known = ReferenceSolution(reference.parameters, self.up(reference.state))
-        self._reference.prepare(known)
-        R = self._reference.rotation(self._state_of(solution))
-        self.visit(solution)
-        return block_galerkin(
-            lambda x: equations.free_stiffness_times(x, transpose=transpose),
-            self._reference.inverse(R, transpose=transpose),
-            right,
-            equations.total,
-            equations.norms,
-            close,
-            ITERATIONS,
-        )
-
-    def _factorise(self, solution: Solved) -> None:
-        equations = self.visit(solution)
-        if equations.latest.factorised is not solution:
-            if self._alone:
-                self._reference.release()
-            equations.factorise(self._state_of(solution))
-            equations.latest.factorised = equations.latest.solution = solution
 
     def values(self, solution: Solved, found: EnrichedState) -> FloatArray:
         """Return the outputs (m,) at a state found from a solution; NaN where not estimated.
@@ -465,7 +264,7 @@ class Enriched:
         gradients = np.array([f.gradient() for f in self._functionals if f is not None])
         loads = weights[:, known] @ gradients
         loads[:, self.equations.fixed] = 0
-        return self._solve(solution, loads, transpose=True)
+        return self.solve(solution, loads, self._rule.other, transpose=True)
 
     def indicators(self, solution: Solved, weights: FloatArray) -> FloatArray:
         """Return contributions (k, n_cells) of this rank's cells to the error of outputs weighted by (k, m); ≥ 0.
@@ -482,12 +281,6 @@ class Enriched:
             sizes = np.abs(equations.imbalance_by_vertices(z - self.up(self.down(z))))
             found.append(shared_by_cells(sizes, equations))
         return np.array(found)
-
-
-def _same(one: ReferenceSolution | Solved, other: ReferenceSolution | Solved) -> bool:
-    if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
-        return one.same(other)
-    return one is other
 
 
 def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:

@@ -1,0 +1,276 @@
+"""The equations of a body in elements of one degree higher on the same mesh, and three ways to solve them.
+
+Where a factor of their own is too dear, the factor at a reference serves many solutions, or a few steps of a Krylov
+method without a factor leave to the stiffness of the body what a coarser space can solve for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from forward.fem.cost import Way, estimate
+from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.equations import Discretisation
+from forward.fem.linearisation import Preconditioner
+from forward.fem.reference import ReferenceFactor
+from forward.model import FloatArray, ReferenceSolution, Work
+from forward.solvers.anderson import block_galerkin
+from forward.solvers.smoothing import minimised, smoothed
+
+if TYPE_CHECKING:
+    from forward.hyperelastic import Hyperelastic
+
+
+ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
+STEPS = 100  # of conjugate gradients or residuals, at most
+ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
+LITTLE = 0.01  # the same before the steps, after which these forces are met again
+ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
+
+
+class Solved(Protocol):
+    """A solution of the body."""
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters (d,)."""
+
+    @property
+    def state(self) -> FloatArray:
+        """This rank's part (U_local,) of the state."""
+
+    @property
+    def stiffer(self) -> float:
+        """Factor on the stiffness of tools."""
+
+    @property
+    def reference(self) -> ReferenceSolution | None:
+        """The nearby solution whose factor was used to find it."""
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
+        """Solve with the stiffness of the body at this state, or its transpose, for rows (k, U_local)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """A solution of the body, moved to a state (U⁺_local,) of the enriched space."""
+
+    origin: Solved
+    enriched: FloatArray
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters (d,)."""
+        return self.origin.parameters
+
+    @property
+    def state(self) -> FloatArray:
+        """State (U_local,) of the solution itself."""
+        return self.origin.state
+
+    @property
+    def stiffer(self) -> float:
+        """As of the solution."""
+        return self.origin.stiffer
+
+    @property
+    def reference(self) -> ReferenceSolution | None:
+        """As of the solution."""
+        return self.origin.reference
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
+        """Solve with the stiffness of the body at the solution itself, for rows (k, U_local)."""
+        return self.origin.solve(right, transpose=transpose, tolerance=tolerance)
+
+
+class EnrichedEquations:
+    """The equations of a body in an enriched space, and its transfer to and from the space of the body.
+
+    Parameters
+    ----------
+    equations
+        Those of the body.
+    spec
+        Specification of the body in elements of a higher degree.
+
+    Attributes
+    ----------
+    equations
+        The equations of the body in the enriched space.
+    way
+        How they are solved; depends only on sizes, form and degree.
+    """
+
+    def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
+        self._coarse = equations
+        self.equations = Discretisation(spec, equations.comm, equations.parameters, equations)
+        pairs = [(equations.unknowns.displacement, self.equations.unknowns.displacement)]
+        if equations.unknowns.pressure is not None:
+            pairs.append((equations.unknowns.pressure, self.equations.unknowns.pressure))
+        self._up = [Transfer(coarse, fine) for coarse, fine in pairs]
+        self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
+        cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        self.way, self._alone = cost.way, cost.alone
+        self._blocks: tuple[ReferenceSolution | Solved, Preconditioner | None] | None = None
+
+    def up(self, u: FloatArray) -> FloatArray:
+        """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
+        parts = np.split(u, [3 * self._coarse.nodes_owned])
+        return np.concatenate([up(part) for up, part in zip(self._up, parts, strict=False)])
+
+    def down(self, u: FloatArray) -> FloatArray:
+        """Interpolate a vector (U⁺_local,) of the enriched space at the nodes of the body (U_local,)."""
+        parts = np.split(u, [3 * self.equations.nodes_owned])
+        return np.concatenate([down(part) for down, part in zip(self._down, parts, strict=False)])
+
+    def restrict(self, forces: FloatArray) -> FloatArray:
+        """Restrict forces (U⁺_local,) of the enriched space to those (U_local,) of the body: the transpose of `up`."""
+        parts = np.split(forces, [3 * self.equations.nodes_owned])
+        return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
+
+    def _state_of(self, solution: Solved) -> FloatArray:
+        return solution.enriched if isinstance(solution, Moved) else self.up(solution.state)
+
+    def visit(self, solution: Solved) -> Discretisation:
+        """Set parameters, loads and state to those of a solution of the body."""
+        equations = self.equations
+        if equations.latest.solution is not solution:
+            equations.set_parameters(solution.parameters, solution.stiffer)
+            equations.at_load(1.0)
+            equations.set_state(self._state_of(solution))
+            equations.latest.solution = solution
+        return equations
+
+    def imbalance(self, solution: Solved) -> FloatArray:
+        """F⁺(u_h) (U⁺_local,) of a solution, zero on prescribed unknowns."""
+        equations = self.visit(solution)
+        forces = equations.imbalance()
+        equations.work.residuals += 1
+        forces[equations.fixed] = 0
+        return forces
+
+    def solve(self, solution: Solved, right: FloatArray, close: float, *, transpose: bool = False) -> FloatArray:
+        """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns; collective.
+
+        To rounding with its own factor, else to the tolerance `close`: relative to the solution with the factor of a
+        reference; of steps without a factor, the part that may be missing of the energy or, with pressures, of the
+        forces.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+        found = None
+        if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
+            found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
+        elif self.way == Way.REFERENCE and solution.reference is not None:
+            found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
+        if found is None:
+            self._factorise(solution)
+            found = self.equations.back_substitute(right, transpose=transpose)
+        return found
+
+    def _solve_by_smoothing(
+        self, solution: Solved, right: FloatArray, close: float, *, transpose: bool
+    ) -> FloatArray | None:
+        """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
+
+        The former may miss such a part of the energy. The solve afterwards corrects what affects outputs most: it makes
+        the residual orthogonal to V_h.
+        """
+        inverse = self._preconditioner(solution)
+        if inverse is None:
+            return None
+        equations, fixed = self.visit(solution), self.equations.fixed
+
+        def multiply(x: FloatArray) -> FloatArray:
+            y = equations.stiffness_times(x, transpose=transpose)
+            y[fixed] = 0
+            return y
+
+        found = self._on_the_body(solution, right, LITTLE, transpose=transpose)
+        for i, b in enumerate(right):
+            residual = b - multiply(found[i]) if found[i].any() else b
+            if inverse.weights is None:
+                change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, close, STEPS)
+            else:
+                change, _, settled = minimised(
+                    multiply, inverse.apply, residual, inverse.weights, equations.total, close, STEPS
+                )
+            if not settled:
+                return None
+            found[i] += change
+        left = right - np.array([multiply(x) for x in found])
+        return found + self._on_the_body(solution, left, ORTHOGONAL, transpose=transpose)
+
+    def _on_the_body(self, solution: Solved, right: FloatArray, negligible: float, *, transpose: bool) -> FloatArray:
+        """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
+        forces = np.array([self.restrict(row) for row in right])
+        forces[:, self._coarse.fixed] = 0
+        sizes, wholes = self._coarse.norms(forces), self.equations.norms(right)
+        worth = sizes > negligible * wholes
+        found = np.zeros_like(right)
+        if worth.any():
+            solved = solution.solve(forces[worth], transpose=transpose, tolerance=ROUGH)
+            found[worth] = [self.up(row) for row in solved]
+            found[:, self.equations.fixed] = 0
+        self.visit(solution)
+        return found
+
+    def _preconditioner(self, solution: Solved) -> Preconditioner | None:
+        """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
+        origin = solution.origin if isinstance(solution, Moved) else solution
+        at: ReferenceSolution | Solved = origin.reference or origin
+        if self._blocks is None or not _same(self._blocks[0], at):
+            equations = self.equations
+            kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
+            equations.set_parameters(at.parameters)
+            equations.at_load(1.0)
+            equations.set_state(self.up(at.state))
+            self._blocks = (at, equations.preconditioner())
+            equations.work = kept
+        return self._blocks[1]
+
+    @cached_property
+    def _reference(self) -> ReferenceFactor:
+        return ReferenceFactor(self.equations)
+
+    def _solve_near(
+        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, close: float, *, transpose: bool
+    ) -> FloatArray | None:
+        """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
+        equations = self.equations
+        if self._alone:
+            equations.release()
+        known = ReferenceSolution(reference.parameters, self.up(reference.state))
+        self._reference.prepare(known)
+        R = self._reference.rotation(self._state_of(solution))
+        self.visit(solution)
+        return block_galerkin(
+            lambda x: equations.free_stiffness_times(x, transpose=transpose),
+            self._reference.inverse(R, transpose=transpose),
+            right,
+            equations.total,
+            equations.norms,
+            close,
+            ITERATIONS,
+        )
+
+    def _factorise(self, solution: Solved) -> None:
+        equations = self.visit(solution)
+        if equations.latest.factorised is not solution:
+            if self._alone:
+                self._reference.release()
+            equations.factorise(self._state_of(solution))
+            equations.latest.factorised = equations.latest.solution = solution
+
+
+def _same(one: ReferenceSolution | Solved, other: ReferenceSolution | Solved) -> bool:
+    if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
+        return one.same(other)
+    return one is other
