@@ -6,6 +6,7 @@ It is rotated with the body (`forward.solvers.rotations`).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from forward.solvers.anderson import Inverse
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 from forward.solvers.rotations import Turned, rotations, turn
-from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
+from forward.solvers.stability import BLOCK, SMOOTH, Rows, Screened, screen, screening_vectors
 from forward.solvers.steps import Corrector, Steps, finished, through
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
@@ -93,7 +94,7 @@ class ReferenceFactor:
             forces = equations.layout.scatter(random.standard_normal((BLOCK, equations.layout.size)))
             self._vectors = screening_vectors(
                 self._changes(reference, random),
-                self._definite().solve,
+                partial(self._definite().solve, tolerance=SMOOTH),
                 forces,
                 equations.free_displacements,
                 equations.total,

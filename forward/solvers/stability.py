@@ -39,6 +39,7 @@ NATURAL = 3  # lowest natural modes among the vectors
 EXTREMES = 2  # vectors at each end of the spectrum of a change of stiffness
 WEAK = 0.1  # |μ| for one standard deviation, below which a parameter does not lead towards instability
 BLOCK, STEPS = 6, 4  # of the Krylov spaces in which these vectors are looked for
+SMOOTH = 1e-6  # tolerance of the solves in which they are: far below what ROUNDING tells apart
 ROUNDING = 1e-10  # squared fraction of a vector that remains if it depends on others
 SAME = 1e-3  # the same for vectors that are not essential
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from forward import native
 from forward.fem.cost import SPARE
@@ -168,12 +169,18 @@ class SingleSolver:
         return found
 
     def _products(self, rows: FloatArray, *, transpose: bool = False) -> FloatArray:
-        multiply = self._stiffness.matrix.multTranspose if transpose else self._stiffness.matrix.mult
-        found = np.empty_like(rows)
-        for row, product in zip(rows, found, strict=True):
-            self._x.array[:] = row
-            multiply(self._x, self._b)
-            product[:] = self._b.array_r
+        """K, or Kᵀ, times rows (k, n): several at a time, since reading the matrix is what takes long."""
+        matrix = self._stiffness.matrix
+        if len(rows) == 1:
+            self._x.array[:] = rows[0]
+            (matrix.multTranspose if transpose else matrix.mult)(self._x, self._b)
+            return np.array(self._b.array_r)[None]
+        columns = PETSc.Mat().createDense(size=rows.T.shape, array=rows.reshape(-1), comm=matrix.comm)
+        columns.assemble()
+        products = (matrix.transposeMatMult if transpose else matrix.matMult)(columns)
+        found = np.array(products.getDenseArray().T)
+        columns.destroy()
+        products.destroy()
         return found
 
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
@@ -188,8 +195,11 @@ class SingleSolver:
         return self._stiffness.unknowns.take(found).reshape(right.shape)
 
     def _refined(self, x: FloatArray, rights: FloatArray, tolerance: float, *, transpose: bool) -> FloatArray:
-        """Refine rows until steps are below the tolerance, or no longer fall: that is rounding in double precision."""
-        before = np.inf
+        """Refine rows until what is left is below the tolerance, or steps no longer fall: that is rounding in double.
+
+        A step is as much shorter than the one before as what is left is shorter than it.
+        """
+        before = 1.0
         for _ in range(REFINEMENTS):
             residuals = rights - self._products(x, transpose=transpose)
             step = self._scaled(residuals, transpose=transpose)
@@ -197,8 +207,9 @@ class SingleSolver:
             share = float((np.linalg.norm(step, axis=1) / np.where(lengths > 0, lengths, 1.0)).max())
             if not share < before / 2:
                 break
-            x, before = x + step, share
-            if share <= tolerance * 1e-2:
+            left, before = share * (share / before), share
+            x = x + step
+            if left <= tolerance * 1e-2:
                 break
         return x
 
