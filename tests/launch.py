@@ -8,10 +8,24 @@ from pathlib import Path
 
 import xarray as xr
 
+from forward.native import library
+
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
 NOT_KEPT = "PYTHONDONTWRITEBYTECODE"
 HANGS = 900  # s, after which a program hangs: busy machines that compile all forms are slow
+# Ranks that wait for others ask MPI again and again, and yield in between: with more ranks than cores, that takes more
+# of the cores than what they wait for. Asleep for a moment instead of yielding, they take next to nothing.
+_SLEEP = """
+#include <time.h>
+int sched_yield(void)
+{
+    struct timespec moment = {0, 20000};
+    nanosleep(&moment, 0);
+    return 0;
+}
+"""
+_SLEEPING = library(_SLEEP, flags=("-O2",), against=())
 
 
 def environment():
@@ -26,6 +40,8 @@ def environment():
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
     shared |= {"OMPI_MCA_hwloc_base_binding_policy": "none"}  # other tests run beside, on the same cores if bound
+    if _SLEEPING is not None:
+        shared["LD_PRELOAD"] = " ".join(filter(None, (_SLEEPING._name, clean.get("LD_PRELOAD"))))
     return clean | root | shared | {"OMP_NUM_THREADS": "1"}
 
 
