@@ -105,7 +105,8 @@ class Loop:
         self._selector.register(self._helper, selectors.EVENT_READ, self._local)
         if view is not None:
             self._selector.register(view, selectors.EVENT_READ, self._slid)
-        self._buffers: dict[socket.socket, bytearray] = {}
+        self._buffers: dict[socket.socket, bytes] = {}
+        self._refused_lines: set[socket.socket] = set()  # clients whose line was too long; its rest is left out
         self._unsent: dict[socket.socket, bytes] = {}
         self.ended = False
 
@@ -155,7 +156,7 @@ class Loop:
         client, _ = listening.accept()
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setblocking(False)
-        self._buffers[client] = bytearray()
+        self._buffers[client] = b""
         self._selector.register(client, selectors.EVENT_READ, self._read)
         self._send(client, [self.greeting()])
 
@@ -167,23 +168,29 @@ class Loop:
             arrived = client.recv(LONGEST)
         except OSError:
             arrived = b""
-        buffer = self._buffers[client]
-        buffer += arrived
-        *lines, rest = bytes(buffer).split(b"\n")
-        self._buffers[client] = bytearray(rest)
         if not arrived:
             self._leave(client)
             return
-        self._send(client, [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)])
+        if client in self._refused_lines:
+            _, newline, arrived = arrived.partition(b"\n")
+            if not newline:
+                return
+            self._refused_lines.discard(client)
+        *lines, rest = (self._buffers[client] + arrived).split(b"\n")
+        answers = [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)]
         if len(rest) > LONGEST:
-            self._send(client, [{"error": f"a line of more than {LONGEST} bytes, expected a table of numbers"}])
-            self._leave(client)
+            answers.append({"error": f"a line of more than {LONGEST} bytes, expected a table of numbers"})
+            self._refused_lines.add(client)
+            rest = b""
+        self._buffers[client] = rest
+        self._send(client, answers)
 
     def _leave(self, client: socket.socket) -> None:
         if client in self._buffers:
             self._selector.unregister(client)
             del self._buffers[client]
             self._unsent.pop(client, None)
+            self._refused_lines.discard(client)
             client.close()
 
     def _send(self, client: socket.socket, tables: list[dict[str, Any]]) -> None:

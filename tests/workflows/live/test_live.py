@@ -94,8 +94,9 @@ def _rude(port, client, lines):
                 other.send(b"{}\n" * 20)
         client.sendall(b"{}\n")
         assert "outputs" in json.loads(lines.readline())
-    client.sendall(b"x" * 200_000)
+    client.sendall(b"x" * 200_000 + b"\n{}\n")
     assert "more than 65536 bytes" in json.loads(lines.readline())["error"]
+    assert "outputs" in json.loads(lines.readline())
 
 
 def _taken(file, port, page):
