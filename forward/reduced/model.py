@@ -185,14 +185,18 @@ class ReducedModel(OneByOne):
         Raises
         ------
         SolveError
-            Where Newton's method finds none, or the reduced stiffness is not positive definite.
+            Where Newton's method finds none, or the reduced stiffness is not positive definite; with a tolerance, where
+            the full model has none.
         """
-        found = self.reduced(np.array(parameters, dtype=float))
-        if self._tolerance is None:
-            return found
-        spread = np.array(self.data.about["spread"])[self.which]
-        if (np.abs(found.estimate.outputs) <= self._tolerance * spread).all():
-            return found
+        try:
+            found = self.reduced(np.array(parameters, dtype=float))
+        except SolveError:
+            if self._tolerance is None:
+                raise
+        else:
+            spread = np.array(self.data.about["spread"])[self.which]
+            if self._tolerance is None or (np.abs(found.estimate.outputs) <= self._tolerance * spread).all():
+                return found
         self.asked.append(self.whole(np.array(parameters, dtype=float)))
         return self.full.solve(np.array(parameters, dtype=float), None)
 
@@ -345,7 +349,7 @@ class ReducedSolution(WithoutMesh):
     def estimate(self) -> Estimate:
         """Estimate the errors of outputs and state by one step of Newton's method in the nested larger model.
 
-        Under tools by its equilibrium.
+        Under tools by its equilibrium. NaN where the larger model is not stable.
 
         Of an output that is the dual-weighted residual −zᵀR with the adjoint z in the larger model, Kᵀz = ∂ψ/∂u, which
         holds a basis of adjoints; the output is evaluated whole, so that curved ones are corrected too (R. Becker,
@@ -360,7 +364,7 @@ class ReducedSolution(WithoutMesh):
 
     @cached_property
     def _larger(self) -> tuple[FloatArray, FloatArray] | None:
-        """Coordinates in the larger model after a step of Newton's method, and the step; None where there is none.
+        """Coordinates in the larger model after a step of Newton's method, and the step; None where it is not stable.
 
         Under tools, where a step says little of what will touch, those of its equilibrium.
         """
@@ -374,8 +378,11 @@ class ReducedSolution(WithoutMesh):
             found = model.way(larger, self._whole, c, Work())
             return None if found is None else (found[0], (found[0] - c)[larger.free])
         R, K, _ = larger.stiffness(c, self._whole)
+        K_free = K[larger.free, larger.free]
+        if model.tested and not larger.pressures and not stable((K_free + K_free.T) / 2, 0):
+            return None  # the body may be unstable here in a way that the few modes do not have
         try:
-            change = -np.linalg.solve(K[larger.free, larger.free], R[larger.free])
+            change = -np.linalg.solve(K_free, R[larger.free])
         except np.linalg.LinAlgError:
             return None
         c[larger.free] += change

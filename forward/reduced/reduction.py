@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +14,16 @@ from forward.reduced import basis, blocks
 from forward.reduced.at_rest import AtRest
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
+from forward.reduced.level import Level
 from forward.reduced.limits import mistakes
+from forward.reduced.newton import stable
 from forward.reduced.outputs import Outputs
-from forward.reduced.rules import Rules, Training
+from forward.reduced.rules import STATES, Rules, Training
 from forward.reduced.snapshots import Snapshots
 
 OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
+LOOKED_AT = 4  # snapshots at which the larger model must be stable
+ROUNDING = 1e-10  # spread of an output, over the largest value of its unit, below which it is round-off
 OF_TANGENTS = 0.5  # weight of changes of the state by one standard deviation, beside the states
 KINDS = 3  # of modes in the mixed form: displacements, pressures, and their supports
 
@@ -138,11 +142,24 @@ class Reduction:
         modes = np.vstack([modes, self._of_adjoints(adjoints, modes, max(n, sizes.more // OF_ADJOINTS))])
         outputs = snapshots.outputs
         told = {
-            "spread": np.maximum(outputs.std(axis=0), 1e-300).tolist(),
+            "spread": self._spread(snapshots).tolist(),
             "lowest": outputs.min(axis=0).tolist(),
             "highest": outputs.max(axis=0).tolist(),
         }
         return self._of_modes(modes, n, rest, snapshots.parameters, sizes, told, left, kept)
+
+    def _spread(self, snapshots: Snapshots) -> FloatArray:
+        """Return the standard deviations (m,) of the outputs; of one that is round-off, the size of those of its unit.
+
+        Such an output vanishes by symmetry, or depends on nothing: its errors are measured against the others.
+        """
+        units = [output.unit for output in self.model.spec.returned]
+        sizes = np.abs(snapshots.outputs).max(axis=0)
+        of_unit = {unit: max(size for size, one in zip(sizes, units, strict=True) if one == unit) for unit in units}
+        if "m" in of_unit:
+            of_unit["m"] = max(of_unit["m"], float(np.abs(snapshots.states[:, : self.model.space.displacements]).max()))
+        size, found = np.array([of_unit[unit] for unit in units]), snapshots.outputs.std(axis=0)
+        return np.maximum(np.where(found > ROUNDING * size, found, size), 1e-300)
 
     def enriched(self, data: ReducedData, answers: Snapshots, sizes: Sizes) -> ReducedData:
         """Return a reduced model of this body that holds further solutions too, with a mode more for each of them.
@@ -247,12 +264,11 @@ class Reduction:
         coordinates = np.hstack([moved, np.zeros((len(rest), len(tests))), rest @ self._rest.inner(modes).T])
         outputs = self._outputs.made(rows, rest + moved @ lifts, parameters, kept)
         training = Training(rows, coordinates, parameters, len(lifts) + len(tests), len(tests))
-        levels, told = self._rules.levels(training, (n, len(modes)), sizes.cubature, kept)
         whole = layout.gather(rows)
         assert whole is not None
         cells, kind = layout.cells()
         fields = self.equations.fields
-        return ReducedData(
+        data = ReducedData(
             spec=model.spec.model_dump(mode="json", exclude_none=True),
             parameters=model.parameters,
             nominal=self.nominal,
@@ -265,7 +281,7 @@ class Reduction:
             tests=len(tests),
             dead=tuple((number, value, rows @ force) for number, value, force in self._dead_rows),
             works=self._written,
-            levels=levels,
+            levels=(),
             outputs=outputs,
             fields=whole,
             places=layout.coordinates,
@@ -282,9 +298,15 @@ class Reduction:
                 "truncation": truncation,
                 "unknowns": int(layout.size),
                 **of_outputs,
-                **told,
             },
         )
+        untested = self.equations.p is not None or model.spec.solver.accept_unstable
+        for shaken in (0, min(len(modes), STATES)):
+            levels, told = self._rules.levels(training, (n, len(modes)), sizes.cubature, shaken, kept)
+            data = replace(data, levels=levels, about=data.about | told)
+            if untested or _definite(data):
+                break
+        return data
 
     def _factor(self, number: int) -> tuple[FloatArray, FloatArray, float]:
         """Return the logarithm of a random field at the nodes, its slopes, and the variance that is kept."""
@@ -294,3 +316,16 @@ class Reduction:
         points[1 + np.arange(len(field.positions)), field.positions] = 1.0
         logs = np.log(model.space.factors(points)[field.field.label])
         return logs[0], (logs[1:] - logs[0]).T.copy(), float(field.kept)
+
+
+def _definite(data: ReducedData) -> bool:
+    """Whether the larger model is stable at the snapshots, as the body is.
+
+    Modes on which no force of any snapshot works, by symmetry, are not integrated by rules that are trained on forces.
+    """
+    level = Level(data, data.levels[-1], np.zeros(0, dtype=np.int64))
+    for i in np.linspace(0, len(data.snapshots) - 1, LOOKED_AT).round().astype(int):
+        K = level.stiffness(data.coordinates[i], data.snapshots[i])[1][level.free, level.free]
+        if not stable((K + K.T) / 2, level.pressures):
+            return False
+    return True

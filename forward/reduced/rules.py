@@ -19,9 +19,10 @@ from forward.reduced.kernels import Kernel, spread
 
 CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
 STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
+FINER = 3.0  # how many times less the points of the larger model miss
+SHAKEN = 0.3  # energy of what is added to a snapshot, over its own
 KEPT_WHOLE = 600  # points of a boundary that are all kept
 SEED = 7
-FINER = 3.0  # how many times less the points of the larger model miss
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,17 @@ class Training:
         count = len(self.parameters)
         few = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
         return replace(self, coordinates=self.coordinates[few], parameters=self.parameters[few])
+
+    def shaken(self, count: int) -> Training:
+        """Return these snapshots and so many more, moved at random in all modes: these tell the whole stiffness."""
+        which = np.arange(count) % len(self.parameters)
+        moved = self.coordinates[which]
+        random = np.random.default_rng(SEED).standard_normal((count, moved.shape[1] - self.before))
+        size = np.linalg.norm(moved[:, self.before :], axis=1) / np.linalg.norm(random, axis=1)
+        moved[:, self.before :] += np.sqrt(SHAKEN) * size[:, None] * random
+        rows = (self.coordinates, moved), (self.parameters, self.parameters[which])
+        coordinates, parameters = (np.concatenate(both) for both in rows)
+        return replace(self, coordinates=coordinates, parameters=parameters)
 
     def tested(self, modes: int) -> NDArray[np.int64]:
         """Return the coordinates on which works are tested: tests and the first modes."""
@@ -93,7 +105,12 @@ class Rules:
         self._whole = whole
 
     def levels(
-        self, training: Training, counts: tuple[int, int], missed: float, kept: NDArray[np.bool_] | None
+        self,
+        training: Training,
+        counts: tuple[int, int],
+        missed: float,
+        shaken: int,
+        kept: NDArray[np.bool_] | None,
     ) -> tuple[tuple[LevelData, ...], dict[str, Any]]:
         """Choose the points of a model with so many modes and of the larger one, and say how many they are.
 
@@ -105,6 +122,8 @@ class Rules:
             Numbers of modes.
         missed
             What they may miss of the forces, relative.
+        shaken
+            How many states beside the snapshots those of the larger model are trained on.
         kept
             Which cells are kept in full, with all their points; None for none.
         """
@@ -130,7 +149,8 @@ class Rules:
                 fixed = in_full[number][candidates[number]]
                 least = missed / (1 if level == 0 else FINER)
                 beside = of_densities if number == 0 else []
-                rule = self._rule(number, points, beside, training, sizes, least, fixed)
+                trained = training.shaken(shaken) if level and shaken else training
+                rule = self._rule(number, points, beside, trained, sizes, least, fixed)
                 works.append(points.some(rule.points, rule.weights, before + n))
                 if number == 0:
                     integrals = [one.some(rule.points, rule.weights, before + n) for one in of_densities]

@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 
 from forward.hyperelastic import Hyperelastic
 from forward.model import Finding, FloatArray, ModelError
+from forward.reduced.said import without_answer
 from forward.registry import named
 from forward.scalars import Scalar
 from forward.spec import ModelSpec
@@ -185,7 +186,7 @@ class Reduced(ModelSpec):
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Say where a study goes beyond the snapshots, and which outputs have large errors."""
-        return (*self.outside(ranges), *self._of_errors())
+        return (*self.outside(ranges), *without_answer(self._about.told), *self._of_errors())
 
     def outside(self, ranges: Ranges) -> Iterator[Finding]:
         """Find parameters that go beyond the snapshots."""

@@ -15,6 +15,7 @@ from forward.model import Finding, SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.said import without_answer
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Request
@@ -124,6 +125,7 @@ class _Making:
             self._sizes = replace(self._sizes, more=max(self._sizes.more, OF_STATES * method.modes))
         if method.blocks is not None:
             self._sizes = replace(self._sizes, cut=method.blocks.cut, full=method.blocks.full)
+        self._lost: list[str] = []  # why snapshots have no answer
         self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
 
     def run(self) -> tuple[ReducedData, xr.Dataset]:
@@ -132,6 +134,9 @@ class _Making:
         in_rounds = method.snapshots // 2 if method.rounds else 0
         first = method.snapshots - in_rounds
         snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
+        if snapshots is None:
+            message = f"no snapshot has an answer: {self._lost[0]}"
+            raise SolveError(message)
         reduction = Reduction(self._model, inputs.mean, inputs.std)
         rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature, more=min(self._sizes.more, ENOUGH))
         seconds = 0.0
@@ -143,23 +148,26 @@ class _Making:
             candidates = inputs.points(sobol_points(method.seed, 1 + number, 0, CANDIDATES * few, d))
             worst = self._worst(reduction.reduced(snapshots, rough), candidates, few)
             seconds += time.process_time() - begin
-            snapshots = snapshots.with_others(self._solved(worst))
+            more = self._solved(worst) if len(worst) else None
+            snapshots = snapshots if more is None else snapshots.with_others(more)
         begin = time.process_time()
         data = reduction.reduced(snapshots, self._sizes)
         seconds += time.process_time() - begin
         solving = float(sum(one.seconds.sum() for one in self._evaluate.log))
         self.seconds = {"snapshots": solving, "reduction": seconds}
-        return data, self._measured(data, reduction)
+        data.about["without an answer"] = len(self._lost)
+        found = self._measured(data, reduction)
+        add(found, *without_answer(data.about))
+        return data, found
 
-    def _solved(self, points: FloatArray) -> Snapshots:
-        """Solve at points (n, d); those without an answer are left out."""
+    def _solved(self, points: FloatArray) -> Snapshots | None:
+        """Solve at points (n, d); those without an answer are left out, and None is returned if no point has one."""
         kept = KeptStates(self._inputs.std if self._method.derivatives else None)
         found = self._evaluate(Request(points, fields=kept, start=self._start))
         rows, ok = found.sketches, found.ok
+        self._lost += [failure.reason for failure in found.failures]
         if rows is None or not ok.any():
-            reason = found.failures[0].reason if found.failures else "none was solved"
-            message = f"no snapshot has an answer: {reason}"
-            raise SolveError(message)
+            return None
         m, size = found.outputs.shape[1] if self._method.derivatives else 0, rows.shape[2]
         adjoints, tangents = rows[:, 1 : 1 + m].reshape(-1, size), rows[:, 1 + m :].reshape(-1, size)
         return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
@@ -199,12 +207,14 @@ class _Making:
         estimated_state = np.full(n, np.nan)
         gradients = np.full((3, n, m, len(inputs.names)), np.nan)  # of the body, and what is off before and after
         places = np.zeros((3, n, m))  # of largest values: of the body, and what the model says before and after
+        answered = np.zeros(n, dtype=bool)
         for i, point in enumerate(points):
             state = next(states) if ok[i] else None
             try:
                 solution = model.reduced(point)
             except SolveError:
                 continue
+            answered[i] = True
             if state is not None:
                 errors[i], estimates[i] = full.outputs[i] - solution.outputs, solution.estimate.outputs
                 of_state[i] = np.linalg.norm(state - solution.state) / np.linalg.norm(state)
@@ -217,7 +227,12 @@ class _Making:
                 places[:, i] = reduction.places(of_point, np.tile(point, (3, 1)))
         good = np.isfinite(errors).all(axis=1) & np.isfinite(estimates).all(axis=1)
         e, x, spread = errors[good], estimates[good], np.array(data.about["spread"])
-        told: dict[str, Any] = {"unseen": int(good.sum())}
+        told: dict[str, Any] = {
+            "unseen": int(good.sum()),
+            "unseen without an answer": int((~ok).sum()),
+            "of these answered all the same": int((answered & ~ok).sum()),
+            "unseen that only the body answers": int((ok & ~answered).sum()),
+        }
         if good.any():
             rms, left = np.sqrt((e**2).mean(axis=0)), np.sqrt(((e - x) ** 2).mean(axis=0))
             effectivity = (x * e).sum(axis=0) / np.maximum((e**2).sum(axis=0), 1e-300)

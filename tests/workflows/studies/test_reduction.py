@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from forward.model import FunctionModel
 from forward.reduced.data import load as load_model
 from forward.reduced.model import ReducedModel
 from tests import launch
@@ -298,3 +299,50 @@ def test_studies_without_it_import_nothing_of_it(tmp_path):
     )
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     assert out.splitlines()[-1] == "[]"
+
+
+COLUMN = """
+[model]
+kind = "hyperelastic"
+formulation = "displacement"
+body = { kind = "box", size = [0.02, 0.02, 0.2], cells = [1, 1, 8], cell = "hexahedron", degree = 2 }
+material = { kind = "neo-hookean", C1 = 1000, D1 = 3000 }
+clamp = ["z-min"]
+loads = [{ kind = "gravity", direction = [0, 0, -1], density = 10 }]
+outputs = [
+    { name = "u_max", kind = "max-displacement" },
+    { name = "side", kind = "mean-displacement", on = "z-max", component = "x" },
+]
+[parameters]
+"loads.gravity.density" = { kind = "uniform", lower = 5, upper = 25 }
+[method]
+kind = "reduce"
+snapshots = 8
+unseen = 6
+"""
+
+
+def test_a_column_that_buckles(tmp_path):
+    """All that it has shown is straight: the model finds it straight beyond its load, and says so."""
+    (tmp_path / "column.toml").write_text(COLUMN)
+    file = tmp_path / "column.npz"
+    command = ["reduce", tmp_path / "column.toml", "--output", file, "--out", tmp_path / "made"]
+    assert main([*map(str, command), "--quiet", "--no-report"]) == 3
+    told = json.loads((tmp_path / "made" / "summary.json").read_text())
+    assert told["reduced"]["of these answered all the same"] > 0
+    assert max(told["reduced"]["errors"].values()) < 0.01  # of the side, which never moves, beside what moves
+    used = USED.format(upper=1200, more="").replace("model.npz", "column.npz")
+    used = "\n".join(line for line in used.splitlines() if "material.C1" not in line)
+    (tmp_path / "used.toml").write_text(used.replace("900", "5").replace("1100", "25"))
+    for texts in (
+        [one["text"] for one in told["findings"]],
+        [one.text for one in load(tmp_path / "used.toml").findings],
+    ):
+        assert any("may find an equilibrium there all the same" in text for text in texts)
+    # The larger model is as stable as the body, so that this is asked where it buckles, and nowhere else.
+    data, asked = load_model(file), []
+    body = FunctionModel(lambda p: asked.append(float(p[0])) or [0.0, 0.0], data.parameters, ("u_max", "side"))
+    model = ReducedModel(data, data.parameters, tolerance=0.05, full=lambda: body)
+    for density in (6.0, 12.0, 16.0, 20.0, 24.0):
+        model.solve(np.array([density]))
+    assert asked == [20.0, 24.0]
