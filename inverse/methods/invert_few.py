@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, assert_never
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
-from inverse.criticism.chains import Chains, chains_of_few, ensemble, verdict_on_few
+from inverse.criticism.chains import Chains, chains_of_few, ensemble
 from inverse.criticism.comparison import quantiles
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
+from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import FEWEST, resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared

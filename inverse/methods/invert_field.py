@@ -13,17 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.chains import (
-    Chains,
-    FieldWeights,
-    Verdict,
-    chains_of_field,
-    verdict_on_field,
-    weigh_field,
-)
+from inverse.criticism.chains import Chains
 from inverse.criticism.comparison import quantiles
+from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine
+from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.data.shared_motion import Shared
 from inverse.fields.field_posterior import FieldPosterior

@@ -6,19 +6,10 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.chains import (
-    FEW,
-    FIELD,
-    Lengths,
-    bent,
-    chains_of_few,
-    chains_of_field,
-    ensemble,
-    verdict_on_few,
-    verdict_on_field,
-    weigh_field,
-)
+from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
+from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
 from inverse.criticism.predictive import examine, examine_few, summary
+from inverse.criticism.verdict import verdict_on_few, verdict_on_field
 from inverse.criticism.weights import enough
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior

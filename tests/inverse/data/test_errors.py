@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from forward.model import FunctionModel
-from inverse.criticism.chains import weigh_field
+from inverse.criticism.field_samples import weigh_field
 from inverse.data.errors import NormalErrors, StudentErrors
 from inverse.data.observations import Components
 from inverse.fields.field_posterior import FieldPosterior

@@ -14,7 +14,7 @@ from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError, Stability
 from forward.specimen import Specimen
-from inverse.criticism.chains import bent
+from inverse.criticism.field_samples import bent
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode

@@ -15,7 +15,7 @@ from mpi4py import MPI
 import inverse.methods.invert_field
 from benchmarks import buckling
 from forward.model import FunctionModel, SolveError, Stability
-from inverse.criticism.chains import weigh_field
+from inverse.criticism.field_samples import weigh_field
 from inverse.data.observations import Components
 from inverse.data.registration import turned
 from inverse.fields.low_rank import LowRankPosterior

@@ -1,0 +1,145 @@
+"""The verdict: whether Laplace's Gaussian can be trusted, what corrects it, or neither; and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from forward.model import FloatArray
+from inverse.criticism.chains import Chains
+from inverse.criticism.field_samples import FieldWeights
+from inverse.criticism.predictive import ResidualTest
+from inverse.criticism.weights import enough, worth
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import Mode
+from inverse.low_dimensional.evidence import Evidence
+from inverse.low_dimensional.laplace import Laplace
+
+SHIFT = 0.25  # distance of the mean from the mode, in standard deviations, tolerated for Laplace's Gaussian
+WIDTH = 0.2  # relative difference of standard deviations tolerated
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Which posterior can be trusted, and why.
+
+    Attributes
+    ----------
+    trust
+        "laplace", "corrected" (weighted points, or chains), or "neither".
+    why
+        In words.
+    """
+
+    trust: Literal["laplace", "corrected", "neither"]
+    why: str
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        heads = {
+            "laplace": "Laplace's Gaussian can be trusted",
+            "corrected": "Laplace's Gaussian is not to be trusted, the corrected posterior is",
+            "neither": "not to be trusted",
+        }
+        return f"{heads[self.trust]}: {self.why}"
+
+
+def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chains: Chains | None = None) -> Verdict:
+    """Judge the Gaussian of few parameters by weighted points, the residuals, and chains if there are any."""
+    objection = _objection(gaussian.converged, test)
+    if objection is not None:
+        return objection
+    if found.route == "closed form":
+        return Verdict("laplace", found.why)
+    said = worth(found.pareto_k, found.ess, len(found.log_weights))
+    if not found.trusted:
+        return _by_chains(said, chains, enough(found.ess, len(found.log_weights)))
+    w, x = found.weights, found.density.x
+    mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
+    shift = float(np.abs((mean - gaussian.mode) / width).max())
+    ratio = np.log(np.sqrt(w @ (x - mean) ** 2) / width)
+    chance = 2 / np.sqrt(found.ess)
+    worst = float(np.exp(ratio[np.abs(ratio).argmax()]))
+    far = f"means are {shift:.2f} standard deviations from the mode, widths {worst:.2f} of the Gaussian's; {said}"
+    if shift <= SHIFT + chance and np.abs(ratio).max() <= WIDTH + chance / np.sqrt(2):
+        return Verdict("laplace", far)
+    return Verdict("corrected", far)
+
+
+def verdict_on_field(
+    mode: Mode,
+    gaussian: LowRankPosterior,
+    found: FieldWeights | None,
+    test: ResidualTest,
+    chains: Chains | None = None,
+    values: FloatArray | None = None,
+) -> Verdict:
+    """Judge means and standard deviations of the values of a field by other solves, if any, and the residuals.
+
+    Parameters
+    ----------
+    mode, gaussian
+        What is judged.
+    found
+        Weighted samples.
+    test
+        Of the residuals.
+    chains
+        Judged chains, and `values` (n, N), the values of the field that they drew.
+    """
+    objection = _objection(mode.converged, test)
+    if objection is not None:
+        return objection
+    if found is None and chains is None:
+        why = (
+            f"the residuals agree with it (probability {test.probability:.2g}); what it says of the directions with "
+            "the largest λ was not checked by other solves (method.samples does)"
+        )
+        return Verdict("laplace", why)
+    if found is None:
+        assert chains is not None
+        if not chains.mixed or values is None:
+            return _by_chains("no weighted samples", chains, 0)
+        return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.ess, _said(chains))
+    said = worth(found.pareto_k, found.ess, len(found.log_weights))
+    if not found.trusted:
+        return _by_chains(said, chains, enough(found.ess, len(found.log_weights)))
+    return _compared(gaussian, found.mean, found.std, found.ess, said)
+
+
+def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, ess: float, worth: str) -> Verdict:
+    """Compare the Gaussian with means and standard deviations (N,) by so many effective samples."""
+    # Root mean squares over the vertices, minus what so few samples would give by chance.
+    chance = 1 / ess
+    shift = np.sqrt(max(float((((mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
+    width = float(np.sqrt((std**2).mean() / (gaussian.std**2).mean()))
+    far = f"means are {shift:.2f} standard deviations from the mode, widths {width:.2f} of the Gaussian's; {worth}"
+    agrees = shift <= SHIFT and abs(np.log(width)) <= WIDTH + np.sqrt(chance)
+    return Verdict("laplace" if agrees else "corrected", far)
+
+
+def _objection(converged: bool, test: ResidualTest) -> Verdict | None:
+    if not converged:
+        return Verdict("neither", "the search for the mode did not converge")
+    if test.probability < 0.01:
+        why = f"the model does not explain the data: |r|² = {test.square:.4g} where {test.degrees:.4g} is expected"
+        return Verdict("neither", f"{why} (probability {test.probability:.1g})")
+    if test.agreement_probability < 0.01:
+        why = f"residuals of neighbours agree too much (probability {test.agreement_probability:.1g})"
+        return Verdict("neither", f"{why}: the model, or the independence of the noise, is wrong")
+    return None
+
+
+def _by_chains(worth: str, chains: Chains | None, samples: int) -> Verdict:
+    if chains is None:
+        return Verdict("neither", f"{worth}; take method.samples = {samples}, or run chains (method.chains)")
+    said = _said(chains)
+    if chains.mixed:
+        return Verdict("corrected", f"{worth}, but chains agree: {said}")
+    return Verdict("neither", f"{worth}, and chains have not mixed: {said}")
+
+
+def _said(chains: Chains) -> str:
+    return f"R̂ up to {chains.rhat.max():.3f}, effective draws from {chains.ess:.0f}"
