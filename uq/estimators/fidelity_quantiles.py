@@ -18,7 +18,7 @@ from forward.model import FloatArray
 from uq.estimators.blue import informations, weights
 from uq.estimators.chosen import Chosen, Pooled
 from uq.estimators.fidelities import Samples, folds
-from uq.estimators.moments import Quantiles, quantiles_of_shares
+from uq.estimators.quantiles import Quantiles, quantiles_of_shares
 
 THRESHOLDS = 129
 FEWER = 0.5  # samples that may differ unseen

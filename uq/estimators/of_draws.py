@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, FloatArray
-from uq.estimators.moments import quantiles_worth
+from uq.estimators.quantiles import quantiles_worth
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 

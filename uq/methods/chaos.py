@@ -18,7 +18,8 @@ from pydantic import Field
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.indices import coefficient_moments, shares
-from uq.estimators.moments import Quantiles, Z, quantiles, student
+from uq.estimators.moments import Z, student
+from uq.estimators.quantiles import Quantiles, quantiles
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request

@@ -36,7 +36,8 @@ from pydantic import Field
 from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
-from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates
+from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request

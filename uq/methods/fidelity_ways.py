@@ -12,17 +12,8 @@ from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated, gains
 from uq.estimators.fidelity_quantiles import quantiles_of_groups
-from uq.estimators.moments import (
-    Estimates,
-    Quantiles,
-    Z,
-    combine,
-    controlled,
-    quantiles,
-    ratio,
-    student,
-    term,
-)
+from uq.estimators.moments import Estimates, Z, combine, controlled, ratio, student, term
+from uq.estimators.quantiles import Quantiles, quantiles
 from uq.estimators.tails import of_influences, unseen
 from uq.evaluation.request import Evaluations
 from uq.methods.chaos import objection

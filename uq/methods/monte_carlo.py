@@ -22,8 +22,8 @@ from uq.estimators.moments import (
     estimate,
     estimate_from_samples,
     monomials,
-    quantiles,
 )
+from uq.estimators.quantiles import quantiles
 from uq.estimators.tails import counted, influences
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder

@@ -27,10 +27,10 @@ from uq.estimators.moments import (
     estimate,
     estimate_from_replicates,
     monomials,
-    quantiles_from_replicates,
     ratio,
     student,
 )
+from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted, influences, of_influences, skewed
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request, Start

@@ -30,7 +30,8 @@ from uq.estimators.indices import (
     jackknife_error,
     shares,
 )
-from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates
+from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add

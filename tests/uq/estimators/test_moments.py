@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from uq.estimators.moments import estimate, estimate_from_replicates, monomials, quantiles
+from uq.estimators.moments import estimate, estimate_from_replicates, monomials
+from uq.estimators.quantiles import quantiles
 
 REPEATS, N = 2000, 100
 # w = x + x²/5 with x ~ N(0, 1) has mean 1/5 and variance 1 + 2/25.
