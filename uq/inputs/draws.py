@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.inputs.distributions import RARE, WIDE, Distribution
+from uq.inputs.distributions import Distribution
+from uq.inputs.univariate import RARE, WIDE
 
 IntArray = NDArray[np.int64]
 SAME = 1e-10  # range of draws over their size below which they are one number
