@@ -29,7 +29,8 @@ from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
 from forward.bodies.geometry import AXES, Box
-from forward.fem.model import FiniteElementSolution, HyperelasticModel
+from forward.fem.model import HyperelasticModel
+from forward.fem.solution import FiniteElementSolution
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, SolveError
 from workflows.config.study import load

@@ -28,7 +28,7 @@ from forward.machine import MIB, headroom
 from forward.model import FloatArray, Guess, SolveError
 
 if TYPE_CHECKING:
-    from forward.fem.model import FiniteElementSolution
+    from forward.fem.solution import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
 
 BULK = 0.5  # share of the refined cells in the sum of all indicators

@@ -33,7 +33,7 @@ from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
 if TYPE_CHECKING:
     from forward.fem.enriched import Enriched, EnrichedState
     from forward.fem.equations import Discretisation
-    from forward.fem.model import FiniteElementSolution
+    from forward.fem.solution import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders

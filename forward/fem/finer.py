@@ -32,8 +32,9 @@ from forward.extrapolated import HALVED, Begun, Extrapolated
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
 
 if TYPE_CHECKING:
-    from forward.fem.model import FiniteElementSolution, HyperelasticModel
+    from forward.fem.model import HyperelasticModel
     from forward.fem.path import PathModel, PathSolution
+    from forward.fem.solution import FiniteElementSolution
     from forward.fem.specimen import SpecimenModel, SpecimenSolution
     from forward.hyperelastic import Hyperelastic
     from forward.model import ForwardModel, MeshError, Saturation, Stability, Work

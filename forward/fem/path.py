@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from forward.fem.calibration import FinerMesh
-from forward.fem.model import FiniteElementSolution, HyperelasticModel
+from forward.fem.model import HyperelasticModel
+from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, gather_each, scatter_each
 from forward.model import (
     FloatArray,
@@ -247,7 +248,7 @@ class PathSolution:
 
     def saturation(self, spare: float = math.inf) -> Saturation:
         """Calibrate estimates of the error of the mesh, step by step; collective."""
-        finer = FinerMesh(self.steps[0]._model, spare)
+        finer = FinerMesh(self._model.steps[0], spare)
         found = [step.saturation(spare, finer) for step in self.steps]
         return Saturation(
             np.concatenate([one.outputs for one in found]),

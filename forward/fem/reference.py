@@ -16,8 +16,9 @@ from forward.solvers.anderson import Inverse
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 from forward.solvers.rotations import Turned, rotations, turn
-from forward.solvers.stability import BLOCK, SMOOTH, Rows, Screened, screen, screening_vectors
+from forward.solvers.stability import BLOCK, NOT_SCREENED, SMOOTH, Rows, Screened, draw, screen, screening_vectors
 from forward.solvers.steps import Corrector, Steps, finished, through
+from forward.solvers.system import Residual
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
@@ -223,3 +224,69 @@ class ReferenceFactor:
             return solver.solve(right, transpose=transpose, tolerance=tolerance)
 
         return inverse
+
+
+class WayFromReference:
+    """The straight line in parameters from a reference.
+
+    Attributes
+    ----------
+    reference
+        Its start.
+    state
+        Of the reference.
+    rotation
+        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    draw
+        A number in [0, 1) that depends on the requested parameters.
+    """
+
+    def __init__(
+        self,
+        equations: Discretisation,
+        factor: ReferenceFactor,
+        reference: ReferenceSolution,
+        parameters: FloatArray,
+        *,
+        screen: bool,
+    ) -> None:
+        self._screen, self._fraction = screen, 1.0
+        self.draw = draw(parameters)
+        self._equations, self._factor = equations, factor
+        self._from, self._to = reference.parameters, parameters
+        self.reference = reference
+        self.state = reference.state
+        self.rotation: FloatArray | None = None
+
+    def corrector(self, u: FloatArray) -> Corrector:
+        """Return the corrector at a prediction u (U_local,), whose rotations are remembered."""
+        self.rotation = self._factor.rotation(u)
+        return self._factor.corrector(self.rotation)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve (U_local,) with the factor at the reference."""
+        return self._factor.solve(right)
+
+    def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
+        """Find the result of the screen for an equilibrium; not screened if that is not asked for."""
+        if not self._screen or self.rotation is None:
+            return NOT_SCREENED
+        return (yield from self._factor.screen(u, residual.vector, self.rotation))
+
+    def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
+        """Whether Lanczos' process shows that the stiffness at an equilibrium is positive definite."""
+        if not self._screen or self.rotation is None:
+            return False
+        return (yield from self._factor.definite(u, residual.vector, self.rotation))
+
+    def at(self, fraction: float) -> None:
+        """Set the parameters of the equations to those after a fraction of the path."""
+        self._fraction = fraction
+        self._equations.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
+        self._equations.at_load(1.0)
+
+    def resume(self, work: Work, solved: int) -> None:
+        """Set the equations to where they were on this path, and count their work and back-substitutions there."""
+        work.back_substitutions += solved
+        self._equations.work = work
+        self.at(self._fraction)

@@ -20,19 +20,11 @@ from forward.fem.dolfinx import spaces
 from forward.fem.enriched import Enriched, EnrichedState, relative
 from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout, vertices_of
-from forward.fem.model import FiniteElementSolution, HyperelasticModel
+from forward.fem.model import HyperelasticModel
 from forward.fem.saturation import factors, typical
+from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, gather_each, log_factor, scatter_each
-from forward.model import (
-    FloatArray,
-    Guess,
-    MeshError,
-    OneByOne,
-    ReferenceSolution,
-    Saturation,
-    Stability,
-    Work,
-)
+from forward.model import FloatArray, Guess, MeshError, OneByOne, ReferenceSolution, Saturation, Stability, Work
 from forward.specimen import Observed, Specimen, of_case
 
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
