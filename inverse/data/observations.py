@@ -1,45 +1,23 @@
-"""Measured displacements of a specimen, tables of them, and what may be wrong with them.
-
-A table of comma-separated values has the columns x, y, z (of the undeformed body), any of ux, uy, uz, and optionally
-sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Heads may
-state the unit of all lengths: ``x [mm]``, ``ux [mm]``. Empty cells and ``nan`` mean that a component was not measured.
-Lines that begin with # state the source of the data, and lines ``# truth.NAME = VALUE`` the true values behind
-synthetic data. Rows may hold measured outputs of load cases, such as forces of tools, in place of displacements:
-`inverse.data.readings`. Other files: `inverse.data.scans`.
-
-Most of the module describes what may be wrong with a table, each mistake with its line.
-"""
+"""Measured displacements of a specimen, with other outputs beside them, and their components one by one."""
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from glob import iglob
-from itertools import count
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import told
-from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
-from inverse.data.readings import Readings, Units, split
-from inverse.data.table import DataError, Table, needed, numeric, others, read_table
-from inverse.data.units import factor, split_head
+from inverse.data.readings import Readings
+from inverse.data.table import DataError, others
 
-TABLES = (".csv", ".txt")
-MESHES = (".vtu", ".vtp", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
-SCANS = (".toml",)  # that say what files belong together
 POSITION, MOTION, ERRORS = ("x", "y", "z"), ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
-COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
 FAR = 0.02  # of the extent of a body: median distance of points from which on they may belong to another
 SAME = 1e-9  # of the extent of all points: distance within which points coincide
-TRUTH = "truth."
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,69 +278,6 @@ def kinds(cases: NDArray[np.int64], axes: NDArray[np.int64]) -> NDArray[np.int64
     return np.asarray(max(int(axes.max(initial=0)) + 1, len(MOTION)) * cases + axes)
 
 
-def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
-    """Return the files given by names, folders (all data files in them) and patterns such as ``*.csv``.
-
-    Missing files are included too, so that the others of a batch go on: they cannot be read.
-
-    Parameters
-    ----------
-    patterns
-        Names, folders and patterns.
-    folders
-        Where to look for them: the first folder with a match counts.
-
-    Raises
-    ------
-    DataError
-        If none of them means anything.
-    """
-    found: dict[Path, bool] = {}
-    missing = []
-    for pattern in patterns:
-        for folder in folders:
-            path = folder / pattern
-            if path.is_dir():
-                children = sorted(path.iterdir())
-                # What says that files belong together stands for them.
-                here = [child for child in children if child.suffix in SCANS]
-                here = here or [child for child in children if child.suffix in TABLES + MESHES]
-            elif path.is_file():
-                here = [path]
-            else:
-                here = [one for one in sorted(_matching(folder, pattern)) if one.is_file()]
-            if here:
-                found |= dict.fromkeys(here, True)
-                break
-        else:
-            missing.append(f"{pattern}: no such file, expected a file, a folder of data files or a pattern")
-            found |= {folders[0] / pattern: False}
-    if not any(found.values()):
-        raise DataError(*missing)
-    return list(found)
-
-
-def _matching(folder: Path, pattern: str) -> Iterator[Path]:
-    """Find what a pattern means, in a folder where it does not say in full where."""
-    if "\0" not in pattern and any(sign in pattern for sign in "*?["):
-        # pathlib takes no pattern that begins with the root
-        for found in iglob(pattern, root_dir=folder, recursive=True, include_hidden=True):  # noqa: PTH207
-            yield folder / found
-
-
-def distinct(paths: Sequence[Path]) -> list[str]:
-    """Return a name for each of different files: without its ending; with it, and with folders, where two share one."""
-    names = [path.stem for path in paths]
-    ways = [path.relative_to(path.anchor).parts for path in paths]
-    for depth in range(1, max(map(len, ways), default=0) + 1):
-        shared = {name for name, times in Counter(names).items() if times > 1}
-        names = ["-".join(way[-depth:]) if name in shared else name for way, name in zip(ways, names, strict=True)]
-    for i, name in enumerate(names):  # a-b/c and a/b-c
-        if name in names[:i]:
-            names[i] = next(new for k in count(2) if (new := f"{name}-{k}") not in names)
-    return names
-
-
 def mistakes_of(found: Observations, name: str) -> list[str]:
     """Say what is wrong with the data of a file."""
     mistakes = []
@@ -392,117 +307,3 @@ def mistakes_of(found: Observations, name: str) -> list[str]:
             f"'{found.cases[found.case[other]]}', expected each once{others(len(twice) - 1)}"
         )
     return mistakes
-
-
-def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) -> Observations:
-    """Read a table of displacements, and of other outputs.
-
-    Parameters
-    ----------
-    path
-        The table.
-    known
-        Names of the load cases, and what is measured in them beside displacements.
-    unit
-        m per unit of the file, if it does not state that.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
-    """
-    name, cases = path.name, tuple(known)
-    table, readings = split(read_table(path), name, known)
-    remarks = tuple(line for line in table.remarks if not line.startswith(TRUTH))
-    truth = dict(_assignment(line) for line in table.remarks if line.startswith(TRUTH))
-    if not table.rows:
-        none = np.zeros((0, 3))
-        return Observations(none, none, none, cases, np.zeros(0, dtype=np.int64), (), remarks, truth, readings=readings)
-    found, unit = _without_units(table, name, unit)
-    columns = found.columns
-    wrong = [
-        f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
-    ]
-    wrong += [f"{name}: no column '{column}', expected x, y, z" for column in POSITION if column not in columns]
-    if not any(column in columns for column in MOTION):
-        wrong.append(f"{name}: no column of displacements, expected at least one of ux, uy, uz")
-    if "case" not in columns and len(cases) > 1:
-        wrong.append(f"{name}: no column 'case', expected one where there are several load cases: {', '.join(cases)}")
-    if wrong:
-        raise DataError(*wrong)
-    rows = found.rows
-    labels = tuple(f"{name}: line {n}" for n in found.lines)
-    numbers: dict[str, FloatArray] = {}
-    mistakes = []
-    for column in (*POSITION, *MOTION, "sigma", *ERRORS):
-        if column not in columns:
-            continue
-        values, bad = np.full(len(rows), math.nan), []
-        for i, row in enumerate(rows):
-            try:
-                values[i] = _number(row[column], column)
-            except ValueError as error:
-                bad.append(f"{labels[i]}: {error}")
-        mistakes += [f"{line}{others(len(bad) - 1)}" for line in bad[:1]]
-        numbers[column] = unit * values
-    given_cases = [row["case"] if "case" in columns else cases[0] for row in rows]
-    strange = [i for i, case in enumerate(given_cases) if case not in cases]
-    if strange:
-        word = given_cases[strange[0]]
-        more = others(len(strange) - 1)
-        mistakes.append(f"{labels[strange[0]]}: unknown load case '{word}'; {nearest(word, cases)}{more}")
-    if mistakes:
-        raise DataError(*mistakes)
-    nothing = np.full(len(rows), np.nan)
-    common = numbers.get("sigma", nothing)
-    return Observations(
-        np.column_stack([numbers[column] for column in POSITION]),
-        np.column_stack([numbers.get(column, nothing) for column in MOTION]),
-        np.column_stack([numbers.get(column, common) for column in ERRORS]),
-        cases,
-        np.array([cases.index(case) for case in given_cases]),
-        labels,
-        remarks,
-        truth,
-        unit=unit,
-        readings=readings,
-    )
-
-
-def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, float]:
-    """Return a table whose heads are names alone, and m per unit of its lengths."""
-    heads = [split_head(head) for head in table.columns]
-    lengths = [(column, said) for column, said in heads if column != "case"]
-    said = {unit for _, unit in lengths}
-    stated = sorted(one for one in said if one is not None)
-    if not stated:
-        return table, 1.0 if unit is None else unit
-    if len(said) > 1:
-        words = ", ".join(column if one is None else f"{column} [{one}]" for column, one in lengths)
-        raise DataError(f"{name}: mixed units: {words}; expected the same unit in all heads, or in none")
-    try:
-        scale = factor(stated[0], "m")
-    except ValueError as error:
-        raise DataError(f"{name}: column '{lengths[0][0]}' has {error}") from None
-    if unit is not None and abs(unit / scale - 1) > SAME:
-        raise DataError(
-            f"{name}: its heads state {stated[0]}, but the study says {unit:g} m per unit; expected one of them"
-        )
-    names = [column for column, _ in heads]
-    twice = next((column for column in names if names.count(column) > 1), None)
-    if twice is not None:
-        raise DataError(f"{name}: several columns '{twice}', expected different names")
-    rows = [dict(zip(names, row.values(), strict=True)) for row in table.rows]
-    return replace(table, columns=tuple(names), rows=rows), scale
-
-
-def _number(text: str, column: str) -> float:
-    """Return a number; where none has to be, an empty cell or NaN is one that was not measured."""
-    if column in POSITION:
-        return needed(text, column)
-    return numeric("" if text.lower() == "nan" else text, column, positive=column not in MOTION)
-
-
-def _assignment(line: str) -> tuple[str, str]:
-    name, _, value = line.removeprefix(TRUTH).partition("=")
-    return name.strip(), value.strip().strip('"')

@@ -21,8 +21,7 @@ from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.curves import Steps, as_rows
 from inverse.data.neighbours import Neighbours, neighbours
-from inverse.data.observations import TRUTH
-from inverse.data.table import DataError, needed, numeric, read_table
+from inverse.data.table import TRUTH, DataError, needed, numeric, read_table
 
 COLUMNS = ("output", "value", "sigma")
 

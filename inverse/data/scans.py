@@ -1,6 +1,6 @@
 """Scans: files of points and displacements, what they do not say themselves, and files that belong together.
 
-Besides tables (`inverse.data.observations`), data files are meshes, surfaces and clouds of points: VTU, VTP, legacy
+Besides tables (`inverse.data.displacement_tables`), data files are meshes, surfaces and clouds of points: VTU, VTP, legacy
 VTK, PLY, XDMF (also as DOLFINx writes it), gmsh's .msh, Abaqus's .inp, and what else meshio reads. Their arrays at the
 points are ``displacement_CASE``, or ``displacement`` if there is only one load case (or those that ``field`` names), or
 numbers ``ux``, ``uy``, ``uz`` (``ux_CASE`` …), and optionally ``sigma`` or ``sigma_CASE`` of one or three components,
@@ -32,16 +32,9 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray
 from forward.settings import Settings, nearest
-from inverse.data.observations import (
-    ERRORS,
-    MESHES,
-    MOTION,
-    SAME,
-    TABLES,
-    Observations,
-    mistakes_of,
-    of_table,
-)
+from inverse.data.displacement_tables import of_table
+from inverse.data.files import MESHES, TABLES
+from inverse.data.observations import ERRORS, MOTION, SAME, Observations, mistakes_of
 from inverse.data.readings import Units
 from inverse.data.registration import Registration
 from inverse.data.scan_files import Points, points_of

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+TRUTH = "truth."  # begins remarks that state true values behind synthetic data
+
 
 class DataError(ValueError):
     """Data that cannot be used; each argument is one line: the place, what was found and what was expected."""

@@ -17,7 +17,7 @@ from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
 from forward.specimen import Specimen
-from inverse.data.observations import distinct, files
+from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.invert import ByReduced, Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
@@ -25,12 +25,7 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import StudyError, refused
 from workflows.config.predict import Predict
-from workflows.config.priors import (
-    findings_of_materials,
-    mistakes_of_factor,
-    mistakes_of_priors,
-    ranges,
-)
+from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_priors, ranges
 from workflows.config.report import Report
 from workflows.studies.measured import DataFiles, DataSet, digest_of, read_measurement
 from workflows.studies.predictions import has_mesh, meshes_of

@@ -20,7 +20,8 @@ from forward.files import meshes
 from forward.settings import Settings, one_line
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.observations import SCANS, Observations, Placed
+from inverse.data.files import SCANS
+from inverse.data.observations import Observations, Placed
 from inverse.data.readings import Readings, Units
 from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from forward.model import SolveError
 from forward.registry import named
-from inverse.data.observations import distinct, files
+from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs

@@ -7,7 +7,7 @@ import pytest
 
 from forward.bodies.geometry import Block, Box
 from inverse.data import scans
-from inverse.data.observations import distinct, files
+from inverse.data.files import distinct, files
 from inverse.data.scans import Scan
 from inverse.data.table import DataError
 
