@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.reduced.at_points import Integrand
 from forward.reduced.level import Level
-from forward.solvers.anderson import NEGLIGIBLE
+from forward.solvers.anderson import scaled_eigenpairs
 
 TOGETHER = 64  # samples
 WINDOW = 8  # differences that Anderson mixing keeps
@@ -95,11 +95,8 @@ class _Mixing:
 
 
 def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations (s, k, k) of scaled columns, as `AndersonMixing` does, of s samples at once."""
-    size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
-    size = np.where(size == 0, 1.0, size)
-    values, vectors = np.linalg.eigh(gram / (size[:, :, None] * size[:, None, :]))
-    good = values > NEGLIGIBLE * values[:, -1:]
+    """Solve the normal equations (s, k, k) as `AndersonMixing` does, of s samples at once."""
+    size, values, vectors, good = scaled_eigenpairs(gram)
     inverse = np.where(good, 1 / np.where(good, values, 1.0), 0.0)
     along = np.matmul(vectors.swapaxes(1, 2), (right / size)[..., None]) * inverse[..., None]
     return np.asarray(np.matmul(vectors, along)[..., 0] / size)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
@@ -67,13 +68,25 @@ class AndersonMixing:
 
 
 def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations (k, k) of scaled columns, without directions that are rounding."""
-    size = np.sqrt(np.diag(gram))
-    size[size == 0] = 1
-    values, vectors = np.linalg.eigh(gram / np.outer(size, size))
-    good = values > NEGLIGIBLE * values[-1]
+    """Solve the normal equations (k, k), without directions that are rounding."""
+    size, values, vectors, good = scaled_eigenpairs(gram)
     vectors = vectors[:, good]
     return np.asarray((vectors / values[good]) @ (vectors.T @ (right / size)) / size)
+
+
+def scaled_eigenpairs(gram: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Decompose normal equations (…, k, k) whose columns are scaled to one size.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Sizes (…, k) of the columns; eigenvalues (…, k) and eigenvectors (…, k, k), as columns, of the scaled equations;
+        and which (…, k) of these directions are more than rounding.
+    """
+    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
+    size[size == 0] = 1
+    values, vectors = np.linalg.eigh(gram / (size[..., :, None] * size[..., None, :]))
+    return size, values, vectors, values > NEGLIGIBLE * values[..., -1:]
 
 
 def block_galerkin(
