@@ -1,11 +1,11 @@
 """Scans: files of points and displacements, what they do not say themselves, and files that belong together.
 
-Besides tables (`inverse.data.displacement_tables`), data files are meshes, surfaces and clouds of points: VTU, VTP, legacy
-VTK, PLY, XDMF (also as DOLFINx writes it), gmsh's .msh, Abaqus's .inp, and what else meshio reads. Their arrays at the
-points are ``displacement_CASE``, or ``displacement`` if there is only one load case (or those that ``field`` names), or
-numbers ``ux``, ``uy``, ``uz`` (``ux_CASE`` …), and optionally ``sigma`` or ``sigma_CASE`` of one or three components,
-or ``sigma_x``, ``sigma_y``, ``sigma_z``. NaN means that a component was not measured. Points that coincide and say the
-same count once.
+Besides tables (`inverse.data.displacement_tables`), data files are meshes, surfaces and clouds of points: VTU, VTP,
+legacy VTK, PLY, XDMF (also as DOLFINx writes it), gmsh's .msh, Abaqus's .inp, and what else meshio reads. Their arrays
+at the points are ``displacement_CASE``, or ``displacement`` if there is only one load case (or those that ``field``
+names), or numbers ``ux``, ``uy``, ``uz`` (``ux_CASE`` …), and optionally ``sigma`` or ``sigma_CASE`` of one or three
+components, or ``sigma_x``, ``sigma_y``, ``sigma_z``. NaN means that a component was not measured. Points that coincide
+and say the same count once.
 
 STL and PLY surfaces, and whatever else has no displacements, come in pairs with the same numbering, the undeformed and
 the deformed surface, whose difference is the displacement. A file in TOML says which, and anything else about a scan::

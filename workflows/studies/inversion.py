@@ -49,27 +49,7 @@ OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are n
 
 
 class InversionStudy(StudyKind):
-    """What inversions of all kinds of models have in common.
-
-    Parameters
-    ----------
-    model
-        What is measured.
-    parameters
-        Priors by the paths of the unknown numbers of the model.
-    correlations
-        Correlations between them.
-    data
-        What was measured.
-    method
-        How it is inverted.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
-    predict
-        What else is to be known by the posterior; by default nothing.
-    """
+    """What inversions of all kinds of models have in common; each kind says what its blocks mean."""
 
     model: Any
     parameters: dict[str, Distribution] = Field(default={})

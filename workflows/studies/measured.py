@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError, field_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
@@ -61,6 +61,13 @@ class DataSet(Settings):
     refused: str = ""
 
 
+def _one_alone(given: Any) -> Any:
+    return (given,) if isinstance(given, str) else given
+
+
+FileNames = Annotated[tuple[str, ...], BeforeValidator(_one_alone, json_schema_input_type=tuple[str, ...] | str)]
+
+
 class DataFiles(Reading):
     """Where measured displacements are.
 
@@ -85,15 +92,10 @@ class DataFiles(Reading):
         The files as they were when the study ran; written by the run.
     """
 
-    files: tuple[str, ...] = Field(min_length=1)
+    files: FileNames = Field(min_length=1)
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
-
-    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
-    @classmethod
-    def _one_alone(cls, given: Any) -> Any:
-        return (given,) if isinstance(given, str) else given
 
 
 def scan_of(path: Path, usual: Reading) -> Scan:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self, cast
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from forward.model import ForwardModel, ModelError
 from forward.registry import OfKind, named
@@ -22,7 +22,7 @@ from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
-from workflows.studies.measured import DataSet, check_signs
+from workflows.studies.measured import DataSet, FileNames, check_signs
 from workflows.studies.predictions import never_estimable
 from workflows.studies.study import Sampled
 
@@ -73,18 +73,13 @@ class MeasuredOutputs(Settings):
         The files as they were when the study ran; written by the run.
     """
 
-    files: tuple[str, ...] = ()
+    files: FileNames = ()
     outputs: dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]] = Field(default={})
     sigma: dict[str, Positive] = Field(default={})
     noise: OutputNoise = OutputNoise()
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
-
-    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
-    @classmethod
-    def _one_alone(cls, given: Any) -> Any:
-        return (given,) if isinstance(given, str) else given
 
     @model_validator(mode="after")
     def _check(self) -> MeasuredOutputs:
