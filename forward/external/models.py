@@ -180,12 +180,8 @@ class PythonModel(_External):
         return function, _guarded(self.jacobian, "jacobian", names, seconds) if self.jacobian else None
 
 
-def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -> Callable[[FloatArray], Any]:
-    """Import a function; exceptions that it raises, and calls beyond the time limit, become failed solves.
-
-    If it ends the process or runs out of memory, which says nothing about the model, the run ends and names the
-    parameters.
-    """
+def _function(path: str, key: str) -> Callable[[FloatArray], Any]:
+    """Import the function that a study names, or say what is wrong with the name."""
     module, _, name = path.rpartition(".")
     try:
         function = getattr(imported(module), name)
@@ -201,6 +197,17 @@ def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -
     if not callable(function):
         message = f"model.{key}: '{path}' is {type(function).__name__}, expected a function"
         raise ModelError(message)
+    found: Callable[[FloatArray], Any] = function
+    return found
+
+
+def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -> Callable[[FloatArray], Any]:
+    """Import a function; exceptions that it raises, and calls beyond the time limit, become failed solves.
+
+    If it ends the process or runs out of memory, which says nothing about the model, the run ends and names the
+    parameters.
+    """
+    function = _function(path, key)
 
     def at(point: FloatArray) -> str:
         return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, point, strict=True))

@@ -23,7 +23,7 @@ from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.observations import ERRORS, MOTION, POSITION, SAME, Observations
 from inverse.data.readings import Units, split
-from inverse.data.table import TRUTH, DataError, Table, needed, numeric, others, read_table
+from inverse.data.table import DataError, Table, needed, numeric, others, read_table
 from inverse.data.units import factor, split_head
 
 COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
@@ -48,11 +48,11 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
     """
     name, cases = path.name, tuple(known)
     table, readings = split(read_table(path), name, known)
-    remarks = tuple(line for line in table.remarks if not line.startswith(TRUTH))
-    truth = dict(_assignment(line) for line in table.remarks if line.startswith(TRUTH))
+    source = table.source
+    truth = {path_of: value.strip('"') for path_of, value in table.truth}
     if not table.rows:
         none = np.zeros((0, 3))
-        return Observations(none, none, none, cases, np.zeros(0, dtype=np.int64), (), remarks, truth, readings=readings)
+        return Observations(none, none, none, cases, np.zeros(0, dtype=np.int64), (), source, truth, readings=readings)
     found, unit = _without_units(table, name, unit)
     columns = found.columns
     wrong = [
@@ -97,7 +97,7 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         cases,
         np.array([cases.index(case) for case in given_cases]),
         labels,
-        remarks,
+        source,
         truth,
         unit=unit,
         readings=readings,
@@ -136,8 +136,3 @@ def _number(text: str, column: str) -> float:
     if column in POSITION:
         return needed(text, column)
     return numeric("" if text.lower() == "nan" else text, column, positive=column not in MOTION)
-
-
-def _assignment(line: str) -> tuple[str, str]:
-    name, _, value = line.removeprefix(TRUTH).partition("=")
-    return name.strip(), value.strip().strip('"')

@@ -21,7 +21,7 @@ from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.curves import Steps, as_rows
 from inverse.data.neighbours import Neighbours, neighbours
-from inverse.data.table import TRUTH, DataError, needed, numeric, read_table
+from inverse.data.table import DataError, needed, numeric, read_table
 
 COLUMNS = ("output", "value", "sigma")
 
@@ -169,17 +169,15 @@ def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None)
             else:
                 numbers.setdefault(column, []).append(value)
     truth = {}
-    for line in (line for line in table.remarks if line.startswith(TRUTH)):
-        path_of, _, text = line.removeprefix(TRUTH).partition("=")
+    for path_of, text in table.truth:
         try:
-            truth[path_of.strip()] = needed(text.strip(), f"truth.{path_of.strip()}")
+            truth[path_of] = needed(text, f"truth.{path_of}")
         except ValueError as error:
             wrong.append(f"{name}: {error}")
     if wrong:
         raise DataError(*wrong)
-    source = tuple(line for line in table.remarks if not line.startswith(TRUTH))
     sigma = np.array(numbers.get("sigma", [math.nan] * len(names)))
-    return OutputData(names, np.array(numbers["value"]), sigma, labels, source, truth)
+    return OutputData(names, np.array(numbers["value"]), sigma, labels, table.source, truth)
 
 
 def stated(values: Mapping[str, float | Sequence[float]]) -> OutputData:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,19 @@ class Table:
     columns: tuple[str, ...]
     rows: list[dict[str, str]]
     lines: list[int]
+
+    @property
+    def source(self) -> tuple[str, ...]:
+        """Its remarks, without those that state true values."""
+        return tuple(line for line in self.remarks if not line.startswith(TRUTH))
+
+    @property
+    def truth(self) -> Iterator[tuple[str, str]]:
+        """Names of true values behind synthetic data, and what is stated of them."""
+        for line in self.remarks:
+            if line.startswith(TRUTH):
+                name, _, value = line.removeprefix(TRUTH).partition("=")
+                yield name.strip(), value.strip()
 
 
 def read_table(path: Path) -> Table:

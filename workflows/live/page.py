@@ -6,6 +6,7 @@ import json
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -73,82 +74,84 @@ class Scene:
         return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
 
 
-def server(scene: Scene, listening: socket.socket, move: Any) -> ThreadingHTTPServer:
-    """Return the server of a scene at a socket; `move` is called with what sliders say."""
+class _Server(ThreadingHTTPServer):
+    """Serves a scene at a socket; `move` is called with what sliders say."""
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-        disable_nagle_algorithm = True  # or a picture takes 40 ms
+    def __init__(self, scene: Scene, listening: socket.socket, move: Callable[[dict[str, float]], object]) -> None:
+        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+        self.scene, self.move = scene, move
 
-        def _own(self) -> bool:
-            """Whether it was asked by this name: a page elsewhere can make its name point here."""
-            name = self.headers.get("Host", "").rsplit(":", 1)[0]
-            if name in {"127.0.0.1", "localhost"}:
-                return True
-            self.send_error(403)
-            return False
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a page that was closed."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
-        def _answer(self, content: bytes, kind: str) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(content)
 
-        def do_GET(self) -> None:
-            if not self._own():
-                return
-            match self.path:
-                case "/":
-                    self._answer((HERE / "page.html").read_bytes(), "text/html; charset=utf-8")
-                case "/scene":
-                    self._answer(json.dumps(scene.told).encode(), "application/json")
-                case "/frame":
-                    self._answer(scene.image(), "application/octet-stream")
-                case _:
-                    self.send_error(404)
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # or a picture takes 40 ms
 
-        def _values(self) -> dict[str, float]:
-            length = int(self.headers.get("Content-Length", "0"))
-            # A page elsewhere may send text, but no JSON, without being allowed to.
-            if self.headers.get("Content-Type") == "application/json" and 0 < length <= LARGEST:
-                values = {str(k): float(v) for k, v in json.loads(self.rfile.read(length)).items()}
-                if values.keys() <= scene.parameters and np.isfinite(list(values.values())).all():
-                    return values
-            raise ValueError
+    def _own(self) -> bool:
+        """Whether it was asked by this name: a page elsewhere can make its name point here."""
+        name = self.headers.get("Host", "").rsplit(":", 1)[0]
+        if name in {"127.0.0.1", "localhost"}:
+            return True
+        self.send_error(403)
+        return False
 
-        def do_POST(self) -> None:
-            if not self._own():
-                return
-            try:
-                values = self._values()
-            except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-                self.close_connection = True  # what has not been read would be taken for the next request
-                self.send_error(400)
-                return
-            move(values)
-            self._answer(b"{}", "application/json")
+    def _answer(self, content: bytes, kind: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
 
-        def log_message(self, format: str, *arguments: Any) -> None:
+    def do_GET(self) -> None:
+        if not self._own():
             return
+        match self.path:
+            case "/":
+                self._answer((HERE / "page.html").read_bytes(), "text/html; charset=utf-8")
+            case "/scene":
+                self._answer(json.dumps(self.server.scene.told).encode(), "application/json")
+            case "/frame":
+                self._answer(self.server.scene.image(), "application/octet-stream")
+            case _:
+                self.send_error(404)
 
-    class Server(ThreadingHTTPServer):
-        def handle_error(self, request: Any, client_address: Any) -> None:
-            """Say nothing of a page that was closed."""
-            if not isinstance(sys.exception(), ConnectionError):
-                super().handle_error(request, client_address)
+    def _values(self) -> dict[str, float]:
+        length = int(self.headers.get("Content-Length", "0"))
+        # A page elsewhere may send text, but no JSON, without being allowed to.
+        if self.headers.get("Content-Type") == "application/json" and 0 < length <= LARGEST:
+            values = {str(k): float(v) for k, v in json.loads(self.rfile.read(length)).items()}
+            if values.keys() <= self.server.scene.parameters and np.isfinite(list(values.values())).all():
+                return values
+        raise ValueError
 
-    found = Server(listening.getsockname(), Handler, bind_and_activate=False)
-    found.socket.close()
-    found.socket = listening
-    return found
+    def do_POST(self) -> None:
+        if not self._own():
+            return
+        try:
+            values = self._values()
+        except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
+            self.close_connection = True  # what has not been read would be taken for the next request
+            self.send_error(400)
+            return
+        self.server.move(values)
+        self._answer(b"{}", "application/json")
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        return
 
 
 def show(path: str, listening: socket.socket, mail: Mail) -> None:
     """Serve the page of a model whose newest frames come by mail, until that is closed."""
     scene = Scene(load(Path(path)))
-    found = server(scene, listening, mail.send)
+    found = _Server(scene, listening, mail.send)
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:

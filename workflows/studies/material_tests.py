@@ -96,19 +96,44 @@ class DataFile(Settings):
             If the table cannot be read, lacks a column, or holds something that is not a number.
         """
         path = folder / self.file
+        table = self._table(path)
+        tests = self._tests(table, path)
+        if not tests:
+            message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
+            raise StudyError(message)
+        return {
+            "source": list(table.remarks),
+            "tests": [
+                {
+                    "mode": self.modes.get(word, word),
+                    "name": named(word, component),
+                    "group": group,
+                    "stress": self.stress,
+                    "component": component,
+                    **columns,
+                }
+                for (group, word, component), columns in tests.items()
+            ],
+        }
+
+    def _table(self, path: Path) -> Table:
+        """Read the table, which must have all columns that are named."""
         try:
             table = read_table(path)
         except DataError as error:
             raise StudyError(*(f"data.file: {line}" for line in error.args)) from None
-        stresses = self.stresses
         columns = [self.mode, self.at, self.across, self.component, self.group, *self.where]
-        columns += [column for pair in stresses.values() for column in pair]
+        columns += [column for pair in self.stresses.values() for column in pair]
         for column in columns:
             if column is not None and column not in table.columns:
                 message = f"data: {path} has no column '{column}'; {nearest(column, table.columns)}"
                 raise StudyError(message)
-        tests: dict[tuple[str, str, Component], dict[str, list[float]]] = {}
         _refuse_repeats(table, path)
+        return table
+
+    def _tests(self, table: Table, path: Path) -> dict[tuple[str, str, Component], dict[str, list[float]]]:
+        """Return the columns of each test, by its group, the word for its mode and the stress that was measured."""
+        tests: dict[tuple[str, str, Component], dict[str, list[float]]] = {}
         for line, row in zip(table.lines, table.rows, strict=True):
             if any(row[column] != word for column, word in self.where.items()):
                 continue
@@ -136,23 +161,7 @@ class DataFile(Settings):
                 if sigma is not None:
                     width = _number(row[sigma], place, sigma, positive=True)
                     test.setdefault("sigma", []).append(self.unit * width)
-        if not tests:
-            message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
-            raise StudyError(message)
-        return {
-            "source": list(table.remarks),
-            "tests": [
-                {
-                    "mode": self.modes.get(word, word),
-                    "name": named(word, component),
-                    "group": group,
-                    "stress": self.stress,
-                    "component": component,
-                    **columns,
-                }
-                for (group, word, component), columns in tests.items()
-            ],
-        }
+        return tests
 
     @property
     def stresses(self) -> dict[Component, tuple[str, str | None]]:
