@@ -25,11 +25,12 @@ from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_meshes, solved_by
-from workflows.studies.inversion import PREDICTED, Inversion, InversionStudy
+from workflows.studies.inversion import PREDICTED, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
 from workflows.studies.output_inversion import OutputInversion, derivable
 from workflows.studies.predictions import has_mesh
+from workflows.studies.specimen_inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -11,9 +11,10 @@ from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
-    from workflows.studies.inversion import Inversion, InversionStudy
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.measured import Measurement
     from workflows.studies.output_inversion import OutputInversion
+    from workflows.studies.specimen_inversion import Inversion
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
 LISTED = 8  # outputs that are named

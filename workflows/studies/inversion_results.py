@@ -16,7 +16,7 @@ from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
 from workflows.studies.findings_inversion import judged
-from workflows.studies.inversion import Inversion
+from workflows.studies.specimen_inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr
