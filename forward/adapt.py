@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import Field
 
-from forward.fem.cost import estimate, times
+from forward.fem.cost import times
+from forward.fem.mesh_error_cost import estimate
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 

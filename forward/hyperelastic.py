@@ -21,18 +21,9 @@ from forward.bodies.inclusions import too_narrow
 from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.affordable import finer, own_estimate
-from forward.fem.cost import (
-    SINGLE_FROM,
-    Estimate,
-    Linear,
-    Times,
-    factor,
-    held_together,
-    linear_solver,
-    sum_of,
-    times,
-)
+from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Ranges
+from forward.fem.mesh_error_cost import Estimate
 from forward.materials.material import splits
 from forward.model import Finding, FloatArray, ModelError
 from forward.observables.observable import Output

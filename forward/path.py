@@ -15,7 +15,8 @@ from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from forward.fem.cost import Estimate, Times, sum_of
+from forward.fem.cost import Times, sum_of
+from forward.fem.mesh_error_cost import Estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import Finding
 from forward.readable import scale

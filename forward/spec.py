@@ -19,9 +19,9 @@ from forward.words import named
 
 if TYPE_CHECKING:
     from forward.bodies.mesh import Contents
-    from forward.fem.cost import Estimate
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
     from forward.fem.locking import Ranges
+    from forward.fem.mesh_error_cost import Estimate
     from forward.materials.admissible import Materials
     from forward.model import Finding, FloatArray, ForwardModel, NamedOutput
 

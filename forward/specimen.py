@@ -13,8 +13,9 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.bodies.geometry import AXES, Vector, holds
 from forward.fem.affordable import own_estimate
-from forward.fem.cost import Estimate, Times, sum_of
+from forward.fem.cost import Times, sum_of
 from forward.fem.locking import Ranges
+from forward.fem.mesh_error_cost import Estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import Finding, ModelError, SolveError
 from forward.observables.displacement import PointDisplacement

@@ -6,7 +6,8 @@ import math
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from forward.fem.cost import MOST_BYTES, REPORT, START, Estimate, estimate
+from forward.fem.cost import MOST_BYTES, REPORT, START
+from forward.fem.mesh_error_cost import Estimate, estimate
 
 MOST_UNKNOWNS = 40_000
 TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough

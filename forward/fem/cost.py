@@ -14,9 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import cache
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from forward.machine import MIB
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 ENTRIES = 1.4  # of MUMPS over those of the model
 OPERATIONS = 1.6
@@ -81,12 +84,6 @@ DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
 SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
 MOST_BYTES = 4e9  # of factors for estimates, where there is another way
-BLOCKS = 9  # residuals, for the blocks of the nodes
-ACTION = 2  # a product with the stiffness, over a residual
-SMOOTHING, ROUGHLY = 12, 5  # steps in the enriched space, and solves with a factor of the body, of an estimate
-SADDLES = 3  # times as many steps and solves with pressures, of two solutions
-SEVERAL = 3  # estimates among which what comes once is shared, in a choice between ways
-COPIES = 4  # of the matrix, while what preconditions steps is taken from it
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
@@ -353,72 +350,7 @@ def held_together(unknowns: int) -> int:
     return 8 * HELD * unknowns * together(unknowns)
 
 
-class Way(StrEnum):
-    """How the enriched equations are solved."""
-
-    FACTOR = "a factor of their own"
-    REFERENCE = "the factor of a reference, or one of their own where there is none"
-    SMOOTHING = "steps of conjugate gradients and the factor of the body"
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What one estimate of the error of a mesh takes, in elements of one degree more.
-
-    Attributes
-    ----------
-    way
-        How; by sizes, form and degree only.
-    seconds
-        Predicted processor time (s).
-    once
-        What comes once for many, before the first (s): a factor, or what the steps are preconditioned by.
-    bytes
-        Memory.
-    calibration, calibration_bytes
-        What calibrates estimates, once (s), and its memory besides; 0 where no finer mesh does.
-    alone
-        Whether the factor of a reference and one of its own are never kept together, since both would be too large.
-    """
-
-    way: Way
-    seconds: float
-    once: float
-    bytes: float
-    calibration: float = 0.0
-    calibration_bytes: float = 0.0
-    alone: bool = False
-
-
-def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) -> Estimate:
-    """Predict an estimate for a body, and the same in elements of one degree more.
-
-    Steps miss too much of the error of linear elements, which may lock.
-    """
-    coarse, fine = (times(one, mixed=mixed, symmetric=symmetric) for one in (body, enriched))
-    forces = 2 * fine.residual  # in the enriched space, with the outputs
-    factored = fine.assembly + fine.factorisation
-    one = forces + factored + fine.substitution
-    near = forces + ROUGHLY * (fine.substitution + ACTION * fine.residual)
-    steps = SMOOTHING * ACTION * fine.residual + ROUGHLY * (coarse.substitution + ACTION * coarse.residual)
-    smoothed, held = forces + (SADDLES if mixed else 1) * steps, 2 * fine.bytes
-    if one <= min(near, smoothed):
-        return Estimate(Way.FACTOR, one, fine.setup, held)
-    alone = held > MOST_BYTES
-    referred = Estimate(Way.REFERENCE, near, fine.setup + factored, fine.bytes if alone else held, alone=alone)
-    vectors = BYTES_PER_UNKNOWN * 3 * enriched.nodes
-    if mixed and body.cell == "hexahedron":  # whose steps leave a fifth of the error where κ ≫ μ
-        return referred
-    if not mixed:
-        if body.degree == 1 and not alone:
-            return referred
-        return Estimate(Way.SMOOTHING, smoothed, BLOCKS * fine.residual, vectors)
-    matrix = COPIES * BYTES_PER_NONZERO * factor(enriched, mixed=True).nonzeros
-    stepped = Estimate(Way.SMOOTHING, smoothed, fine.setup + fine.assembly, vectors + matrix)
-    return min((referred, stepped), key=lambda way: way.once + SEVERAL * way.seconds)
-
-
-Summed = TypeVar("Summed", Times, Estimate)
+Summed = TypeVar("Summed", bound="DataclassInstance")
 
 
 def sum_of(parts: Sequence[Summed]) -> Summed:

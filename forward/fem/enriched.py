@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from forward.fem.cost import MOST_BYTES, Way, estimate
+from forward.fem.cost import MOST_BYTES
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
 from forward.fem.enriched_equations import EnrichedEquations, Moved, Solved
 from forward.fem.equations import Discretisation
+from forward.fem.mesh_error_cost import Way, estimate
 from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
 

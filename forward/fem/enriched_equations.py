@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from forward.fem.cost import Way, estimate
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.equations import Discretisation
 from forward.fem.linearisation import Preconditioner
+from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.model import FloatArray, ReferenceSolution, Work
 from forward.solvers.anderson import block_galerkin

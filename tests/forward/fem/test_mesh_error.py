@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 
 from forward.external.models import PythonModel
-from forward.fem.cost import Way, estimate
+from forward.fem.mesh_error_cost import Way, estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import FunctionModel, Guess, ReferenceSolution
 from forward.specimen import Specimen
@@ -352,7 +352,7 @@ def test_how_is_decided_by_sizes():
 SCRIPT = """
 import sys
 import numpy as np
-from forward.fem.cost import Way
+from forward.fem.mesh_error_cost import Way
 from tests.bodies import OUTPUTS, loaded_body
 from tests.ranks import groups
 
