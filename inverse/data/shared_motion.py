@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from inverse.data.approximation_error import Whitening
-from inverse.data.registration import Rigid, UncertainMotion, slopes
+from inverse.data.registration import UncertainMotion
+from inverse.data.rigid import Rigid, slopes
 from inverse.fields.low_rank import Spectrum
 from uq.evaluation.request import Evaluate, Request
 

@@ -8,7 +8,7 @@ from forward.bodies.surface import Surface
 from forward.specimen import Specimen
 from inverse.data.approximation_error import Whitening
 from inverse.data.errors import NORMAL, StudentErrors
-from inverse.data.registration import Rigid, exponential
+from inverse.data.rigid import Rigid, exponential
 from inverse.data.shared_motion import SharedMotion, determined
 from inverse.fields.low_rank import Spectrum
 

@@ -17,7 +17,7 @@ from benchmarks import buckling
 from forward.model import FunctionModel, SolveError, Stability
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.observations import Components
-from inverse.data.registration import turned
+from inverse.data.rigid import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.invert import Invert
