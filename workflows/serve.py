@@ -225,6 +225,22 @@ def _first(question: dict[str, Any], *keys: str) -> None:
             raise RefusalError("InvalidInput", message)
 
 
+def _settle(job: _Job, service: Service) -> None:
+    """Answer a request, or say why there is no answer."""
+    try:
+        job.future.set_result(service.answer(job.what, job.question))
+    except KeyboardInterrupt:
+        job.future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
+        raise
+    except RefusalError as refusal:
+        job.future.set_exception(refusal)
+    except ModelError as error:
+        job.future.set_exception(RefusalError("ModelError", str(error), 500))
+    except Exception as error:  # the next request may succeed
+        traceback.print_exc()
+        job.future.set_exception(RefusalError(type(error).__name__, str(error), 500))
+
+
 def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
     """Serve the model of a study until the process is interrupted.
 
@@ -278,18 +294,7 @@ def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool =
                 job = jobs.get(timeout=WAKE)
             except Empty:  # by waking, signals are heard that came just as the wait began
                 continue
-            try:
-                job.future.set_result(service.answer(job.what, job.question))
-            except KeyboardInterrupt:
-                job.future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
-                raise
-            except RefusalError as refusal:
-                job.future.set_exception(refusal)
-            except ModelError as error:
-                job.future.set_exception(RefusalError("ModelError", str(error), 500))
-            except Exception as error:  # the next request may succeed
-                traceback.print_exc()
-                job.future.set_exception(RefusalError(type(error).__name__, str(error), 500))
+            _settle(job, service)
             answered += 1
     except KeyboardInterrupt:
         if not quiet:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -87,17 +87,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     wrong = conflicts(dataset, best)
     if wrong:
         said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
-    changed = []
-    for variant in dataset.variant.values[1:]:
-        other = by_probability(dataset, dataset["variant_log_evidence"].sel(variant=variant))
-        if other[0] != best:
-            changed.append(f"{other[0]} with {variant}")
-        elif other != order:
-            said.append(
-                Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
-            )
-    if changed:
-        said.append(Finding("warning", f"It depends: the most probable is {'; '.join(changed)}."))
+    said += _depends(dataset, order)
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
         said.append(Finding("warning", f"Left-out data are predicted best by {predicts}."))
@@ -115,6 +105,19 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."
         said.append(Finding("warning", text))
     return said
+
+
+def _depends(dataset: xr.Dataset, order: list[str]) -> Iterator[Finding]:
+    """Say under which other priors, errors and parts of the data the order changes, and whether another one wins."""
+    best, changed = order[0], []
+    for variant in dataset.variant.values[1:]:
+        other = by_probability(dataset, dataset["variant_log_evidence"].sel(variant=variant))
+        if other[0] != best:
+            changed.append(f"{other[0]} with {variant}")
+        elif other != order:
+            yield Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+    if changed:
+        yield Finding("warning", f"It depends: the most probable is {'; '.join(changed)}.")
 
 
 def _doubtful(dataset: xr.Dataset, order: list[str]) -> tuple[list[str], int]:
