@@ -192,7 +192,7 @@ def doubts_of_selection(
 
 def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Doubt]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
-    from inverse.criticism import doubts as criticism
+    from inverse.criticism import doubts_of_meshes as of_meshes
 
     of = dataset.sel(model=model, group=group)
     here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
@@ -204,14 +204,14 @@ def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Doubt]:
     )
     if bool(of["mesh_corrected"]):
         of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
-        return criticism.mesh_corrected(error, shifts, left, np.zeros(0), settled=True, from_file=of_file)
+        return of_meshes.mesh_corrected(error, shifts, left, np.zeros(0), settled=True, from_file=of_file)
     why = str(of["mesh_why"].item())
-    return criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
+    return of_meshes.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
-    from inverse.criticism import doubts as criticism
+    from inverse.criticism import doubts_of_meshes as of_meshes
 
     if "mesh_checked" not in dataset:
         return []
@@ -240,9 +240,9 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
     coarse = _too_coarse_for_files(dataset).any("group")
-    doubts = criticism.meshes_not_alike(corrected, unknown)
-    doubts += criticism.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
-    doubts += criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
+    doubts = of_meshes.meshes_not_alike(corrected, unknown)
+    doubts += of_meshes.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
+    doubts += of_meshes.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
 
 
@@ -264,7 +264,7 @@ def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Da
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
-    from inverse.criticism.doubts import certain, decides
+    from inverse.criticism.doubts_of_meshes import certain, decides
 
     if "mesh_checked" not in dataset:
         return dataset
@@ -277,7 +277,7 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
 
 def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
-    from inverse.criticism.doubts import beyond_files
+    from inverse.criticism.doubts_of_meshes import beyond_files
 
     corrected = dataset["mesh_corrected"]
     if "mesh_of_file" not in dataset:

@@ -16,7 +16,7 @@ from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from forward.words import named
 from inverse.criticism.comparison import Data
-from inverse.criticism.doubts import not_estimable
+from inverse.criticism.doubts_of_meshes import not_estimable
 from inverse.data.curves import steps_of
 from inverse.data.measured_model import MeasuredModel
 from inverse.data.outputs import read_outputs, stated

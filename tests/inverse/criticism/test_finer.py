@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.doubts import certain, meshes_not_alike, meshes_too_coarse
+from inverse.criticism.doubts_of_meshes import certain, meshes_not_alike, meshes_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import Places
 from inverse.low_dimensional.laplace import laplace

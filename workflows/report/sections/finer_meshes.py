@@ -36,7 +36,7 @@ class FinerMeshes(Section):
 
 def meshes(dataset: xr.Dataset) -> Table:
     """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
-    from inverse.criticism.doubts import change_in_words
+    from inverse.criticism.doubts_of_meshes import change_in_words
 
     rows = []
     for model in dataset.model.values:
