@@ -208,6 +208,12 @@ class Pooled:
         return np.asarray(np.sum([one.expected(self.cheap[self.rows]) for one in self.pools], axis=0))
 
     @cached_property
+    def answered(self) -> float:
+        """Estimated probability of an answer of model 0."""
+        missing = ~np.isfinite(self.values).all(axis=1)
+        return max(1.0 - float((1 / self.expected[missing]).sum()), 1 / len(self.values))
+
+    @cached_property
     def _parts(self) -> NDArray[np.intp]:
         """The fold of each point (N,)."""
         return np.concatenate([np.arange(one.count) % FOLDS for one in self.pools])
@@ -242,7 +248,10 @@ class Pooled:
         found = combine(offset + middle, terms)
         moved = [b - 2 * mean * a for a, b in parts]
         relative = np.array([uncertainty(one)[1] for one in ([a for a, _ in parts], moved)])
-        factors = [[student(float(d)) / Z for d in np.maximum(2 / np.maximum(one, 1e-9), FREE)] for one in relative]
+        factors = [
+            [student(float(d)) / Z / self.answered for d in np.maximum(2 / np.maximum(one, 1e-9), FREE)]
+            for one in relative
+        ]
         found = replace(found, mean_error=found.mean_error * factors[0], std_error=found.std_error * factors[1])
         for j in range(m):
             T = self._coordinates @ self.slopes[j]

@@ -8,8 +8,9 @@ a fixed value, the samples of both moments are the remainders of regressions
 and their means follow from the groups by `uq.estimators.blue`. The coefficients and the covariances that determine the
 weights come from the samples of all models together. Weights of a sample among these come from the others: they are cut
 into `FOLDS` parts, each weighted by what the rest tells, so that the estimate has no bias from fitted weights, and the
-scatter of what is averaged is an honest error. What few degrees of freedom leave open lengthens it by Student's factor
-(B. L. Welch, Biometrika 34 (1947) 28–35).
+scatter of what is averaged is an honest error. A sample without an answer of model 0 counts as the others do in the
+mean: so the estimate is conditional on an answer, though cheap models were asked everywhere. What few degrees of
+freedom leave open lengthens the error by Student's factor (B. L. Welch, Biometrika 34 (1947) 28–35).
 """
 
 from __future__ import annotations
@@ -27,19 +28,20 @@ from uq.estimators.blue import Group, Problem, informations, weights
 from uq.estimators.moments import Estimates, Term, Z, combine, ratio, student, term
 
 FOLDS = 10  # parts into which the samples of all models are cut
+ROUNDS = 4  # in which the mean stands for answers of model 0 that are missing
 FREE = 3  # degrees of freedom counted at least
 
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of a group that have answers of all its models.
+    """The samples of a group.
 
     Attributes
     ----------
     group
         Its models.
     deviations
-        w_k (n, K, m); zero for models outside the group.
+        w_k (n, K, m); zero for models outside the group, NaN where model 0 has no answer.
     controls
         T_k (n, K, m).
     """
@@ -52,6 +54,23 @@ class Samples:
     def count(self) -> int:
         """Number n of the samples."""
         return len(self.deviations)
+
+    @property
+    def answered(self) -> NDArray[np.bool_]:
+        """At which samples (n,) model 0 has an answer, if it was asked."""
+        return np.asarray(np.isfinite(self.deviations[:, 0]).all(axis=1))
+
+    def filled(self, mean: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return w and w² (n, K, m), with these of model 0 (m,) where it has no answer."""
+        w, squares, missing = self.deviations.copy(), self.deviations**2, ~self.answered
+        w[missing, 0], squares[missing, 0] = mean, square
+        return w, squares
+
+
+def share_answered(samples: Sequence[Samples]) -> float:
+    """Return the share of the samples of model 0 at which it has an answer."""
+    own = np.concatenate([one.answered for one in samples if 0 in one.group])
+    return float(own.mean())
 
 
 @dataclass(frozen=True)
@@ -73,14 +92,14 @@ class Fitted:
     means: FloatArray
 
     @classmethod
-    def of(cls, w: FloatArray, T: FloatArray, V: FloatArray) -> Fitted:
-        """Fit deviations w and controls T (n, K) of all models, with the variances V (K,) of the controls."""
+    def of(cls, w: FloatArray, squares: FloatArray, T: FloatArray, V: FloatArray) -> Fitted:
+        """Fit deviations w, w² and controls T (n, K) of all models, with the variances V (K,) of the controls."""
         n, K = w.shape
         slopes, parts = np.zeros((K, 3)), np.empty((2, n, K))
         for k in range(K):
             slopes[k, 0] = _slopes(w[:, k], T[:, k, None])[0]
-            slopes[k, 1:] = _slopes(w[:, k] ** 2, np.column_stack([T[:, k], T[:, k] ** 2 - V[k]]))
-        first, second = remainders(w, T, V, slopes)
+            slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T[:, k], T[:, k] ** 2 - V[k]]))
+        first, second = remainders(w, squares, T, V, slopes)
         means = first.mean(axis=0)
         parts = np.array([first, second - 2 * means * first])
         used = (slopes != 0).sum(axis=1).max()
@@ -100,10 +119,12 @@ def _slopes(y: FloatArray, x: FloatArray) -> FloatArray:
     return np.asarray(found if helps else np.zeros(q))
 
 
-def remainders(w: FloatArray, T: FloatArray, V: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return r and r' (n, K) of deviations w and controls T (n, K), with V (K,) and the slopes (K, 3)."""
+def remainders(
+    w: FloatArray, squares: FloatArray, T: FloatArray, V: FloatArray, slopes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return r and r' (n, K) of deviations w, w² and controls T (n, K), with V (K,) and the slopes (K, 3)."""
     beta, gamma, delta = slopes.T
-    return w - beta * T, w**2 - gamma * T - delta * (T**2 - V)
+    return w - beta * T, squares - gamma * T - delta * (T**2 - V)
 
 
 @dataclass(frozen=True)
@@ -161,7 +182,7 @@ def folds(whole: Samples, *, inner: bool) -> list[Fold]:
 def estimated(
     samples: Sequence[Samples], offset: FloatArray, variances: FloatArray, apart: Samples | None = None
 ) -> Found:
-    """Estimate the moments of model 0 from groups with at least two samples each.
+    """Estimate the moments of model 0, given that it has an answer, from groups with at least two samples each.
 
     Parameters
     ----------
@@ -174,28 +195,15 @@ def estimated(
     apart
         Samples of all models that tell the weights, and nothing else; by default the first group does.
     """
-    whole = apart or samples[0]
-    groups, counts = [one.group for one in samples], np.array([float(one.count) for one in samples])
-    m = offset.size
-    cut = folds(whole, inner=apart is None)
-    first, second = ([np.zeros((one.count, m)) for one in samples] for _ in range(2))
-    fitted = []
-    for j in range(m):
-        V = variances[:, j]
-        middle = _middle(samples, j)
-        for kept, share in cut:
-            fit = Fitted.of(whole.deviations[kept, :, j], whole.controls[kept, :, j], V)
-            a = [weights(informations(groups, c), counts) for c in fit.covariances]
-            for g, one in enumerate(samples):
-                inner = g == 0 and apart is None
-                rows = ~kept if inner else slice(None)
-                w, T = one.deviations[rows, :, j], one.controls[rows, :, j]
-                portion = 1.0 if inner else share
-                for sums, r, by, centre in zip(
-                    (first, second), remainders(w, T, V, fit.slopes), a, middle, strict=True
-                ):
-                    sums[g][rows, j] += portion * ((r - centre) @ by[g] + (centre[0] if g == 0 else 0.0))
-        fitted.append(Fitted.of(whole.deviations[:, :, j], whole.controls[:, :, j], V))
+    asked = np.concatenate([one.deviations[one.answered, 0] for one in samples if 0 in one.group])
+    mean, square, answered = asked.mean(axis=0), (asked**2).mean(axis=0), share_answered(samples)
+    for _ in range(1 if answered == 1.0 else ROUNDS):
+        first, second, fitted = _combined(samples, apart, variances, (mean, square))
+        mean, square = (np.sum([one.mean(axis=0) for one in parts], axis=0) for parts in (first, second))
+    if answered < 1.0:  # of m = E[w 1]/E[1], to first order
+        first, second = (
+            [one.mean(axis=0) + (one - one.mean(axis=0)) / answered for one in parts] for parts in (first, second)
+        )
     terms = tuple(term(a, b) for a, b in zip(first, second, strict=True))
     found = combine(offset, terms)
     mean = np.sum([one.first for one in terms], axis=0)
@@ -206,13 +214,48 @@ def estimated(
     return Found(estimates, terms, moved, tuple(fitted), np.array(relative))
 
 
-def _middle(samples: Sequence[Samples], j: int) -> tuple[FloatArray, FloatArray]:
+def _combined(
+    samples: Sequence[Samples], apart: Samples | None, variances: FloatArray, missing: tuple[FloatArray, FloatArray]
+) -> tuple[list[FloatArray], list[FloatArray], list[Fitted]]:
+    """Return the summands (n, m) of both moments by group, and the fits by output."""
+    groups, counts = [one.group for one in samples], np.array([float(one.count) for one in samples])
+    known = [one.filled(*missing) for one in samples]
+    whole, (of_all, squares_of_all) = apart or samples[0], apart.filled(*missing) if apart else known[0]
+    m = len(missing[0])
+    cut = folds(whole, inner=apart is None)
+    first, second = ([np.zeros((one.count, m)) for one in samples] for _ in range(2))
+    fitted = []
+    for j in range(m):
+        V = variances[:, j]
+        middle = _middle(groups, known, j)
+        parts = of_all[:, :, j], squares_of_all[:, :, j], whole.controls[:, :, j]
+        for kept, share in cut:
+            fit = Fitted.of(parts[0][kept], parts[1][kept], parts[2][kept], V)
+            a = [weights(informations(groups, c), counts) for c in fit.covariances]
+            for g, (one, (values, squares)) in enumerate(zip(samples, known, strict=True)):
+                inner = g == 0 and apart is None
+                rows = ~kept if inner else slice(None)
+                w, q, T = values[rows, :, j], squares[rows, :, j], one.controls[rows, :, j]
+                portion = 1.0 if inner else share
+                for sums, r, by, centre in zip(
+                    (first, second), remainders(w, q, T, V, fit.slopes), a, middle, strict=True
+                ):
+                    sums[g][rows, j] += portion * ((r - centre) @ by[g] + (centre[0] if g == 0 else 0.0))
+        fitted.append(Fitted.of(*parts, V))
+    return first, second, fitted
+
+
+def _middle(
+    groups: Sequence[Group], known: Sequence[tuple[FloatArray, FloatArray]], j: int
+) -> tuple[FloatArray, FloatArray]:
     """About where the deviations of output j and their squares are (K,): from there weights vary with little effect."""
-    count = samples[0].deviations.shape[1]
+    count = known[0][0].shape[1]
     found = np.zeros((2, count))
     for k in range(count):
-        w = np.concatenate([one.deviations[:, k, j] for one in samples if k in one.group])
-        found[:, k] = w.mean(), (w**2).mean()
+        for row, which in zip(found, range(2), strict=True):
+            row[k] = np.concatenate(
+                [one[which][:, k, j] for one, g in zip(known, groups, strict=True) if k in g]
+            ).mean()
     return found[0], found[1]
 
 

@@ -4,7 +4,8 @@ The share of outputs below a threshold t is the mean of an indicator, which grou
 the output (`uq.estimators.fidelities`): F(t) = Σ_g Σ_k a_gk ⟨1(w_k ≤ t)⟩_g, without bias for any weights that sum to 1
 for model 0 and to 0 for the others. The weights are those for the mean, since a pilot has too few samples in a tail to
 tell others; what scatters is a sample's indicators, so that the error is honest where the weights are not the best. Of
-few samples in which the indicators of two models differ, half a sample more is counted. Models are compared at the same
+few samples in which the indicators of two models differ, half a sample more is counted. Where model 0 has no answer,
+F(t) stands for its indicator, as the mean for its output in `uq.estimators.fidelities`. Models are compared at the same
 distance from their outputs at the mean parameters.
 """
 
@@ -13,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.blue import informations, weights
+from uq.estimators.blue import Group, informations, weights
 from uq.estimators.chosen import Chosen, Pooled
-from uq.estimators.fidelities import Samples, folds
+from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
 from uq.estimators.quantiles import Quantiles, quantiles_of_shares
 
 THRESHOLDS = 129
@@ -43,7 +45,8 @@ def quantiles_of_groups(
     """
 
     def known(j: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        thresholds = _thresholds(np.concatenate([one.deviations[:, list(one.group), j].ravel() for one in samples]))
+        every = np.concatenate([one.deviations[:, list(one.group), j].ravel() for one in samples])
+        thresholds = _thresholds(every[np.isfinite(every)])
         return thresholds, *below(samples, j, thresholds, apart)
 
     return _between(known, offset, probabilities)
@@ -61,15 +64,19 @@ def quantiles_of_chosen(
     def known(j: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         values = found.predicted[:, j]
         thresholds = _thresholds(np.concatenate([values, pooled.values[ok, j]]))
-        parts = (values[:, None] <= thresholds) / len(values)
-        rows, weights = pooled.rows[ok], 1 / pooled.expected[ok, None]
-        parts[rows] += weights * (
-            (pooled.values[ok, j, None] <= thresholds).astype(float) - (values[rows, None] <= thresholds)
-        )
-        variance = FEWER / len(rows) ** 2 + np.zeros(len(thresholds))
+        predicted = (values[:, None] <= thresholds).astype(float)
+        rows, weights = pooled.rows, 1 / pooled.expected[:, None]
+        inside = (pooled.values[:, j, None] <= thresholds).astype(float)
+        share = inside[ok].mean(axis=0)
+        for _ in range(1 if ok.all() else ROUNDS):
+            inside[~ok] = share
+            parts = predicted / len(values)
+            parts[rows] += weights * (inside - predicted[rows])
+            share = parts.sum(axis=0)
+        variance = FEWER / ok.sum() ** 2 + np.zeros(len(thresholds))
         for a, b in zip(pooled.starts[:-1], pooled.starts[1:], strict=True):
             variance += parts[a:b].var(axis=0, ddof=1) * (b - a)
-        return thresholds, parts.sum(axis=0), np.sqrt(variance)
+        return thresholds, share, np.sqrt(variance) / pooled.answered
 
     return _between(known, offset, probabilities)
 
@@ -102,25 +109,44 @@ def below(
     """Return the shares (t,) of output j of model 0 below thresholds (t,), as deviations, and their standard errors."""
     whole = apart or samples[0]
     groups, counts = [one.group for one in samples], np.array([float(one.count) for one in samples])
-    parts = [np.zeros((one.count, len(thresholds))) for one in samples]
     indicators = [(one.deviations[:, :, j, None] <= thresholds).astype(float) for one in samples]
-    middle = np.array(
-        [
-            np.concatenate([i[:, k] for i, one in zip(indicators, samples, strict=True) if k in one.group]).mean(axis=0)
-            for k in range(whole.deviations.shape[1])
-        ]
-    )
-    for kept, portion_of in folds(whole, inner=apart is None):
-        w = whole.deviations[kept, :, j]
-        a = weights(informations(groups, np.atleast_2d(np.cov(w.T))), counts)
-        for g, (found, values) in enumerate(zip(parts, indicators, strict=True)):
-            inner = g == 0 and apart is None
-            rows = ~kept if inner else slice(None)
-            portion = 1.0 if inner else portion_of
-            group = list(groups[g])
-            combined = np.tensordot(values[rows][:, group] - middle[group], a[g][group], (1, 0))
-            found[rows] += portion * (combined + (middle[0] if g == 0 else 0.0))
-    share = np.sum([one.mean(axis=0) for one in parts], axis=0)
+    answered = [one.answered for one in samples]
+    own = [g for g, group in enumerate(groups) if 0 in group]
+    share = np.concatenate([indicators[g][answered[g], 0] for g in own]).mean(axis=0)
+    cut = []
+    for kept, portion in folds(whole, inner=apart is None):
+        w = whole.deviations[kept & whole.answered, :, j]
+        cut.append((kept, portion, weights(informations(groups, np.atleast_2d(np.cov(w.T))), counts)))
+    for _ in range(1 if all(one.all() for one in answered) else ROUNDS):
+        for g in own:
+            indicators[g][~answered[g], 0] = share
+        parts = _parts(indicators, groups, cut, inner=apart is None)
+        share = np.sum([one.mean(axis=0) for one in parts], axis=0)
     variance = np.sum([one.var(axis=0, ddof=1) / len(one) for one in parts], axis=0)
     variance += sum(FEWER / len(one) ** 2 for one, group in zip(parts, groups, strict=True) if 0 in group)
-    return share, np.sqrt(variance)
+    return share, np.sqrt(variance) / share_answered(samples)
+
+
+def _parts(
+    indicators: Sequence[FloatArray],
+    groups: Sequence[Group],
+    cut: Sequence[tuple[NDArray[np.bool_], float, FloatArray]],
+    *,
+    inner: bool,
+) -> list[FloatArray]:
+    """Return the summands (n, t) of the shares by group, from indicators (n, K, t) and the weights of each fold."""
+    parts = [np.zeros((len(one), one.shape[2])) for one in indicators]
+    middle = np.array(
+        [
+            np.concatenate([i[:, k] for i, group in zip(indicators, groups, strict=True) if k in group]).mean(axis=0)
+            for k in range(indicators[0].shape[1])
+        ]
+    )
+    for kept, share, a in cut:
+        for g, (found, values) in enumerate(zip(parts, indicators, strict=True)):
+            of_fold = g == 0 and inner
+            rows = ~kept if of_fold else slice(None)
+            group = list(groups[g])
+            combined = np.tensordot(values[rows][:, group] - middle[group], a[g][group], (1, 0))
+            found[rows] += (1.0 if of_fold else share) * (combined + (middle[0] if g == 0 else 0.0))
+    return parts

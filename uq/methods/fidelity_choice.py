@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from forward.model import Finding, FloatArray
 from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.doubts import of_tails
-from uq.estimators.fidelities import Found, correlations, ok_rows
+from uq.estimators.fidelities import Found, correlations
 from uq.estimators.fidelity_quantiles import quantiles_of_chosen
 from uq.estimators.moments import Estimates, ratio
 from uq.estimators.quantiles import Quantiles
@@ -74,19 +74,14 @@ class ByChoice:
         return self.found.estimates
 
     def _pool(self, taken: Taken, asked: NDArray[np.intp]) -> _Taken:
-        """A pool whose points are all chosen, or none yet, without those where a cheap model has no answer."""
+        """A pool whose points are all chosen, or none yet."""
         team = self._team
-        deviations = taken.values - team.offsets
-        ok = self._answered(taken)
-        chosen = np.zeros(len(ok), dtype=bool)
-        chosen[asked] = ok[asked]
-        t = team.members[0].centre.coordinates.of(taken.points[ok])
-        places = np.flatnonzero(chosen[ok])
-        return _Taken(Pool(deviations[ok, 1:], t, places, deviations[ok, 0][places]), taken, chosen)
-
-    def _answered(self, taken: Taken) -> NDArray[np.bool_]:
-        """Which points (n,) have answers of all cheap models."""
-        return ok_rows(taken.values, self._team.groups[self._all])
+        deviations = team.deviations(taken)
+        chosen = np.zeros(len(taken.points), dtype=bool)
+        chosen[asked] = True
+        t = team.members[0].centre.coordinates.of(taken.points)
+        places = np.flatnonzero(chosen)
+        return _Taken(Pool(deviations[:, 1:], t, places, deviations[places, 0]), taken, chosen)
 
     def _pooled(self) -> Pooled:
         pools = [one.pool for one in self._pools]
@@ -160,8 +155,7 @@ class ByChoice:
         taken = team.drawn(self._all, sum(len(one.taken.points) for one in self._pools), count)
         bare = self._pool(taken, np.empty(0, dtype=int))
         start = float(random_points((team.seed, len(team.groups) + 1), number, number + 1, 1)[0, 0])
-        floor, intensity, places = choice(design, bare.pool.cheap, full, start)
-        rows = np.flatnonzero(self._answered(taken))[places]
+        floor, intensity, rows = choice(design, bare.pool.cheap, full, start)
         taken.values[rows, 0] = team.solved(0, taken.points[rows], taken.reasons)
         pool = self._pool(taken, rows)
         pool = replace(pool, pool=replace(pool.pool, design=design, floor=floor, intensity=intensity))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray
 from uq.estimators.fidelities import Found, correlations
@@ -19,6 +20,7 @@ from uq.surrogates.linearisation import local_dataset
 if TYPE_CHECKING:
     import xarray as xr
 
+KNOWN = 10  # failures at samples of the study's model that tell how much they matter
 UNRELATED = 0.1  # squared correlation of remainders up to which a cheap model is of no use
 
 
@@ -66,20 +68,55 @@ def described(
     dataset = dataset.assign_coords(alternative=list(others))
     dataset = dataset.assign(alternative_solves=(("alternative", "output"), np.array(list(others.values()))))
     add(dataset, compared(others, team.spent, expanded_used=isinstance(way, ByExpansion)))
-    failed = int(dataset["group_failed"].sum())
-    if failed:
-        total = int(sizes_of.sum())
-        dataset.attrs["note"] = (
-            f"{failed} of {total} samples have no answer of all models of their group; estimates are over the others, "
-            "that is, conditional on the models having an answer"
+    values = np.isfinite(dataset["fidelity_values"].to_numpy()).all(axis=2)
+    asked = np.repeat(inside, sizes_of, axis=0)
+    lost, filled = int((asked & ~values)[:, 0].sum()), int((asked & ~values)[:, 1:].any(axis=1).sum())
+    told = []
+    if lost:
+        told.append(
+            f"{lost} of {int(asked[:, 0].sum())} samples of the study's model have no answer; estimates are over "
+            "the others, that is, conditional on it having one"
         )
+    if filled:
+        told.append(
+            f"at {filled} samples a cheap model has no answer; its tangent stands for it, which causes no bias"
+            if team.controlled
+            else f"at {filled} samples a cheap model has no answer; its value at the mean stands for it, without bias"
+        )
+    if told:
+        dataset.attrs["note"] = "; ".join(told)
+    add(dataset, *rarely_failing(team, asked, values))
     return dataset
+
+
+def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bool_]) -> Iterator[Finding]:
+    """Find cheap models that fail at few of the samples of the study's model, which tell what is missed there.
+
+    Parameters
+    ----------
+    team
+        The models.
+    asked, answered
+        Which models were asked at each sample (n, K), and have an answer there.
+    """
+    for k, one in enumerate(team.members[1:], 1):
+        failed = asked[:, k] & ~answered[:, k]
+        few = int((failed & asked[:, 0]).sum())
+        if failed.any() and few < KNOWN:
+            share = f"{int(failed.sum())} of {int(asked[:, k].sum())} samples"
+            yield Finding(
+                "warning",
+                f"The cheap model '{one.label}' has no answer at {share}, and the study's model was asked at {few} of "
+                "these: so few tell little of what is missed there, and errors may be too small. Leave it out, or take "
+                "more samples.",
+            )
 
 
 def plain_correlations(team: Team) -> FloatArray:
     """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
     samples = team.samples(PILOT if PILOT in team.taken else 0)
-    centred = samples.deviations - samples.deviations.mean(axis=0)
+    deviations = samples.deviations[samples.answered]
+    centred = deviations - deviations.mean(axis=0)
     return correlations(np.einsum("nkm,nlm->mkl", centred, centred))
 
 

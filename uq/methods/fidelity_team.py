@@ -184,29 +184,38 @@ class Team:
         """Numbers of samples (G,) of the groups that count."""
         return np.array([float(len(self.taken[g].points)) if g in self.taken else 0.0 for g in range(len(self.groups))])
 
-    def ok(self, g: int) -> NDArray[np.bool_]:
-        """Which samples (n,) of a group have answers of all its models."""
-        return ok_rows(self.taken[g].values, self.groups[max(g, 0)])
+    def deviations(self, taken: Taken) -> FloatArray:
+        """Return the deviations (n, K, m) of all models at points; NaN where the study's model has no answer.
+
+        The tangent stands for a cheap model that has none: whatever is taken for it there is right, as long as it is
+        taken everywhere. Leaving such points out would estimate something else.
+        """
+        found = taken.values - self.offsets
+        tangent = self._controls(taken.points)
+        found[:, 1:] = np.where(np.isfinite(found[:, 1:]), found[:, 1:], tangent[:, 1:])
+        return np.asarray(found)
+
+    def _controls(self, points: FloatArray) -> FloatArray:
+        t = self.members[0].centre.coordinates.of(points)
+        return np.array([t @ slopes.T for slopes in self.slopes]).swapaxes(0, 1)
 
     def samples(self, g: int) -> Samples:
-        """Return the samples of a group that have answers of all its models.
+        """Return the samples of a group.
 
         Raises
         ------
         SolveError
-            If there are fewer than two.
+            If the study's model has fewer than two answers.
         """
-        taken, ok, group = self.taken[g], self.ok(g), self.groups[max(g, 0)]
-        if ok.sum() < 2:
-            names = ", ".join(self.members[k].label for k in group)
+        taken, group = self.taken[g], self.groups[max(g, 0)]
+        inside = np.isin(np.arange(len(self.members)), group)[:, None]
+        deviations = np.where(inside, self.deviations(taken), 0.0)
+        found = Samples(group, deviations, np.where(inside, self._controls(taken.points), 0.0))
+        if found.answered.sum() < 2:
             reasons = "; ".join(sorted(taken.reasons)[:3])
-            message = f"{ok.sum()} of {len(ok)} samples have an answer of {names}, expected 2: {reasons}"
+            message = f"{found.answered.sum()} of {found.count} samples have an answer, expected 2: {reasons}"
             raise SolveError(message)
-        t = self.members[0].centre.coordinates.of(taken.points[ok])
-        inside = np.isin(np.arange(len(self.members)), group)
-        deviations = np.where(inside[:, None], taken.values[ok] - self.offsets, 0.0)
-        controls = np.array([t @ slopes.T for slopes in self.slopes]).swapaxes(0, 1)
-        return Samples(group, deviations, np.where(inside[:, None], controls, 0.0))
+        return found
 
 
 def _known(one: CheapModel, cost: float | None) -> float:

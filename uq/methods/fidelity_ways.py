@@ -128,7 +128,9 @@ class ByModels:
         counted = sorted(g for g in team.taken if g != PILOT) or [PILOT]
         largest = max(range(len(counted)), key=lambda i: float(_share(found, i).max()))
         g = counted[largest]
-        values = team.taken[g].values[team.ok(g)][:, team.groups[max(g, 0)][0]]
+        samples = team.samples(g)
+        values, ok = samples.deviations[:, samples.group[0]], samples.answered
+        values = team.offsets[samples.group[0]] + np.where(ok[:, None], values, values[ok].mean(axis=0))
         yield from of_tails(team.evaluate.outputs, values, found.estimates.relative_std_error, found.moved[largest])
 
 
@@ -190,8 +192,12 @@ class ByExpansion:
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs, of the samples of the study's model alone."""
-        samples = self._team.samples(self._own)
-        return quantiles(self._team.offsets[0] + samples.deviations[:, 0], probabilities)
+        return quantiles(self._values()[1], probabilities)
+
+    def _values(self) -> tuple[FloatArray, FloatArray]:
+        """Points (n, d) and outputs (n, m) of samples of the study's model alone that have an answer."""
+        samples, taken = self._team.samples(self._own), self._team.taken[self._own]
+        return taken.points[samples.answered], taken.values[samples.answered, 0]
 
     @property
     def _own(self) -> int:
@@ -216,9 +222,9 @@ class ByExpansion:
         if not count:
             return
         team.take(self._own, count)
-        ok = team.ok(self._own)
-        points, values = team.taken[self._own].points[ok], team.samples(self._own).deviations[:, 0]
         offset = team.offsets[0]
+        points, values = self._values()
+        values = values - offset
         # The expansion is one of deviations from the solution at the mean parameters.
         centre = team.members[0].centre.outputs
         L, _ = self._control.predict(self._control.features(points), self._fitted.outputs)
@@ -237,7 +243,7 @@ class ByExpansion:
     def doubts(self) -> Iterator[Finding]:
         """Find what a few samples decide."""
         team = self._team
-        values = team.taken[self._own].values[team.ok(self._own)][:, 0]
+        values = self._values()[1]
         relative = self.estimates.relative_std_error
         yield from of_tails(team.evaluate.outputs, values, relative, self._moved, expanded=True)
 
@@ -254,13 +260,13 @@ def sizes(estimates: Estimates) -> FloatArray:
 
 def with_tails(team: Team, found: Estimates, moved: tuple[FloatArray, ...]) -> Estimates:
     """Return estimates with errors of standard deviations that count tails beyond the samples."""
-    own = [g for g in team.taken if 0 in team.groups[max(g, 0)]]
-    values = np.concatenate([team.taken[g].values[team.ok(g)][:, 0] for g in own])
+    values = own_values(team)
     tails = [of_influences(found, team.inputs, one) for one in moved]
     tails[0] = np.maximum(tails[0], unseen(team.inputs, values) * found.std)
     return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
 
 
 def own_values(team: Team) -> FloatArray:
-    """Outputs (n, m) of the study's model in samples with answers of all models of their group."""
-    return np.concatenate([one.taken.values[one.ok][:, 0] for one in team.blocks() if 0 in one.group])
+    """Outputs (n, m) of the study's model in samples in which it has an answer."""
+    values = np.concatenate([one.taken.values[:, 0] for one in team.blocks() if 0 in one.group])
+    return np.asarray(values[np.isfinite(values).all(axis=1)])

@@ -65,8 +65,9 @@ class AtOnce(Recorder):
     def __call__(self, request):
         if len(request.points) == 1:
             return super().__call__(request)
-        one = super().__call__(replace(request, points=request.points[:1]))
         values, n = self._function(request.points), len(request.points)
+        some = int(np.isfinite(values).all(axis=1).argmax())
+        one = super().__call__(replace(request, points=request.points[some, None]))
         many = {name: np.repeat(getattr(one, name), n, axis=0) for name in ("seconds", "work", "residuals")}
         many |= {name: np.repeat(getattr(one, name), n, axis=0) for name in ("converged", "stability")}
         return replace(one, points=request.points, outputs=values, **many)
@@ -275,7 +276,8 @@ def test_failures_of_any_model_are_recorded():
     broken = FunctionModel(fails, ("a", "b"), ("f", "g"))
     data = Multifidelity(samples=60, cheap=cheap(0.05), control="none").run(INPUTS, team(broken))
     assert data["group_failed"].sum() == (~data["ok"]).sum() > 0
-    assert "have no answer of all models of their group" in data.attrs["note"]
+    assert "a cheap model has no answer; its value at the mean stands for it" in data.attrs["note"]
+    assert "The cheap model 'c1' has no answer at" in texts(data)
     assert np.isfinite(data["mean"]).all()
 
     def never(p):
@@ -283,6 +285,43 @@ def test_failures_of_any_model_are_recorded():
 
     with pytest.raises(SolveError, match="c1: the model has no answer at the mean parameters: never"):
         Multifidelity(samples=60, cheap=cheap(0.05)).run(INPUTS, team(FunctionModel(never, ("a", "b"), ("f", "g"))))
+
+
+def without(function, missing):
+    return lambda x: np.where(missing(x)[:, None], np.nan, function(x))
+
+
+@pytest.mark.parametrize(("fails", "bends"), [("cheap", 1), ("own", 1), ("own", 2)])
+def test_where_a_model_fails_the_others_cause_no_bias(fails, bends):
+    """A cheap model may fail anywhere; where the study's does, estimates are those of the points where it does not."""
+
+    def stiff(x):
+        return x[:, 0] > 0.85
+
+    own, cheaper = waves(0.3, 0.0), [waves(0.27, 0.1), waves(0.2, 0.05)][:bends]
+    evaluate = AtOnce(
+        without(own, stiff) if fails == "own" else own,
+        {f"c{i}": AtOnce(without(one, stiff) if fails == "cheap" else one) for i, one in enumerate(cheaper, 1)},
+    )
+    top = 0.85 if fails == "own" else 1.0
+    x = (np.arange(400) + 0.5) / 400
+    every = own(np.stack(np.meshgrid(top * x, x), axis=-1).reshape(-1, 2))
+    truth = every.mean(), every.std(), *np.quantile(every, [0.5, 0.95])
+    held, errors = [], []
+    full = "differences" if bends == 2 else "evenly"
+    for seed in range(30):
+        method = Multifidelity(
+            samples=80, cheap=cheap(*[0.1, 0.05][:bends]), control="none", full_solves=full, seed=seed
+        )
+        data = method.run(INPUTS, evaluate)
+        quantiles = [data[name].sel(quantile=[0.5, 0.95]).values[:, 0] for name in ("quantiles", "quantiles_error")]
+        found = np.array([*(data[n].values[0] for n in ("mean", "std")), *quantiles[0]])
+        claimed = np.array([*(data[n].values[0] for n in ("mean_error", "std_error")), *quantiles[1]])
+        errors.append(found - truth)
+        held.append(np.abs(found - truth) < 2 * claimed)
+    mean = np.mean(errors, axis=0)[:2]
+    assert (np.abs(mean) < 3.5 * np.std(errors, axis=0)[:2] / np.sqrt(len(errors))).all()
+    assert (np.mean(held, axis=0) > 0.85).all(), np.mean(held, axis=0)
 
 
 def test_a_cost_that_cannot_be_predicted_is_asked_for():
