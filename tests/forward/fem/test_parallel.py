@@ -1,5 +1,7 @@
 """A model spread over several ranks gives what one rank gives."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from tests.launch import run_script
 pytestmark = [pytest.mark.fem, pytest.mark.mpi]
 
 SCRIPT = """
+import json
 import sys
 import numpy as np
 from forward.conformance import check_derivatives
@@ -28,11 +31,12 @@ def solve(material, comm):
     values = np.array([scalar.value for scalar in spec.scalars.values()])
     model = spec.build(comm, parameters)
 
-    try:
-        model.solve(np.where(np.array(parameters) == "loads.gravity.density", 1e9, values))
-    except SolveError as error:
-        reasons = comm.allgather(str(error))
-    assert len(set(reasons)) == 1, reasons
+    if comm.size == 3:  # it takes hundreds of factorisations
+        try:
+            model.solve(np.where(np.array(parameters) == "loads.gravity.density", 1e9, values))
+        except SolveError as error:
+            reasons = comm.allgather(str(error))
+        assert len(set(reasons)) == 1, reasons
 
     solution = model.solve(values)
     state = model.space.gather(solution.state[None])
@@ -62,30 +66,33 @@ def solve(material, comm):
         "cells": cells,
     }
 
-for comm in groups(1, 2, 3):
-    for material in sys.argv[2:]:
+for comm in groups(*map(int, sizes := json.loads(sys.argv[2]))):
+    for material in sizes[str(comm.size)]:
         arrays = solve(material, comm)
         if comm.rank == 0:
             np.savez(f"{sys.argv[1]}/{material} {comm.size}.npz", **arrays)
 """
 SHAPES = ("mooney-rivlin", "neo-hookean", *MIXED)  # hexahedra and tetrahedra
+SOME = ("mooney-rivlin", "neo-hookean mixed")  # hexahedra and tetrahedra, displacements and pressures
 
 
-@pytest.fixture(scope="module")
-def solved(tmp_path_factory):
-    """What is found of each material on 1, 2 and 3 ranks."""
-    place = tmp_path_factory.mktemp("solved")
-    done = run_script(3, SCRIPT, place, *SHAPES, timeout=1200)  # compiling all forms takes minutes
+def solved(place, sizes):
+    """What is found on groups of ranks: of each material that is named for their number."""
+    done = run_script(max(sizes), SCRIPT, place, json.dumps(sizes), timeout=1200)  # compiling all forms takes minutes
     assert done.returncode == 0, done.stdout + done.stderr
-    return {ranks: [dict(np.load(place / f"{shape} {ranks}.npz")) for shape in SHAPES] for ranks in (1, 2, 3)}
+    return {ranks: {shape: dict(np.load(place / f"{shape} {ranks}.npz")) for shape in sizes[ranks]} for ranks in sizes}
 
 
-@pytest.mark.parametrize("ranks", [2, 3])
-def test_ranks_agree_with_one(solved, ranks):
-    for found, expected in zip(solved[ranks], solved[1], strict=True):
+@pytest.mark.parametrize(
+    "sizes", [{1: SHAPES, 2: SHAPES, 3: SOME}, pytest.param({1: SHAPES, 3: SHAPES}, marks=pytest.mark.slow)]
+)
+def test_ranks_agree_with_one(tmp_path, sizes):
+    one, *shared = solved(tmp_path, sizes).values()
+    for shape, found in (pair for group in shared for pair in group.items()):
+        expected = one[shape]
         np.testing.assert_allclose(found["coordinates"], expected["coordinates"], rtol=0, atol=1e-14)
         np.testing.assert_array_equal(found["cells"], expected["cells"])
         np.testing.assert_allclose(found["outputs"], expected["outputs"], rtol=1e-9)
         for name in ("state", "slopes", "tangents", "gradients"):
-            sizes = np.abs(expected[name]).max(axis=-1, keepdims=True)
-            np.testing.assert_allclose(found[name] / sizes, expected[name] / sizes, rtol=0, atol=1e-9, err_msg=name)
+            scales = np.abs(expected[name]).max(axis=-1, keepdims=True)
+            np.testing.assert_allclose(found[name] / scales, expected[name] / scales, rtol=0, atol=1e-9, err_msg=name)
