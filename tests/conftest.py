@@ -2,9 +2,15 @@
 
 import sys
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+if find_spec("cftime") is None:
+    # For each dataset xarray looks for it twenty times, which takes as long as the study of a small model in a test:
+    # pytest's own search for modules comes on top. Python does not search for what is known to be absent.
+    sys.modules["cftime"] = None
 
 
 def pytest_configure(config):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -80,6 +80,7 @@ def _table() -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
         return table["poly"].astype(np.uint64), table["vinit"].astype(np.uint64)
 
 
+@lru_cache(maxsize=16)
 def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
     """Return the first direction numbers (count, d) of Sobol' points, of `BITS` bits.
 
@@ -102,7 +103,9 @@ def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
                 chosen = polynomials[columns] >> np.uint64(degree - back) & np.uint64(1)
                 new ^= chosen * (found[row - back, columns] << np.uint64(back))
             found[row, columns] = new
-    return np.asarray(found << (BITS - 1 - np.arange(count)).astype(np.uint64)[:, None], dtype=np.uint64)
+    found <<= (BITS - 1 - np.arange(count)).astype(np.uint64)[:, None]
+    found.flags.writeable = False  # all scrambles begin with it
+    return found
 
 
 def _scramble(directions: NDArray[np.uint64], random: np.random.Generator) -> tuple[NDArray[np.uint64], ...]:
