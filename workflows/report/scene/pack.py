@@ -14,8 +14,6 @@ import numpy as np
 
 from forward.model import FloatArray
 
-FINEST = 2**30  # steps from one end of an array to the other
-
 
 @dataclass
 class Packer:
