@@ -103,12 +103,12 @@ def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bo
         failed = asked[:, k] & ~answered[:, k]
         few = int((failed & asked[:, 0]).sum())
         if failed.any() and few < KNOWN:
-            share = f"{int(failed.sum())} of {int(asked[:, k].sum())} samples"
+            lost, of = int(failed.sum()), int(asked[:, k].sum())
             yield Finding(
                 "warning",
-                f"The cheap model '{one.label}' has no answer at {share}, and the study's model was asked at {few} of "
-                "these: so few tell little of what is missed there, and errors may be too small. Leave it out, or take "
-                "more samples.",
+                f"The cheap model '{one.label}' has no answer at {lost} of {of} samples, and the study's model was asked "
+                f"at {few} of these: so few tell little of what is missed there, and errors may be too small. Leave it "
+                "out, or take more samples.",
             )
 
 
