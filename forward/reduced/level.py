@@ -18,6 +18,7 @@ from forward.reduced.data import LevelData, Output, Points, ReducedData
 from forward.reduced.kernels import spread
 
 LENGTH = 3  # in place of an axis
+LEAST = 0.1  # of the forces of the largest snapshot: below, forces that are left are measured against this
 
 
 class Level:
@@ -49,6 +50,8 @@ class Level:
         outputs = data.outputs if which is None else [data.outputs[i] for i in which]
         self._outputs = [_of_output(output, self, p) for output in outputs]
         self.free = slice(self.before, self.count)
+        # In the norm of the modes forces are as large as coordinates; without loads they cancel to nothing.
+        self.least = LEAST * float(np.abs(data.coordinates[:, self.free]).max(initial=0.0))
 
     @cached_property
     def pressures(self) -> int:
@@ -97,7 +100,7 @@ class Level:
         every = np.array(parts)
         R = every.sum(axis=0)
         largest = float(np.abs(every[:, self.free]).max(initial=0.0))
-        return R, max(largest, float(np.abs(R[: self.before]).max(initial=0.0)))
+        return R, max(largest, float(np.abs(R[: self.before]).max(initial=0.0)), self.least)
 
     def by_parameters(self, c: FloatArray, parameters: FloatArray, K: FloatArray) -> FloatArray:
         """Return the derivatives (N, d) of the forces by the parameters at coordinates of the modes that stay."""

@@ -106,9 +106,9 @@ def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bo
             lost, of = int(failed.sum()), int(asked[:, k].sum())
             yield Finding(
                 "warning",
-                f"The cheap model '{one.label}' has no answer at {lost} of {of} samples, and the study's model was asked "
-                f"at {few} of these: so few tell little of what is missed there, and errors may be too small. Leave it "
-                "out, or take more samples.",
+                f"The cheap model '{one.label}' has no answer at {lost} of {of} samples, and the study's model was "
+                f"asked at {few} of these: so few tell little of what is missed there, and errors may be too small. "
+                "Leave it out, or take more samples.",
             )
 
 

@@ -124,6 +124,16 @@ def test_a_study_of_it_gives_what_the_body_gives(folder, looked_at, chromium):
         slid(chromium, folder / "used" / "report.html", folder / "model.npz")
 
 
+def test_without_loads_nothing_moves(folder):
+    """Forces are measured against those of the snapshots where there are none: loads may be random around zero."""
+    data = load_model(folder / "model.npz")
+    for tested in (True, False):
+        model = ReducedModel(data, data.parameters, tested=tested)
+        points = np.array([[900.0, 0.0], [1100.0, 1e-12]])
+        for found in (*model.solve_many(points), *map(model.solve, points)):
+            assert np.abs(found.outputs).max() < 1e-9
+
+
 def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):
     (folder / "beyond.toml").write_text(USED.format(upper=2000, more=""))
     said = [one.text for one in load(folder / "beyond.toml").findings]
