@@ -6,6 +6,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import pytest
 import xarray as xr
 
 from forward.native import library
@@ -13,6 +14,8 @@ from forward.native import library
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
 NOT_KEPT = "PYTHONDONTWRITEBYTECODE"
+# What two ranks of a body share well they share as three: one test of all its forms is enough of that between changes.
+UP_TO_RANKS = pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 HANGS = 900  # s, after which a program hangs: busy machines that compile all forms are slow
 # Ranks that wait for others ask MPI again and again, and yield in between: with more ranks than cores, that takes more
 # of the cores than what they wait for. Asleep for a moment instead of yielding, they take next to nothing.

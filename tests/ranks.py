@@ -10,9 +10,12 @@ from uq.evaluation.turns import gather_here
 
 
 def groups(*sizes):
-    """The first ranks of the job, as many as each size says, one group after another; the other ranks sleep."""
+    """The first ranks of the job, as many as each size says, one group after another; the other ranks sleep.
+
+    Without sizes, from one rank up to all.
+    """
     world = MPI.COMM_WORLD
-    for size in sizes:
+    for size in sizes or range(1, world.size + 1):
         comm = world.Split(0 if world.rank < size else MPI.UNDEFINED, world.rank)
         if comm != MPI.COMM_NULL:
             assert comm.size == size

@@ -14,7 +14,7 @@ from forward.model import FunctionModel, Guess, ReferenceSolution
 from forward.specimen import Specimen
 from inverse.data.measured_model import MeasuredModel
 from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
-from tests.launch import ROOT, run_script
+from tests.launch import ROOT, UP_TO_RANKS, run_script
 from tests.meshes import box
 from workflows.config.study import load as loaded
 
@@ -356,7 +356,7 @@ from forward.fem.mesh_error_cost import Way
 from tests.bodies import OUTPUTS, loaded_body
 from tests.ranks import groups
 
-for comm in groups(1, 2, 3):
+for comm in groups():
     for form in ("neo-hookean mixed", "mooney-rivlin", "demiray"):
         spec = loaded_body(form, body={"cells": (3, 2, 2)}, outputs=OUTPUTS[:4])
         model = spec.build(comm, ())
@@ -377,10 +377,11 @@ SHAPES = ("neo-hookean mixed", "mooney-rivlin", "demiray")
 
 
 @pytest.mark.mpi
-def test_ranks_agree(tmp_path):
-    done = run_script(3, SCRIPT, tmp_path)
+@UP_TO_RANKS
+def test_ranks_agree(tmp_path, ranks):
+    done = run_script(ranks, SCRIPT, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    found = [[dict(np.load(tmp_path / f"{form} {ranks}.npz")) for form in SHAPES] for ranks in (1, 2, 3)]
+    found = [[dict(np.load(tmp_path / f"{form} {n}.npz")) for form in SHAPES] for n in range(1, ranks + 1)]
     for other in found[1:]:
         for here, expected in zip(other, found[0], strict=True):
             for name, values in expected.items():

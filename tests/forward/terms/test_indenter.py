@@ -13,7 +13,7 @@ from forward.model import Guess, ReferenceSolution, SolveError
 from forward.terms import tools
 from forward.terms.indenter import Indenter
 from tests.bodies import energy_density
-from tests.launch import run_script
+from tests.launch import UP_TO_RANKS, run_script
 
 SIDE = 20e-3
 C1, D1 = 1e3, 2e3
@@ -445,7 +445,7 @@ outputs = (
 spec = body(tool(name="ball", at=(4e-3, 3e-3, SIDE)), table, displacements=ON_ROLLERS[:2], outputs=outputs)
 values = np.array([spec.scalars[name].value for name in names])
 first = None
-for comm in groups(1, 2, 3):
+for comm in groups():
     model = spec.build(comm, tuple(names))
     solution = model.solve(values)
     states = comm.bcast(model.space.gather(solution.state[None]))
@@ -471,6 +471,7 @@ for comm in groups(1, 2, 3):
 
 @pytest.mark.fem
 @pytest.mark.mpi
-def test_ranks_share_a_body_between_two_tools():
-    done = run_script(3, SHARED)
+@UP_TO_RANKS
+def test_ranks_share_a_body_between_two_tools(ranks):
+    done = run_script(ranks, SHARED)
     assert done.returncode == 0, done.stdout + done.stderr
