@@ -116,7 +116,7 @@ for case in sys.argv[1:]:
 CASES = ("plain", "fails", "uneven", "many", "models", "passing")
 
 
-@pytest.mark.parametrize("ranks", [1, 2, 3])
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow), 3])  # two are two of three
 def test_same_numbers_as_in_one_process(ranks):
     done = run_script(ranks, STUDY, *CASES)
     assert done.returncode == 0, done.stderr
