@@ -43,6 +43,8 @@ def environment():
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
     shared |= {"OMPI_MCA_hwloc_base_binding_policy": "none"}  # other tests run beside, on the same cores if bound
+    # On one machine there are no networks to look for, and a process without mpirun needs no daemon beside it.
+    shared |= {"OMPI_MCA_pml": "ob1", "OMPI_MCA_ess_singleton_isolated": "1"}
     if _SLEEPING is not None:
         shared["LD_PRELOAD"] = " ".join(filter(None, (_SLEEPING._name, clean.get("LD_PRELOAD"))))
     return clean | root | shared | {"OMP_NUM_THREADS": "1"}

@@ -102,7 +102,7 @@ for case in sys.argv[1:]:
             model, task, others=others, passing=frozenset({"first", "second"}), progress=count
         )
     except SolveError as error:
-        sys.stdout.write(f"caught {error}\n")  # at once: `print` writes piece by piece, and so do other ranks
+        print(f"caught {error}")  # in one piece, among what other ranks print
         sys.exit(1)
     if data is not None:
         lost = 0
