@@ -92,13 +92,12 @@ class Turns:
             accept(i, found, theirs=False)
         heard = time.monotonic()
         while missing:
-            # Waits as `recv` does, but keeps counting other groups' solves.
-            while not world.iprobe(tag=_RESULT):
-                time.sleep(0)
-                if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
-                    self.count(0, 0)
-                    heard = time.monotonic()
-            accept(*world.recv(tag=_RESULT), theirs=True)
+            # Waits as `recv` does, but keeps counting other groups' solves; what arrives while it counts is received.
+            drain()
+            time.sleep(0)
+            if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
+                self.count(0, 0)
+                heard = time.monotonic()
         # The counter may restart for the next pieces only once every rank has seen that no turn is left.
         world.barrier()
         self.count(0, 0)
