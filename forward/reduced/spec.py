@@ -146,12 +146,13 @@ class Reduced(ModelSpec):
     def seconds_together(self) -> float:
         """Weigh a solve in lockstep against solves of bodies, see `uq.methods.stopping.seconds_per_solve`.
 
-        Fitted to 1.5 and 3.9 ms with 60 and 192 modes at 344 and 864 points, 3.1 and 9.6 ms with 60 and 300 modes at
-        335 and 1 177 points and with more for the largest stress (a 2.8 GHz core, a ten-thousandth of the forces left).
+        Fitted to 0.40 and 0.95 ms with 40 and 60 modes at 313 and 372 points of 4,641 and 32,175 unknowns, 1.0 and 4.6
+        ms with 128 and 300 modes at 694 and 1,413 points (a 2.8 GHz core, 64 in lockstep, a ten-thousandth of the
+        forces left, the largest stress among the outputs).
         """
         told, which = self._about.told, " of the larger model" if self.larger else ""
         modes, points = told[f"modes{which}"], told[f"points{which}"]
-        return float(1.5e-3 + 2e-8 * points * modes)
+        return float(5e-4 + 9e-9 * points * modes)
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
         """Return the materials of the body as functions of some of its numbers, by their paths."""

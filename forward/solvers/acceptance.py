@@ -15,7 +15,11 @@ STALLED = 0.5  # a residual that falls by less may have reached rounding
 
 
 class Diverged(Exception):  # noqa: N818 - control flow of the solvers
-    """An attempt at one load failed, for the reason given."""
+    """An attempt at one load failed, for the reason given; `closest` is a state from which to try again, if known."""
+
+    def __init__(self, reason: str, closest: FloatArray | None = None) -> None:
+        super().__init__(reason)
+        self.closest = closest
 
 
 class Unstable(Diverged):

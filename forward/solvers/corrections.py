@@ -16,22 +16,31 @@ PATIENCE = 6  # corrections without a smaller residual before giving up
 TOUCHING, LESS = 4, 1 / 3  # corrections of a body in contact after which the residual must be this much smaller
 ROUGH = 1e-2  # relative residual of a state that only predicts the next
 SHORTEST = 1 / 8  # fraction of the path from the reference that is not divided further
+CLOSE = 0.05  # relative residual at the end of the path below which a state is a better start than the prediction
+FAILURES = 2  # corrections at the end of the path that may fail, once a state as close as that is known
 ROUNDED = 1e-2  # relative residual above which a useless correction is not due to rounding
 
 
 def predict_correct(
     system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]
 ) -> Steps[Found]:
-    """Correct a prediction with a reference factor, in several steps if one is too long; or raise `Diverged`.
+    """Correct a prediction with a reference factor, in several steps if one is too long.
 
     With s the slope of the prediction, the state after a fraction t of the path is ū + t s + t² q(t). The first step
     takes q = 0; each state found gives a value of q, and the last two values predict the next. Where a tool touches the
     body, there is one step only: as points come into contact and leave it, corrections of several steps take longer
     than Newton's method.
+
+    Raises
+    ------
+    Diverged
+        If the reference is too far away, with the state at the end of the path that came closest, if one did.
     """
     slope = start - way.state
     known: list[tuple[float, FloatArray]] = []
     reached, target = 0.0, 1.0
+    closest: FloatArray | None = None
+    least, failures = CLOSE, 0
     while True:
         way.at(target)
         guess = way.state + target * slope + target**2 * _line(known, target)
@@ -46,16 +55,20 @@ def predict_correct(
         if close and target == 1:
             stability = yield from accepted(system, settings, u, residual, way, history)
             return Found(u, residual.relative, corrected=True, stability=stability)
+        if target == 1:
+            failures += 1
+            if residual.relative < least and system.smallest_jacobian(u) > 0:
+                closest, least = u, residual.relative
         if close:
             known.append((target, ((u - way.state) / target - slope) / target))
             reached, target = target, 1.0
-        elif target - reached > SHORTEST and not system.contact:
+        elif target - reached > SHORTEST and not system.contact and (failures < FAILURES or closest is None):
             target = (reached + target) / 2
         else:
             way.at(1.0)
             message = "the reference is too far away"
             history.append(message)
-            raise Diverged(message)
+            raise Diverged(message, closest)
 
 
 def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:

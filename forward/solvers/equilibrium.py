@@ -107,12 +107,16 @@ def solving(
             return known((yield from predict_correct(system, settings, guesses[0], way, history)))
         except Unstable as stop:
             failed(stop)
-            guesses = [zero]  # from the same prediction Newton would only find the same equilibrium
+            guesses = []  # at full load Newton would find the same equilibrium, or another unstable one
         except Diverged as stop:
             failed(stop)
+            guesses = guesses if stop.closest is None else [stop.closest, *guesses]
     for guess in guesses:
         try:
             return known(newton(system, settings, guess, history, 1.0)[0])
+        except Unstable as stop:
+            failed(stop)
+            break
         except Diverged as stop:
             failed(stop)
     try:

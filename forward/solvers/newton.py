@@ -22,6 +22,7 @@ TOUCHING = 2  # times the iterations that are allowed, where the area in contact
 CURVED = 0.1  # relative residual below which the stiffness has the curvature of tools
 LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
+LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
 
 
 def load_steps(
@@ -31,7 +32,8 @@ def load_steps(
 
     The load at which an equilibrium was unstable is not tried again until the stable branch has been followed to within
     `LOCATED` of it: from further away Newton would only find the same state. Once an equilibrium was unstable (at full
-    load, if `unstable` says so), the branch is expected to end, and only `REFUSALS` more attempts may fail.
+    load, if `unstable` says so), the branch is expected to end: only `REFUSALS` more attempts may fail, and each after
+    the first has `LATE` iterations.
     """
     reached, step, refusals = 0.0, 0.5, 0
     barrier = 1.0 if unstable else np.inf
@@ -42,7 +44,8 @@ def load_steps(
             load = barrier if barrier - reached <= LOCATED else (reached + barrier) / 2
         try:
             # The secant through the last two states predicts the next one.
-            there, iterations = newton(system, settings, found.state + (load - reached) * slope, history, load)
+            start = found.state + (load - reached) * slope
+            there, iterations = newton(system, settings, start, history, load, LATE if unstable and reached else None)
         except Diverged as stop:
             step = (load - reached) / 2
             slope = np.zeros_like(zero)
@@ -70,12 +73,16 @@ def load_steps(
 
 
 def newton(
-    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
+    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float, limit: int | None = None
 ) -> tuple[Found, int]:
-    """Iterate at one load; return the state and the number of iterations, or raise `Diverged`."""
+    """Iterate at one load; return the state and the number of iterations, or raise `Diverged`.
+
+    `limit` is on iterations, unless the settings have a lower one.
+    """
     system.at_load(load)
+    allowed = settings.iterations if limit is None else min(limit, settings.iterations)
     try:
-        return _iterate(system, settings, u, history, load)
+        return _iterate(system, settings, u, history, load, allowed * (TOUCHING if system.contact else 1))
     except NoConvergence as stop:
         history.append(f"load {load:.6g}: {stop.reason}")
         raise Diverged(stop.reason) from None
@@ -85,7 +92,7 @@ def newton(
 
 
 def _iterate(
-    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
+    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float, limit: int
 ) -> tuple[Found, int]:
     residual = system.residual(u)
     sizes: list[float] = []
@@ -93,7 +100,6 @@ def _iterate(
     if not np.isfinite(residual.size):
         message = "the starting state has no finite residual"
         raise Diverged(message)
-    limit = settings.iterations * (TOUCHING if system.contact else 1)
     for iteration in range(limit + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if converged(system, settings.tolerance, u, residual, sizes):
