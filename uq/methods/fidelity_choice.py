@@ -40,11 +40,15 @@ class Amounts(NamedTuple):
 
 @dataclass(frozen=True)
 class _Taken:
-    """A pool, and what was asked for it."""
+    """A pool, and all that was answered in it."""
 
     pool: Pool
     taken: Taken
-    chosen: NDArray[np.bool_]
+
+    @property
+    def chosen(self) -> NDArray[np.bool_]:
+        """Which points (n,) are."""
+        return np.isin(np.arange(self.pool.count), self.pool.chosen)
 
 
 class ByChoice:
@@ -60,8 +64,8 @@ class ByChoice:
         self._team, self._known = team, known
         self._all = team.groups.index(tuple(range(1, len(team.members))))
         g = PILOT if PILOT in team.taken else 0
-        first = self._pool(team.taken[g], np.arange(len(team.taken[g].points)))
-        self._pilot, self._counts = first, g == 0
+        first = team.taken[g]
+        self._pilot, self._counts = _Taken(self._pool(first, np.arange(len(first.points))), first), g == 0
         follows = (correlations(pilot.covariance)[:, 1:] ** 2).mean(axis=0)
         best = np.argsort(-follows, kind="stable")[:2] + 1
         self._pair = (int(best[0]), int(best[1]))
@@ -73,15 +77,12 @@ class ByChoice:
         """Mean and standard deviation."""
         return self.found.estimates
 
-    def _pool(self, taken: Taken, asked: NDArray[np.intp]) -> _Taken:
-        """A pool whose points are all chosen, or none yet."""
+    def _pool(self, taken: Taken, chosen: NDArray[np.intp]) -> Pool:
+        """A pool of points of which these are chosen."""
         team = self._team
         deviations = team.deviations(taken)
-        chosen = np.zeros(len(taken.points), dtype=bool)
-        chosen[asked] = True
         t = team.members[0].centre.coordinates.of(taken.points)
-        places = np.flatnonzero(chosen)
-        return _Taken(Pool(deviations[:, 1:], t, places, deviations[places, 0]), taken, chosen)
+        return Pool(deviations[:, 1:], t, chosen, deviations[chosen, 0])
 
     def _pooled(self) -> Pooled:
         pools = [one.pool for one in self._pools]
@@ -153,13 +154,13 @@ class ByChoice:
             return
         design, number = self._design(), len(self._pools)
         taken = team.drawn(self._all, sum(len(one.taken.points) for one in self._pools), count)
-        bare = self._pool(taken, np.empty(0, dtype=int))
+        pool = self._pool(taken, np.empty(0, dtype=int))
         start = float(random_points((team.seed, len(team.groups) + 1), number, number + 1, 1)[0, 0])
-        floor, intensity, rows = choice(design, bare.pool.cheap, full, start)
+        floor, intensity, rows = choice(design, pool.cheap, full, start)
         taken.values[rows, 0] = team.solved(0, taken.points[rows], taken.reasons)
-        pool = self._pool(taken, rows)
-        pool = replace(pool, pool=replace(pool.pool, design=design, floor=floor, intensity=intensity))
-        self._pools.append(pool)
+        values = taken.values[rows, 0] - team.offsets[0]
+        pool = replace(pool, chosen=rows, values=values, design=design, floor=floor, intensity=intensity)
+        self._pools.append(_Taken(pool, taken))
         self.found = self._estimated()
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
