@@ -214,6 +214,13 @@ class Reduced(ModelSpec):
 
     def _of_errors(self) -> Iterator[Finding]:
         errors = self._about.told.get("errors", {})
+        if not errors:
+            yield Finding(
+                "warning",
+                "Nobody has measured how far the reduced model is from its body: it was made without unseen samples, "
+                "or without any that both could solve. Errors of all numbers are those of sampling alone; make it with "
+                "method.unseen, 32 by default.",
+            )
         large = [f"{name} {100 * error:.2g} %" for name, error in errors.items() if error > DOUBTFUL]
         if large:
             yield Finding(

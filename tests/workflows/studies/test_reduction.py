@@ -201,6 +201,8 @@ def test_the_model_and_its_nested_larger_one_are_cheap_models(folder):
     few = [*SIZES[:2], *(part for one in ("unseen=0", "rounds=0", "modes=2") for part in ("--set", f"method.{one}"))]
     reduced = ["reduce", folder / "body.toml", *few, "--out", folder / "few", "--output", folder / "few.npz"]
     assert main([*map(str, reduced), "--quiet", "--no-report"]) == 0
+    (folder / "alone.toml").write_text(USED.format(upper=1200, more="").replace("model.npz", "few.npz"))
+    assert any("Nobody has measured" in one.text for one in load(folder / "alone.toml").findings)
     method = """
 [method]
 kind = "multifidelity"
