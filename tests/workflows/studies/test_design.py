@@ -111,12 +111,12 @@ def test_a_linear_model_is_the_closed_form_with_any_ranks(folder, looked_at):
     path = line(folder)
     study = load(path)
     assert parse(document(study)) == study
-    for ranks in (None, 2):
+    for ranks in (None, 3):
         words = ["--no-report"] if ranks is None else []
         done = on_ranks(ranks, TISSUQ, "run", path, "--out", folder / f"out-{ranks}", "--quiet", *words)
         assert done.returncode == 0, done.stderr
-    assert_same_bits(folder / "out-None", folder / "out-2")
-    found = xr.load_dataset(folder / "out-2" / "results.nc")
+    assert_same_bits(folder / "out-None", folder / "out-3")
+    found = xr.load_dataset(folder / "out-3" / "results.nc")
     chosen = found["chosen"].to_numpy()
     for n in range(4):
         assert float(found["information"][n]) == pytest.approx(exact(chosen[: n + 1])[0], rel=1e-9)
@@ -124,13 +124,13 @@ def test_a_linear_model_is_the_closed_form_with_any_ranks(folder, looked_at):
     best = max(range(12), key=lambda i: exact([i])[0])
     assert chosen[0] == best
     assert (found["random_upper"].to_numpy()[:4] <= found["information"].to_numpy() + 1e-9).all()
-    summary = json.loads((folder / "out-2" / "summary.json").read_text())
+    summary = json.loads((folder / "out-3" / "summary.json").read_text())
     design = summary["design"]
     assert [one["name"] for one in design["chosen"]] == [NAMES[i] for i in chosen]
     assert design["random_equal"] is None or design["random_equal"] >= 4
-    assert "Which observations tell most" in (folder / "out-2" / "report.html").read_text()
-    looked_at(folder / "out-2")
-    table = (folder / "out-2" / "design.csv").read_text().splitlines()
+    assert "Which observations tell most" in (folder / "out-3" / "report.html").read_text()
+    looked_at(folder / "out-3")
+    table = (folder / "out-3" / "design.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in table[1:]] == [NAMES[i] for i in chosen]
 
 
