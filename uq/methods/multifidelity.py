@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MOST_MODELS = 6  # cheap ones: 127 groups
 FEWEST = 8  # samples of a pilot
 PILOT, PER_MODEL = 16, 4  # samples of a pilot, and how many more for each cheap model
-UNSEEN = 1.5  # predicted variance, over that of even full solves, up to which those where models differ are taken
+UNSEEN = 4.0  # predicted variance, over that of even full solves, up to which those where models differ are taken
 BETTER = 0.8  # predicted variance, over that of the models, from which an expansion takes their place
 LITTLE = 0.01  # of what was spent: not worth another round
 MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
@@ -76,8 +76,8 @@ class Multifidelity(Amount):
     full_solves
         Which points the study's model is solved at: "differences", with probabilities that grow with the difference of
         the two cheap models that follow it best, so that it is asked where they are least to be trusted; "evenly", as
-        any point. "auto": "differences", unless the pilot predicts for them a variance half as large again, since it
-        has seen no tails; with a single cheap model, evenly.
+        any point. "auto": "differences", unless the pilot predicts for them four times the variance, since it has seen
+        no tails; with a single cheap model, evenly.
     quantiles
         Probabilities of the quantiles of the outputs.
     seed
