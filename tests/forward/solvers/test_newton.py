@@ -5,8 +5,14 @@ import pytest
 from mpi4py import MPI
 
 from forward.fem.dolfinx import linear
+from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError
+from forward.solvers import corrections
 from tests.bodies import FORMS, OUTPUTS, loaded_body, unloaded_body
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.surrogates.linearisation import linearise
 
 pytestmark = pytest.mark.fem
 INTEGRALS = OUTPUTS[6:]
@@ -143,6 +149,20 @@ def test_a_prediction_changes_the_cost_and_not_the_answer(model):
     check(model, predicted)
     again = model.solve(POINT + change, Guess(from_zero.state))
     assert again.work.factorisations == 1  # that which counts the negative eigenvalues there
+
+
+def test_newton_starts_where_corrections_came_close(heavy, monkeypatch):
+    inputs, point = Inputs({DENSITY: Uniform(lower=0.0, upper=1.2e4)}), np.array([1.15e4])
+    spec = Hyperelastic.model_validate(heavy.spec.model_dump() | {"solver": {"corrections": 3}})
+    model = spec.build(MPI.COMM_SELF, (DENSITY,))
+    guess = linearise(inputs, SerialEvaluate(model)).prediction.on(model)
+    close = model.solve(point, guess(point))
+    check(model, close)
+    monkeypatch.setattr(corrections, "CLOSE", 0.0)  # from the prediction, from zero, by load steps
+    far = model.solve(point, guess(point))
+    np.testing.assert_allclose(close.state, far.state, rtol=0, atol=1e-8)
+    assert close.work.load_steps == 0
+    assert close.work.factorisations < far.work.factorisations / 2
 
 
 @pytest.mark.parametrize("wrong", [np.nan, 1e6, 1.0, -0.7])
