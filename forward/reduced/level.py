@@ -100,7 +100,7 @@ class Level:
         every = np.array(parts)
         R = every.sum(axis=0)
         largest = float(np.abs(every[:, self.free]).max(initial=0.0))
-        return R, max(largest, float(np.abs(R[: self.before]).max(initial=0.0)), self.least)
+        return R, max(largest, float(np.abs(R[: self.before]).max(initial=self.least)))
 
     def by_parameters(self, c: FloatArray, parameters: FloatArray, K: FloatArray) -> FloatArray:
         """Return the derivatives (N, d) of the forces by the parameters at coordinates of the modes that stay."""

@@ -53,7 +53,7 @@ def equilibria(
         parts = [still[active], *(one.forces(c[active], active) for one in moving)]
         R = np.sum(parts, axis=0)
         size = np.max([np.abs(part[:, free]).max(axis=1, initial=0.0) for part in parts], axis=0)
-        size = np.maximum(np.maximum(size, np.abs(R[:, : level.before]).max(axis=1, initial=0.0)), level.least)
+        size = np.maximum(size, np.abs(R[:, : level.before]).max(axis=1, initial=level.least))
         left = np.abs(R[:, free]).max(axis=1, initial=0.0)
         for i in active:
             iterations[i] += 1

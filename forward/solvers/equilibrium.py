@@ -110,7 +110,8 @@ def solving(
             guesses = []  # at full load Newton would find the same equilibrium, or another unstable one
         except Diverged as stop:
             failed(stop)
-            guesses = guesses if stop.closest is None else [stop.closest, *guesses]
+            if stop.closest is not None:
+                guesses.insert(0, stop.closest)
     for guess in guesses:
         try:
             return known(newton(system, settings, guess, history, 1.0)[0])

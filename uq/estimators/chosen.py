@@ -35,12 +35,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.fidelities import FOLDS, FREE, uncertainty
+from uq.estimators.fidelities import FOLDS, FREE, ROUNDS, uncertainty
 from uq.estimators.moments import Estimates, Term, Z, combine, student, term
 
 FLOOR = 0.5  # a over the root mean square of d
 PER_FEATURE = 10  # points of the pools for each polynomial that is taken off
-ROUNDS = 4  # in which the mean stands for answers that are missing
 
 
 @dataclass(frozen=True)
