@@ -382,7 +382,6 @@ class _Worker:
             receive(i, block)
 
         with abort_all(self._ensemble.world):
-            self._turns.restart()
             self._ensemble.told(order)
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 

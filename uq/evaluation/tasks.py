@@ -185,7 +185,6 @@ def run_tasks(
             if world.rank > 0:
                 turns.follow(pending, do)
             else:
-                turns.restart()
                 turns.lead(pending, do, receive)
     if pending is None:
         raise FinishedElsewhere

@@ -61,10 +61,6 @@ class Turns:
         """Rank 0: receive the results that have arrived."""
         self._drain()
 
-    def restart(self) -> None:
-        """Rank 0: start again with the first piece, before the others are told of new pieces."""
-        self._turn.reset()
-
     def lead(self, pending: Sequence[int], work: Callable[[int], T], receive: Callable[[int, T, bool], None]) -> None:
         """Rank 0: work on pieces until all are finished, here or elsewhere.
 
@@ -88,6 +84,8 @@ class Turns:
                 accept(*world.recv(tag=_RESULT), theirs=True)
 
         self._drain = drain
+        self._turn.reset()
+        world.barrier()  # until turns start again: nobody takes one before
         for i, found in self._taken(pending, work):
             accept(i, found, theirs=False)
         heard = time.monotonic()
@@ -98,13 +96,16 @@ class Turns:
             if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
                 self.count(0, 0)
                 heard = time.monotonic()
-        # The counter may restart for the next pieces only once every rank has seen that no turn is left.
-        world.barrier()
+        world.barrier()  # until every rank has seen that no turn is left
         self.count(0, 0)
 
     def follow(self, pending: Sequence[int], work: Callable[[int], T]) -> None:
-        """Other ranks: work on pieces until none is left, and send the results to rank 0."""
+        """Other ranks: work on pieces until none is left, and send the results to rank 0.
+
+        A piece taken before turns start again would be taken twice, and nobody would receive its second result.
+        """
         sent: list[Any] = []
+        self._world.barrier()
         for result in self._taken(pending, work):
             if self._group.rank == 0 and self._index > 0:
                 sent.append(self._world.isend(result, dest=0, tag=_RESULT))

@@ -158,6 +158,43 @@ def test_a_mistake_on_one_rank_ends_all():
     assert "ZeroDivisionError: on one rank" in done.stderr
 
 
+LATE = """
+import time
+from mpi4py import MPI
+import xarray as xr
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.tasks import run_tasks
+from uq.evaluation.turns import Counter
+
+reset = Counter.reset
+
+
+def late(counter):
+    time.sleep(0.3)
+    reset(counter)
+
+
+def work(number, solved):
+    done.append(number)
+    return xr.Dataset({"large": ("x", [0.0] * 100_000)})  # only sent once somebody receives it
+
+
+Counter.reset = late
+done = []
+run_tasks(Ensemble.split(MPI.COMM_WORLD), ["one", "two"], work)
+done = sum(MPI.COMM_WORLD.allgather(done), [])
+if MPI.COMM_WORLD.rank == 0:
+    print(sorted(done))
+"""
+
+
+@pytest.mark.mpi
+def test_no_task_is_taken_before_turns_start_again():
+    """However late that is: it would be done twice, and the job would wait forever for its second outcome."""
+    done = run_script(2, LATE, timeout=60)
+    assert "[0, 1]\n" in done.stdout, done.stderr
+
+
 OF_TWO_JOBS = """
 import sys
 import time
