@@ -56,8 +56,8 @@ def main(words: Sequence[str] = ()) -> None:
             if name == "organ" and not asked.mixed:
                 sets.append("model.formulation=displacement")
             changes = [part for one in sets for part in ("--set", one)]
-            study = str(CONFIGS / f"{name}.toml")
-            if command(["reduce", study, "--out", str(out), "--quiet", "--no-report", *changes]):
+            study = CONFIGS / f"{name}.toml"
+            if command(["reduce", str(study), "--out", str(out), "--quiet", "--no-report", *changes]):
                 return
             told = json.loads((out / "summary.json").read_text())["reduced"]
             of_body = [one for one in sets if not one.startswith("method.")]
