@@ -70,7 +70,7 @@ def _full(study: Any) -> float:
     evaluate = SerialEvaluate(model)
     start = linearise(study.inputs, evaluate).prediction
     points = study.inputs.points(random_points((0, 9), 0, LOCKSTEP, len(study.inputs.names)))
-    return 1e3 * float(evaluate(Request(points, start=start)).seconds.mean())
+    return 1e3 * float(np.median(evaluate(Request(points, start=start)).seconds))
 
 
 def _table(told: dict[str, Any], data: Any, full: float) -> None:
@@ -119,11 +119,13 @@ def _table(told: dict[str, Any], data: Any, full: float) -> None:
 
 
 def _times(what: Any, points: Any) -> float:
-    """Milliseconds of processor time for one of several calls."""
-    start = time.process_time()
+    """Milliseconds of processor time for a call, the median of several: other jobs slow some of them down."""
+    taken = []
     for point in points:
+        start = time.process_time()
         what(point)
-    return 1e3 * (time.process_time() - start) / len(points)
+        taken.append(time.process_time() - start)
+    return 1e3 * float(np.median(taken))
 
 
 def _frames(model: ReducedModel) -> None:

@@ -19,7 +19,7 @@ from forward.reduced.kernels import Kernel, spread
 
 CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
 STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
-FINER = 3.0  # how many times less the points of the larger model miss
+FINER = 10.0  # how many times less the points of the larger model miss
 SHAKEN = 0.3  # energy of what is added to a snapshot, over its own
 KEPT_WHOLE = 600  # points of a boundary that are all kept
 SEED = 7
