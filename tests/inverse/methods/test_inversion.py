@@ -580,11 +580,18 @@ def test_fewer_data_sets_than_ranks(folder):
 REPORTED = "method.mesh_error='report'"
 
 
-def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
+@pytest.fixture(scope="module")
+def single(folder):
+    """The results of one data set on two cells along an edge: the program finds itself that they are too few."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(study_runs, "_report", lambda directory: None)
+        assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']", REPORTED) == 3
+    return folder / "single"
+
+
+def test_one_data_set_and_what_others_read_of_it(folder, single, monkeypatch):
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
-    # On two cells along an edge: the program finds itself that they are too few.
-    assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']", REPORTED) == 3
-    summary = json.loads((folder / "single" / "summary.json").read_text())
+    summary = json.loads((single / "summary.json").read_text())
     assert summary["evaluations"] > 32
     assert set(summary["posterior"]) == {"inclusions.lump.contrast", "material.mu"}
     assert summary["log_evidence_error"] < 1
@@ -592,7 +599,7 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     said = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
     assert any("a finer mesh moves the data by" in text and "material.mu +" in text for text in said)
     arviz = pytest.importorskip("arviz")
-    kept = arviz.from_netcdf(folder / "single" / "results.nc")
+    kept = arviz.from_netcdf(single / "results.nc")
     assert kept.posterior["material.mu"].shape == (1, 50)
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
     assert np.isfinite(arviz.loo(kept).elpd_loo)
@@ -607,13 +614,12 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
 
 
 @pytest.mark.mpi
-def test_all_groups_share_one_data_set(folder):
+def test_all_groups_share_one_data_set(folder, single):
     """The same bytes as of one rank, the solve on the finer mesh among them."""
-    assert (folder / "single").exists()  # of the test before
     changes = ("--set", "data.files=['data/made-1.csv']", "--set", REPORTED)
     done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "shared", "--quiet", *changes)
     assert done.returncode == 3, done.stderr
-    assert (folder / "single/results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
+    assert (single / "results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
 
 
 def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):

@@ -96,10 +96,26 @@ def ran(study, out, *changes, report=False):
     return main(["run", str(study), "--out", str(out), "--quiet", *([] if report else ["--no-report"]), *sets])
 
 
-def test_a_linear_model_has_its_exact_posterior(folder, looked_at):
-    """Mode, standard deviations and evidence; the residuals, repeated measurements among them; nothing of meshes."""
+FILES = "data={files='data', noise={relative=0.1}}"
+
+
+@pytest.fixture(scope="module")
+def alone(folder):
+    """The results of the data that the study states."""
     assert ran(folder / "stated.toml", folder / "stated", report=True) == 0
-    one = results(folder / "stated").isel(data_set=0)
+    return folder / "stated"
+
+
+@pytest.fixture(scope="module")
+def batch(folder):
+    """The results of three files, of which one cannot be read."""
+    assert ran(folder / "stated.toml", folder / "batch", FILES, report=True) == 3
+    return folder / "batch"
+
+
+def test_a_linear_model_has_its_exact_posterior(alone, looked_at):
+    """Mode, standard deviations and evidence; the residuals, repeated measurements among them; nothing of meshes."""
+    one = results(alone).isel(data_set=0)
     mode, covariance, log_evidence = exactly([0, 2, 2], VALUES, SIGMA)
     np.testing.assert_allclose(one["mode"], mode, rtol=1e-8)
     np.testing.assert_allclose(one["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
@@ -110,21 +126,19 @@ def test_a_linear_model_has_its_exact_posterior(folder, looked_at):
     np.testing.assert_allclose(one["alone_std"][0], np.sqrt(np.diag(exactly([0], VALUES[:1], SIGMA[:1])[1])), rtol=1e-8)
     assert not {"mesh_checked", "place", "stiffness_mode", "cell_nodes"} & set(one.data_vars)
     assert np.isfinite(one["agreement_probability"])  # of the repeated ones
-    summary = json.loads((folder / "stated" / "summary.json").read_text())
+    summary = json.loads((alone / "summary.json").read_text())
     assert set(summary["posterior"]) == {"a", "b"}
     assert "can be trusted" in summary["verdict"]
-    page = (folder / "stated" / "report.html").read_text()
-    looked_at(folder / "stated")
+    page = (alone / "report.html").read_text()
+    looked_at(alone)
     assert "values of outputs" in page
     assert "predicted" in page
     assert "oad case" not in page
 
 
-def test_tables_are_data_sets_side_by_side(folder, looked_at, capsys):
+def test_tables_are_data_sets_side_by_side(batch, looked_at, capsys):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
-    files = "data={files='data', noise={relative=0.1}}"
-    assert ran(folder / "stated.toml", folder / "batch", files, report=True) == 3
-    found = results(folder / "batch")
+    found = results(batch)
     assert found["ok"].to_numpy().tolist() == [True, True, False]
     assert "the model has no output 'ux'" in str(found["why"].values[2])
     sigma = np.array([0.05, 0.31, 0.2])
@@ -132,11 +146,11 @@ def test_tables_are_data_sets_side_by_side(folder, looked_at, capsys):
     np.testing.assert_allclose(found["mode"][0], mode, rtol=1e-8)
     np.testing.assert_allclose(found["log_evidence"][0], log_evidence, rtol=1e-9)
     assert found["true"].sel(parameter="a").to_numpy()[:2].tolist() == [1.1, 1.1]
-    table = (folder / "batch" / "batch.csv").read_text().splitlines()
+    table = (batch / "batch.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
-    assert "All data sets" in (folder / "batch" / "report.html").read_text()
-    looked_at(folder / "batch")
-    assert main(["check", str(folder / "batch" / "study.toml")]) == 2  # a record, which names its data
+    assert "All data sets" in (batch / "report.html").read_text()
+    looked_at(batch)
+    assert main(["check", str(batch / "study.toml")]) == 2  # a record, which names its data
     assert "records a study without its data, expected the study that was run" in capsys.readouterr().err
 
 
@@ -176,13 +190,13 @@ def test_files_of_one_name_in_different_folders_are_different_data(folder):
 
 
 @pytest.mark.mpi
-def test_groups_of_ranks_give_the_same_bytes(folder):
-    for name, changes in (("stated", ()), ("batch", ("--set", "data={files='data', noise={relative=0.1}}"))):
-        out = folder / f"{name}-shared"
+def test_groups_of_ranks_give_the_same_bytes(folder, alone, batch):
+    for there, changes in ((alone, ()), (batch, ("--set", FILES))):
+        out = folder / f"{there.name}-shared"
         done = run_script(2, SCRIPT, "run", folder / "stated.toml", "--out", out, "--quiet", "--no-report", *changes)
         assert done.returncode in (0, 3), done.stderr
-        one, other = (results(place) for place in (folder / name, out))
-        xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
+        left, right = (results(place) for place in (there, out))
+        xr.testing.assert_identical(left.drop_attrs(), right.drop_attrs())
 
 
 SCRIPT = "import sys\nfrom workflows.__main__ import main\nsys.exit(main(sys.argv[1:]))"
