@@ -193,11 +193,7 @@ class Multifidelity(Amount):
         expansion = ByExpansion.of(team) if self.control == "auto" else None
         cost = self._left(team) if self.tolerance is None else models.needed(self.tolerance**2)
         cost = max(min(cost, self._left(team)), FEWEST)
-        way: ByModels | ByExpansion | ByChoice = models
-        if len(self.cheap) > 1 and self.full_solves != "evenly":
-            choice = ByChoice(team, models.pilot, known=self.control != "none")
-            if self.full_solves == "differences" or choice.expected(cost) <= UNSEEN * models.expected(cost):
-                way = choice
+        way: ByModels | ByExpansion | ByChoice = self._full_solves(team, models, cost)
         if expansion is not None and expansion.expected(cost) < BETTER * way.expected(cost):
             told.append(preferred(way.expected(cost), expansion.expected(cost)))
             way = expansion
@@ -226,6 +222,14 @@ class Multifidelity(Amount):
         add(dataset, *told, *way.doubts())
         dataset.attrs["stopped"] = stopped
         return dataset
+
+    def _full_solves(self, team: Team, models: ByModels, cost: float) -> ByModels | ByChoice:
+        """Return how the study's model is asked: at even samples, or where two cheap models differ."""
+        if len(self.cheap) == 1 or self.full_solves == "evenly":
+            return models
+        choice = ByChoice(team, models.pilot, known=self.control != "none")
+        better = self.full_solves == "differences" or choice.expected(cost) <= UNSEEN * models.expected(cost)
+        return choice if better else models
 
     def _left(self, team: Team) -> float:
         """What may still be spent, in solves of the study's model."""
