@@ -136,15 +136,18 @@ class Loaded:
     def __init__(self) -> None:
         self._before = frozenset(sys.modules)
         self._files: dict[str, tuple[str, str]] = {}
+        self._others: dict[str, str] = {}  # files of modules that are not the user's: they are asked about once
 
     def __call__(self) -> dict[str, tuple[str, str]]:
         """Return (path, SHA-256) by module."""
         for name in sys.modules.keys() - self._before - self._files.keys():
             file = getattr(sys.modules[name], "__file__", None)
-            if isinstance(file, str) and file.endswith(".py") and name != "__main__":
+            if isinstance(file, str) and file.endswith(".py") and name != "__main__" and self._others.get(name) != file:
                 path = Path(file).absolute()
                 if _is_own(path):
                     self._files[name] = (str(path), hashed(path))
+                else:
+                    self._others[name] = file
         return self._files
 
     def note(self) -> str:

@@ -1,5 +1,6 @@
 """The modules of a user's model: found beside the study, never in place of others, and never mixed with older ones."""
 
+import importlib
 import json
 import shutil
 import sys
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from forward.external import own_modules
 from forward.external.models import PythonModel
-from forward.external.own_modules import Sources, sources
+from forward.external.own_modules import Loaded, Sources, sources
 from tests.launch import ROOT, run_script
 from workflows.__main__ import main
 
@@ -188,3 +190,16 @@ def test_a_helper_that_is_called_like_another_module_is_refused(tmp_path, tissuq
     code, said = tissuq("check", tmp_path / "study.toml")
     assert code == 2
     assert said[0].startswith(f"model.function: {tmp_path / 'own_beam.py'} imports 'statistics', which is both ")
+
+
+def test_modules_of_others_are_asked_about_once(monkeypatch, tmp_path):
+    """Each block that is kept asks which of the user's modules are loaded: most of a small study's time, if all are."""
+    asked, known = [], own_modules._is_own
+    monkeypatch.setattr(own_modules, "_is_own", lambda file: asked.append(file) or known(file))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_alone.py").write_text("import colorsys")
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    loaded = Loaded()
+    importlib.import_module("mine_alone")
+    assert list(loaded()) == ["mine_alone"] == list(loaded())
+    assert sorted(file.name for file in asked) == ["colorsys.py", "mine_alone.py"]
