@@ -379,7 +379,7 @@ class ReducedSolution(WithoutMesh):
             return None if found is None else (found[0], (found[0] - c)[larger.free])
         R, K, _ = larger.stiffness(c, self._whole)
         K_free = K[larger.free, larger.free]
-        if model.tested and not larger.pressures and not stable((K_free + K_free.T) / 2, 0):
+        if model.tested and not stable((K_free + K_free.T) / 2, larger.pressures):
             return None  # the body may be unstable here in a way that the few modes do not have
         try:
             change = -np.linalg.solve(K_free, R[larger.free])

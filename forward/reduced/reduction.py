@@ -24,6 +24,7 @@ from forward.reduced.snapshots import Snapshots
 OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
 LOOKED_AT = 4  # snapshots at which the larger model must be stable
 ROUNDING = 1e-10  # spread of an output, over the largest value of its unit, below which it is round-off
+LEAST_SPREAD = 1e-300  # of an output that is zero, as all of its unit are
 OF_TANGENTS = 0.5  # weight of changes of the state by one standard deviation, beside the states
 KINDS = 3  # of modes in the mixed form: displacements, pressures, and their supports
 
@@ -146,7 +147,7 @@ class Reduction:
             "lowest": outputs.min(axis=0).tolist(),
             "highest": outputs.max(axis=0).tolist(),
         }
-        return self._of_modes(modes, n, rest, snapshots.parameters, sizes, told, left, kept)
+        return self._of_modes(modes, n, rest, snapshots.parameters, adjoints, sizes, told, left, kept)
 
     def _spread(self, snapshots: Snapshots) -> FloatArray:
         """Return the standard deviations (m,) of the outputs; of one that is round-off, the size of those of its unit.
@@ -159,7 +160,7 @@ class Reduction:
         if "m" in of_unit:
             of_unit["m"] = max(of_unit["m"], float(np.abs(snapshots.states[:, : self.model.space.displacements]).max()))
         size, found = np.array([of_unit[unit] for unit in units]), snapshots.outputs.std(axis=0)
-        return np.maximum(np.where(found > ROUNDING * size, found, size), 1e-300)
+        return np.maximum(np.where(found > ROUNDING * size, found, size), LEAST_SPREAD)
 
     def enriched(self, data: ReducedData, answers: Snapshots, sizes: Sizes) -> ReducedData:
         """Return a reduced model of this body that holds further solutions too, with a mode more for each of them.
@@ -175,14 +176,15 @@ class Reduction:
         first = np.vstack([old[:n], fresh])
         beside = np.vstack([old[n:], self._rest.normed(every[len(rest) :])])
         modes = np.vstack([first, self._rest.modes(beside, first, len(beside))[0]])
-        modes = np.vstack([modes, self._of_adjoints(layout.scatter(answers.adjoints), modes, len(fresh))])
+        adjoints = layout.scatter(answers.adjoints)
+        modes = np.vstack([modes, self._of_adjoints(adjoints, modes, len(fresh))])
         whole = np.vstack([data.coordinates[:, data.before :] @ old, rest])
         parameters = np.vstack([data.snapshots, answers.parameters])
         truncation = max(self._rest.left(rest, first), data.about["truncation"])
         told: dict[str, list[float]] = {
             name: data.about[name] for name in ("spread", "lowest", "highest") if name in data.about
         }
-        return self._of_modes(modes, len(first), whole, parameters, sizes, told, truncation, None)
+        return self._of_modes(modes, len(first), whole, parameters, adjoints, sizes, told, truncation, None)
 
     def places(self, states: FloatArray, parameters: FloatArray) -> NDArray[np.int64]:
         """Return where the body has its largest values (s, m) in states (s, U) at parameters (s, d).
@@ -236,6 +238,7 @@ class Reduction:
         n: int,
         rest: FloatArray,
         parameters: FloatArray,
+        adjoints: FloatArray,
         sizes: Sizes,
         of_outputs: dict[str, list[float]],
         truncation: float,
@@ -251,6 +254,8 @@ class Reduction:
             How many the model has.
         rest, parameters
             Snapshots (s, U_local) less what prescribed displacements move, and their parameters (s, d).
+        adjoints
+            Those of all outputs (k, U_local) at the last of these snapshots.
         sizes
             What the points may miss.
         of_outputs, truncation
@@ -263,7 +268,8 @@ class Reduction:
         rows = np.vstack([lifts, tests, modes])
         coordinates = np.hstack([moved, np.zeros((len(rest), len(tests))), rest @ self._rest.inner(modes).T])
         outputs = self._outputs.made(rows, rest + moved @ lifts, parameters, kept)
-        training = Training(rows, coordinates, parameters, len(lifts) + len(tests), len(tests))
+        on_outputs = self._on_outputs(adjoints, modes, np.array(of_outputs["spread"]), len(rest))
+        training = Training(rows, coordinates, parameters, len(lifts) + len(tests), len(tests), on_outputs)
         whole = layout.gather(rows)
         assert whole is not None
         cells, kind = layout.cells()
@@ -300,13 +306,26 @@ class Reduction:
                 **of_outputs,
             },
         )
-        untested = self.equations.p is not None or model.spec.solver.accept_unstable
+        untested = model.spec.solver.accept_unstable
         for shaken in (0, min(len(modes), STATES)):
             levels, told = self._rules.levels(training, (n, len(modes)), sizes.cubature, shaken, kept)
             data = replace(data, levels=levels, about=data.about | told)
             if untested or _definite(data):
                 break
         return data
+
+    def _on_outputs(self, adjoints: FloatArray, modes: FloatArray, spread: FloatArray, count: int) -> FloatArray:
+        """Return what forces on the modes do to outputs: coordinates (s, m, N) of adjoints over the spreads (m,).
+
+        Zero at snapshots of which the adjoints (k, U_local) are not known, which are the first ones of so many, and for
+        outputs that never differ from zero.
+        """
+        m = len(spread) if len(adjoints) else 0
+        found = np.zeros((count, m, len(modes)))
+        if m:
+            known = (adjoints @ self._rest.inner(modes).T).reshape(-1, m, len(modes))
+            found[count - len(known) :] = np.where(spread > LEAST_SPREAD, 1 / spread, 0.0)[:, None] * known
+        return found
 
     def _factor(self, number: int) -> tuple[FloatArray, FloatArray, float]:
         """Return the logarithm of a random field at the nodes, its slopes, and the variance that is kept."""

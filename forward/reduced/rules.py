@@ -37,6 +37,9 @@ class Training:
         Coordinates (s, N) and parameters (s, d) of the snapshots.
     before, tests
         How many coordinates come before the modes, and how many of these are fields that only test.
+    adjoints
+        Coordinates (s, m, N − before) of the adjoints of the outputs there, over the spread of these; none of them
+        where nobody knows them.
     """
 
     rows: FloatArray
@@ -44,12 +47,14 @@ class Training:
     parameters: FloatArray
     before: int
     tests: int
+    adjoints: FloatArray
 
     def some(self, most: int) -> Training:
         """Return an even part of the snapshots, at most so many."""
         count = len(self.parameters)
         few = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
-        return replace(self, coordinates=self.coordinates[few], parameters=self.parameters[few])
+        few_of = {name: getattr(self, name)[few] for name in ("coordinates", "parameters", "adjoints")}
+        return replace(self, **few_of)
 
     def shaken(self, count: int) -> Training:
         """Return these snapshots and so many more, moved at random in all modes: these tell the whole stiffness."""
@@ -58,21 +63,22 @@ class Training:
         random = np.random.default_rng(SEED).standard_normal((count, moved.shape[1] - self.before))
         size = np.linalg.norm(moved[:, self.before :], axis=1) / np.linalg.norm(random, axis=1)
         moved[:, self.before :] += np.sqrt(SHAKEN) * size[:, None] * random
-        rows = (self.coordinates, moved), (self.parameters, self.parameters[which])
-        coordinates, parameters = (np.concatenate(both) for both in rows)
-        return replace(self, coordinates=coordinates, parameters=parameters)
+        none = np.zeros_like(self.adjoints[which])  # those of other states are not known
+        rows = (self.coordinates, moved), (self.parameters, self.parameters[which]), (self.adjoints, none)
+        coordinates, parameters, adjoints = (np.concatenate(both) for both in rows)
+        return replace(self, coordinates=coordinates, parameters=parameters, adjoints=adjoints)
 
     def tested(self, modes: int) -> NDArray[np.int64]:
         """Return the coordinates on which works are tested: tests and the first modes."""
         return np.arange(self.before - self.tests, self.before + modes)
 
-    def projected(self, sizes: Sequence[int]) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Return coordinates (N,) and parameters (d,) of the snapshots on the first modes, so many each time."""
-        for c, point in zip(self.coordinates, self.parameters, strict=True):
+    def projected(self, sizes: Sequence[int]) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Return the snapshots on the first modes, so many each time: coordinates (N,), parameters (d,), adjoints."""
+        for c, point, adjoints in zip(self.coordinates, self.parameters, self.adjoints, strict=True):
             for size in sizes:
                 kept = np.zeros(len(self.rows))
                 kept[: self.before + size] = c[: self.before + size]
-                yield kept, point
+                yield kept, point, adjoints
 
 
 class Rules:
@@ -149,7 +155,9 @@ class Rules:
                 fixed = in_full[number][candidates[number]]
                 least = missed / (1 if level == 0 else FINER)
                 beside = of_densities if number == 0 else []
-                trained = training.shaken(shaken) if level and shaken else training
+                # Estimates of errors are what forces do to outputs, and only the larger model makes them.
+                trained = training if level else replace(training, adjoints=training.adjoints[:, :0])
+                trained = trained.shaken(shaken) if level and shaken else trained
                 rule = self._rule(number, points, beside, trained, sizes, least, fixed)
                 works.append(points.some(rule.points, rule.weights, before + n))
                 if number == 0:
@@ -171,20 +179,22 @@ class Rules:
     ) -> cubature.Rule:
         """Choose points and weights that integrate the works of projected snapshots, densities of outputs, and volume.
 
-        The works of each state are scaled to its forces, and mixed at random: a few hundred sums stand for all of them.
+        The works of each state on modes are scaled to its forces, those on adjoints, which are what forces that are
+        missed do to an output, to its spread. Mixed at random, a few hundred sums stand for all of them.
         """
         equations, numbers, sampler = self._equations, self._numbers, self._samplers[number]
         kernel = self._kernel(sampler)
         of_densities = [self._kernel(one) for one, _ in self._densities] if densities else []
         tests, tested = training.tests, training.tested(sizes[-1])
         whole = len(points.weights) == sampler.count
-        count = len(training.parameters) * len(sizes)
-        size = min(count * len(tested), 4 * len(tested) + 400)
-        mixture = cubature.Mixture(size, len(points.weights), SEED)
+        outputs = training.adjoints.shape[1]
+        count, each = len(training.parameters) * len(sizes), len(tested) + outputs
+        mixture = cubature.Mixture(min(count * each, 4 * each + 400), len(points.weights), SEED)
         rows: list[FloatArray] = []
+        of_forces = of_outputs = 0.0  # sums of squares of integrals
         m, n = points.fields.shape[:2]
         fields = np.ascontiguousarray(points.fields[:, :, tested])
-        for c, point in training.projected(sizes):
+        for c, point, adjoints in training.projected(sizes):
             components = (points.fields.reshape(m * n, -1) @ c).reshape(m, n)
             T = kernel(sampler.inputs(components, points, point), point[numbers])
             values = np.ascontiguousarray(spread(T[None], fields)[0].T)
@@ -202,14 +212,21 @@ class Rules:
                 rows.append(density / (total or 1.0))
             scale = np.full(len(tested), float(np.linalg.norm(targets[tests:])) or 1.0)
             scale[:tests] = np.where(targets[:tests] == 0, scale[:tests], np.abs(targets[:tests]))
-            mixture.add(values / scale[:, None], targets / scale)
+            adjoint = adjoints[:, : sizes[-1]]
+            on_modes, on_adjoints = targets / scale, adjoint @ targets[tests:]
+            both = values / scale[:, None], adjoint @ values[tests:]
+            mixture.add(np.concatenate(both), np.concatenate([on_modes, on_adjoints]))
+            of_forces += float(on_modes @ on_modes)
+            of_outputs += float(on_adjoints @ on_adjoints)
         volume = np.ones((1, len(points.weights))) / sampler.weights.sum()
         every = np.vstack([mixture.values, *rows, volume])
         aims = np.concatenate([mixture.integrals, np.ones(len(rows) + 1)])
-        rule = cubature.beside(every, aims, missed, np.where(fixed, points.weights, 0.0))
-        if whole and rule.missed > missed:  # then all points are needed
+        # Works on adjoints may be far larger than spreads of outputs: what is missed is relative to all but these.
+        share = float(np.sqrt(1 - of_outputs / (of_forces + of_outputs + len(rows) + 1)))
+        rule = cubature.beside(every, aims, missed * share, np.where(fixed, points.weights, 0.0))
+        if whole and rule.missed > missed * share:  # then all points are needed
             return cubature.Rule(np.arange(len(points.weights)), points.weights, 0.0)
-        return rule
+        return rule._replace(missed=rule.missed / share)
 
     def _kernel(self, sampler: Sampler) -> Kernel:
         tape = sampler.integrand.written.tape

@@ -28,13 +28,11 @@ class ReducedModelOfBody(Section):
             "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
             "over the true error; where it is 1, estimates can be taken for the errors."
         )
+        left = {name: percent(error) for name, error in told.get("errors after correction", {}).items()}
+        shares = {name: f"{share:.2f}" for name, share in told.get("effectivity", {}).items()}
         rows = [
-            (
-                name,
-                *(percent(told[which][name]) for which in ("errors", "errors after correction")),
-                f"{told['effectivity'][name]:.2f}",
-            )
-            for name in told.get("errors", ())
+            (name, percent(error), left.get(name, "–"), shares.get(name, "–"))
+            for name, error in told.get("errors", {}).items()
         ]
         yield Table(("output", "error", "after the correction", "effectivity"), rows)
         drawn = []
@@ -78,6 +76,11 @@ def card(results: Results) -> Card:
         lines.insert(1, f"a solve takes {number(own, 2)} ms, one of the body {number(full, 2)} ms")
     answers = [Answer("reduced model", f"{told['modes']} modes", lines)]
     for name, error in told.get("errors", {}).items():
+        if name not in told.get("effectivity", {}):
+            answers.append(
+                Answer(f"error of {name}", percent(error), ["of its spread; nothing estimates or corrects it"])
+            )
+            continue
         left = told["errors after correction"][name]
         true, estimated = (results.dataset[f"reduced_{w}"].sel(output=name) for w in ("error", "estimate"))
         rms = float(((true - estimated) ** 2).mean() ** 0.5)
