@@ -500,22 +500,29 @@ sys.exit(code)
 )
 
 
+@pytest.mark.mpi
 def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, one, monkeypatch):
-    """Killed in the first data set, and in the second: nothing is solved twice, and what is finished is shown."""
+    """Killed in the first data set, and in the second: nothing is solved twice, and what is finished is shown.
+
+    Two ranks end it: the same bytes, and all solves are counted in a line off the terminal.
+    """
     study, out = folder / "few.toml", folder / "killed"
     blocks, rows = [], []
-    for count in ("10", "30", ""):
-        monkeypatch.setenv("BLOCKS", count or "0")
-        done = run_script(None, KILLED, "run", study, "--out", out)
+    for count, ranks in ((10, None), (30, None), (0, 2)):
+        monkeypatch.setenv("BLOCKS", str(count))
+        done = run_script(ranks, KILLED, "run", study, "--out", out)
         assert done.returncode == (9 if count else 3), done.stderr
-        blocks.append(count or done.stdout.rpartition(" blocks")[0].split()[-1])
+        blocks.append(count or sum(map(int, re.findall(r"^(\d+) blocks$", done.stdout, re.MULTILINE))))
         table = out / "batch.csv"
         rows.append([row["data_set"] for row in csv.DictReader(table.open())] if table.exists() else [])
     assert rows == [[], ["made-1"], ["made-1", "made-2", "wrong"]]
     assert not (out / "evaluations").exists()
     assert (folder / "one/batch.csv").read_bytes() == (out / "batch.csv").read_bytes()
     assert (folder / "one/results.nc").read_bytes() == (out / "results.nc").read_bytes()
-    assert sum(map(int, blocks)) == one
+    assert sum(blocks) == one
+    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
+    solves = json.loads((out / "summary.json").read_text())["solves"]
+    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
 
 
 def field_by_program(folder, out, blocks=0, ranks=None):
@@ -536,36 +543,23 @@ def whole_field(folder):
     return int(done.stdout.removesuffix(" blocks\n"))
 
 
-def test_an_interrupted_field_keeps_its_solves(folder, whole_field):
-    """States, products with the Hessian, finer meshes: nothing is computed twice, and the result is the same."""
-    field_by_program(folder, "field-killed", blocks=60)
-    rest = field_by_program(folder, "field-killed").stdout.removesuffix(" blocks\n")
-    assert whole_field == 60 + int(rest) > 80
-    assert not (folder / "field-killed" / "evaluations").exists()
-    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
-
-
-@pytest.mark.usefixtures("one")
-def test_two_ranks_give_the_same_bytes_and_count_their_solves(folder):
-    """Of all data sets, in a line off the terminal."""
-    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "two")
-    assert done.returncode == 3, done.stderr
-    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
-    assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
-    solves = json.loads((folder / "two/summary.json").read_text())["solves"]
-    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
-
-
 IDLE = "{} groups of ranks were started for {} task"
 
 
 @pytest.mark.mpi
-@pytest.mark.usefixtures("whole_field")
-def test_a_field_leaves_a_rank_idle(folder):
-    done = field_by_program(folder, "field-two", ranks=2)
+def test_an_interrupted_field_keeps_its_solves(folder, whole_field):
+    """States, products with the Hessian, finer meshes: nothing is computed twice, and the result is the same.
+
+    On two ranks too, of which one has nothing to do.
+    """
+    field_by_program(folder, "field-killed", blocks=60)
+    done = field_by_program(folder, "field-killed", ranks=2)
     assert IDLE.format(2, 1) in done.stderr
     assert ": 1 of them will be idle" in done.stderr
-    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-two/results.nc").read_bytes()
+    rest = sum(map(int, re.findall(r"(\d+) blocks", done.stdout)))
+    assert whole_field == 60 + rest > 80
+    assert not (folder / "field-killed" / "evaluations").exists()
+    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
 
 
 @pytest.mark.mpi
