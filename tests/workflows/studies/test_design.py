@@ -514,13 +514,10 @@ def test_draws_of_a_field_are_found_by_a_restart_and_shared_by_ranks(tmp_path):
             time.sleep(0.02)
         begun.kill()
     assert not (out / "summary.json").exists()
-    done = on_ranks(None, *command, out)
+    done = on_ranks(2, TISSUQ, "run", tmp_path / "field.toml", "--quiet", "--out", out)
     assert done.returncode == 0, done.stderr
     assert_same_bits(tmp_path / "whole", out)
-    done = on_ranks(2, TISSUQ, "run", tmp_path / "field.toml", "--quiet", "--out", tmp_path / "two")
-    assert done.returncode == 0, done.stderr
-    assert_same_bits(tmp_path / "whole", tmp_path / "two")
-    assert "Share of the variance" in (tmp_path / "two" / "report.html").read_text()
+    assert "Share of the variance" in (out / "report.html").read_text()
 
 
 @pytest.mark.fem
