@@ -23,6 +23,8 @@ CLOSE = 1e-4  # forces left, relative to what they would be if they did not canc
 MOST = 3  # corrections in a frame
 LONGER, SHORTER = 0.05, 0.5  # share of the newest time in the time that something takes
 LOST = 0.3  # forces left from which on the factor is too far away
+OPEN = 1e-2  # forces left before the last correction from which on the frame is no answer of the model yet
+FADES = 0.5  # share of what tangents missed that is kept from one local model to the next
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,9 @@ class Frame(NamedTuple):
     ----------
     outputs
         Outputs (m,).
+    errors
+        Estimated errors (m,): those of the local model, and of outputs that are on its tangent what that may miss. What
+        tangents missed of their own predictions when the last local models came is what they are taken to miss now.
     residual
         Forces that were left before the last correction, relative to what they would be if they did not cancel.
     corrections
@@ -92,6 +97,7 @@ class Frame(NamedTuple):
     """
 
     outputs: FloatArray
+    errors: FloatArray
     residual: float
     corrections: int
 
@@ -122,6 +128,7 @@ class Stream:
         self.outputs = at.outputs.copy()  # at these parameters
         self.lost = False  # whether a new local model is needed
         self.behind, self.takes, self.besides = False, 0.0, 0.0
+        self._bent = np.zeros(len(at.outputs))  # what a tangent misses, over what it predicts
         self._each_frame = [i for i, output in enumerate(model.data.outputs) if output.kind != "peak"]
 
     def moved(self, at: Local) -> None:
@@ -131,6 +138,9 @@ class Stream:
         else:
             own = self._from_here(at, self.parameters)
             own[self._each_frame] = self.outputs[self._each_frame]
+            missed = np.abs(own - self._from_here(self.here, self.parameters))
+            far = self._far(self.here.parameters, self.parameters)
+            self._bent = np.maximum(np.divide(missed, far, out=np.zeros_like(far), where=far > 0), FADES * self._bent)
             self.outputs = own
         self.here, self.lost = at, False
 
@@ -138,11 +148,19 @@ class Stream:
     def _from_here(at: Local, parameters: FloatArray) -> FloatArray:
         return at.outputs + at.jacobian @ (parameters - at.parameters)
 
+    def _far(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """How much each parameter moves the outputs (m,) along the tangent, summed over them without their signs."""
+        far: FloatArray = np.abs(self.here.jacobian) @ np.abs(end - start)
+        return far
+
     def linear(self, parameters: FloatArray) -> Frame:
         """Return the last frame moved along the slopes to parameters (d,), without solving anything."""
         if self.lost:
-            return Frame(self._from_here(self.here, parameters), np.nan, 0)
-        return Frame(self.outputs + self.here.jacobian @ (parameters - self.parameters), np.nan, 0)
+            return Frame(self._from_here(self.here, parameters), np.full(len(self.outputs), np.nan), np.nan, 0)
+        far = self._far(self.here.parameters, parameters)
+        far[self._each_frame] = self._far(self.parameters, parameters)[self._each_frame]
+        moved = self.here.jacobian @ (parameters - self.parameters)
+        return Frame(self.outputs + moved, self.here.errors + self._bent * far, np.nan, 0)
 
     def frame(self, parameters: FloatArray, within: float = math.inf) -> Frame:
         """Correct the state for parameters (d,) within a time (s).
@@ -174,11 +192,12 @@ class Stream:
         if not residual < LOST:
             self.lost = True
             return self.linear(parameters)
-        outputs = self._from_here(self.here, parameters)
+        outputs, far = self._from_here(self.here, parameters), self._far(self.here.parameters, parameters)
+        far[self._each_frame] = 0.0
         outputs[self._each_frame] = level.some_outputs(self._each_frame, c, parameters)
         self.modes, self.parameters, self.outputs = c[level.free].copy(), parameters.copy(), outputs
         self.besides = _learnt(self.besides, time.perf_counter() - now)
-        return Frame(outputs.copy(), residual, corrections)
+        return Frame(outputs.copy(), self.here.errors + self._bent * far, residual, corrections)
 
 
 def _learnt(before: float, seconds: float) -> float:

@@ -15,8 +15,9 @@ A frame is corrected as long as that is done within `WITHIN`. Where a correction
 frame moved along the slopes of the local model (`corrections` is 0), and the correction follows once it has been sent.
 When it is late, that is, when more than one line waits, only the last one is solved for; the others are answered in
 that way, and say so. Where the model cannot follow (a jump), frames are those of the nearest local model until the next
-one is there; they say so in `doubt`, and so do those where no local model can be made, since there is no equilibrium or
-none that is stable. Errors and spread are null then: those that are known are of another place.
+one is there; they say so in `doubt`, and so do those whose forces were far from balance before their last correction,
+and those where no local model can be made, since there is no equilibrium or none that is stable. Errors and spread are
+null then: those that are known are of another place.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ from typing import Any
 
 import numpy as np
 
-from forward.model import FloatArray, SolveError
+from forward.model import SolveError
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
-from forward.reduced.stream import Local, Stream, local
+from forward.reduced.stream import OPEN, Frame, Local, Stream, local
 from workflows.config.mistakes import StudyError
 from workflows.live.mail import Mail, pair
 
@@ -50,6 +51,7 @@ SHOWN = 1 / 60  # s between states that are sent to the page
 BEHIND = 5  # how much nicer the other processes are than the loop
 LONGEST = 2**16  # bytes of a line
 FAR = "the body has moved too far at once: outputs are on the tangent at another place, until this one is solved"
+UNBALANCED = "forces were out of balance by more than 1 % before the last correction: the body moves too fast to follow"
 NOT_PROMPT = "the usual one: frames are late where others want the processors (`ulimit -r 1` would let it be real time)"
 
 
@@ -226,13 +228,13 @@ class Loop:
         except (ValueError, TypeError, OverflowError, RecursionError):
             return {**own, "error": "expected a table of numbers by parameter, in JSON"}
         frame = self.stream.linear(self._now) if late else self.stream.frame(self._now, WITHIN)
-        here, beyond, doubt = self.stream.here, outside_of(self._data, self._now), self._doubt
+        beyond, doubt = outside_of(self._data, self._now), self._doubt(frame)
         unknown = np.full(len(frame.outputs), np.nan)
         return {
             **own,
             "outputs": _known(frame.outputs),
-            "errors": _known(unknown if doubt else here.errors),
-            "spread": _known(unknown if doubt else here.spread),
+            "errors": _known(unknown if doubt else frame.errors),
+            "spread": _known(unknown if doubt else self.stream.here.spread),
             "residual": _known([frame.residual])[0],
             "corrections": frame.corrections,
             "late": late,
@@ -242,10 +244,11 @@ class Loop:
             "microseconds": round(1e6 * (time.perf_counter() - begin)),
         }
 
-    @property
-    def _doubt(self) -> str:
+    def _doubt(self, frame: Frame) -> str:
         """Why the newest frame is not an answer of the model; empty if it is one."""
-        return self._refused or (FAR if self.stream.lost else "")
+        if self._refused or self.stream.lost:
+            return self._refused or FAR
+        return UNBALANCED if frame.residual > OPEN else ""
 
     def _set(self, values: dict[str, float]) -> None:
         names = self._data.parameters
@@ -295,11 +298,11 @@ class Loop:
         now = time.monotonic()
         if self._view is not None and now - self._shown >= SHOWN:
             self._shown = now
-            outputs: FloatArray = self.stream.linear(self._now).outputs
-            here = self.stream.here
-            errors, spread = (np.full(len(outputs), np.nan) if self._doubt else x for x in (here.errors, here.spread))
+            frame = self.stream.linear(self._now)
+            known = frame.errors, self.stream.here.spread
+            errors, spread = (np.full(len(x), np.nan) if self._doubt(frame) else x for x in known)
             try:
-                self._view.send((self._now, self.stream.modes, outputs, errors, spread))
+                self._view.send((self._now, self.stream.modes, frame.outputs, errors, spread))
             except OSError:  # the page has ended; frames go on
                 self._selector.unregister(self._view)
                 self._view = None

@@ -35,6 +35,23 @@ def test_frames_follow_the_equilibrium(model, small):  # noqa: F811
         assert (np.abs(frame.outputs - exact) < 1e-3 * spread)[smooth].all()
 
 
+def test_errors_count_what_the_tangent_misses(model, small):  # noqa: F811
+    """Of a largest stress, which stays on the tangent of local models that come late."""
+    stream, asked = begin(model, SPREAD), NOMINAL
+    peak = next(i for i, output in enumerate(small.outputs) if output.kind == "peak")
+    missed, claimed = [], []
+    for k in range(120):
+        at = NOMINAL + SPREAD * np.sin(0.05 * k * np.array([1, 0.7, 1.2, 0.9, 1.1, 0.8, 0]))
+        if k % 6 == 0:
+            stream.moved(local(model, asked, None, SPREAD))
+            asked = at
+        frame = stream.frame(at)
+        missed.append(abs(frame.outputs - model.reduced(at).outputs)[peak])
+        claimed.append((frame.errors - stream.here.errors)[peak])
+    assert 0.5 < np.median(claimed[12:]) / np.median(missed[12:]) < 2
+    assert np.mean(np.array(missed[12:]) < 3 * np.array(claimed[12:])) > 0.8
+
+
 def test_a_local_model_knows_errors_and_spread(model):
     solution = model.reduced(NOMINAL)
     uncertain = SPREAD * np.array([1, 0, 1, 0, 0, 0, 0])
@@ -110,6 +127,9 @@ def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path):  # noqa: F81
         late = loop.answer(b'{"loads.pressure.size": 212}', late=True)
         assert late["late"]
         assert late["corrections"] == 0
+        balanced = loop.stream.frame(loop._now)
+        assert loop._doubt(balanced) == ""
+        assert "out of balance" in loop._doubt(balanced._replace(residual=0.02))
         assert "outside the trained range" in loop.answer(b'{"loads.pressure.size": 900}')["outside"]
         assert "expected one of" in loop.answer(b'{"x": 1}')["error"]
         for wrong in (b"no", b"[" * 9999, *(b'{"id": 3, "loads.pressure.size": %s}' % x for x in WRONG)):
