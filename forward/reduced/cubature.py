@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
 from forward.model import FloatArray
 
 SHARE = 0.05  # of the points that are in, how many enter at once
 TIMES = 2  # how often each row is taken in a mixture
+LEAST = 1e-13  # by which diagonals of normal equations are raised, relative,
+RAISED = (1e-10, 1e-7)  # and where points do the same
 
 
 class Rule(NamedTuple):
@@ -46,25 +48,24 @@ def chosen(values: FloatArray, integrals: FloatArray, tolerance: float, most: in
     """
     scale = np.linalg.norm(values, axis=0)
     scale[scale == 0] = 1.0
-    A = values / scale
-    right = integrals @ A
+    of_points = np.ascontiguousarray((values / scale).T)
+    right = of_points @ integrals
     goal = float(np.linalg.norm(integrals))
-    inside, gram, x = np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros(0)
+    inside, x, equations = np.zeros(0, dtype=np.int64), np.zeros(0), _Normal()
     residual = integrals.copy()
-    barred = np.zeros(A.shape[1], dtype=bool)  # points that have just proved of no use
+    barred = np.zeros(len(of_points), dtype=bool)  # points that have just proved of no use
     while goal > 0 and np.linalg.norm(residual) > tolerance * goal and len(inside) < most:
-        gains = residual @ A
+        gains = of_points @ residual
         gains[inside] = -np.inf
         gains[barred] = -np.inf
         best = np.argsort(-gains)[: max(1, round(SHARE * len(inside)))]
         best = best[gains[best] > max(1e-13 * goal, 0.5 * gains[best[0]])]
         if not len(best):
             break
-        beside = A[:, inside].T @ A[:, best]
-        gram = np.block([[gram, beside], [beside.T, A[:, best].T @ A[:, best]]])
+        equations.enter(of_points[inside] @ of_points[best].T, of_points[best] @ of_points[best].T)
         inside, x = np.concatenate([inside, best]), np.concatenate([x, np.zeros(len(best))])
         while True:
-            s = _solved(gram, right[inside])
+            s = equations.solved(right[inside])
             if (s > 0).all():
                 x = s
                 break
@@ -75,8 +76,9 @@ def chosen(values: FloatArray, integrals: FloatArray, tolerance: float, most: in
             out = down & (x <= 1e-12 * x.max(initial=0.0))
             barred[:] = False
             barred[inside[out]] = True
-            inside, x, gram = inside[~out], x[~out], gram[np.ix_(~out, ~out)]
-        residual = integrals - A[:, inside] @ x
+            inside, x = inside[~out], x[~out]
+            equations.leave(out)
+        residual = integrals - x @ of_points[inside]
     order = np.argsort(inside)
     missed = float(np.linalg.norm(residual) / goal) if goal > 0 else 0.0
     return Rule(inside[order], (x / scale[inside])[order], missed)
@@ -93,15 +95,55 @@ def beside(values: FloatArray, integrals: FloatArray, tolerance: float, kept: Fl
     return Rule(points[order], np.concatenate([kept[there], rule.weights])[order], rule.missed * share)
 
 
-def _solved(gram: FloatArray, right: FloatArray) -> FloatArray:
-    for more in (1e-13, 1e-10, 1e-7):
-        raised = gram.copy()
-        raised[np.diag_indices_from(gram)] *= 1 + more
+class _Normal:
+    """Normal equations of the points that are in, and their Cholesky factor: of it only what changes is made again."""
+
+    def __init__(self) -> None:
+        self._gram = np.zeros((0, 0))
+        self._factor: FloatArray | None = None  # lower; None where points do the same
+
+    def enter(self, beside: FloatArray, among: FloatArray) -> None:
+        """Add points, by their products with those that are in (k, b) and among each other (b, b)."""
+        self._gram = np.block([[self._gram, beside], [beside.T, among]])
+        known = self._factor
+        across = None if known is None else solve_triangular(known, beside, lower=True, check_finite=False).T
+        self._go_on(known, across)
+
+    def leave(self, out: NDArray[np.bool_]) -> None:
+        """Leave out some of the points (k,)."""
+        first, stay = int(np.argmax(out)), ~out
+        self._gram = self._gram[np.ix_(stay, stay)]
+        known = None if self._factor is None else self._factor[stay, :first]
+        self._go_on(None if known is None else known[:first], None if known is None else known[first:])
+
+    def _go_on(self, known: FloatArray | None, across: FloatArray | None) -> None:
+        """Find the rest of the factor from that (j, j) of the first points, and the part across (k − j, j)."""
+        if known is None or across is None:
+            known, across = np.zeros((0, 0)), np.zeros((len(self._gram), 0))
+        j = len(known)
         try:
-            return np.asarray(cho_solve(cho_factor(raised), right))
-        except LinAlgError:  # points that do the same
-            continue
-    return np.asarray(np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+            corner = cholesky(_raised(self._gram[j:, j:], LEAST) - across @ across.T, lower=True, check_finite=False)
+        except LinAlgError:
+            self._factor = None
+            return
+        self._factor = np.block([[known, np.zeros((j, len(corner)))], [across, corner]])
+
+    def solved(self, right: FloatArray) -> FloatArray:
+        """Return the weights (k,) for right sides (k,)."""
+        if self._factor is not None:
+            return np.asarray(cho_solve((self._factor, True), right, check_finite=False))
+        for more in RAISED:
+            try:
+                return np.asarray(cho_solve(cho_factor(_raised(self._gram, more)), right))
+            except LinAlgError:
+                continue
+        return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-10)[0])
+
+
+def _raised(gram: FloatArray, more: float) -> FloatArray:
+    raised = gram.copy()
+    raised[np.diag_indices_from(gram)] *= 1 + more
+    return raised
 
 
 class Mixture:
