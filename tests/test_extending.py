@@ -39,6 +39,7 @@ def test_the_page_has_one_file_for_each_kind(folder):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_study_of_a_body_on_two_ranks(folder, schema):
     study, out = folder / "wound.toml", folder / "wound"
     schema.validate(tomllib.loads(study.read_text()))

@@ -158,6 +158,7 @@ noise = {}
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_candidate_with_regions_of_a_mesh(site, tmp_path):
     """By measured outputs, on two ranks and on one; the report has its constants with their units."""
     meshio.write(tmp_path / "block.msh", meshes.box(), file_format="gmsh22", binary=False)

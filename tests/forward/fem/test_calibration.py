@@ -150,6 +150,7 @@ def solved(spec):
 
 
 @pytest.mark.fem
+@pytest.mark.slow
 def test_errors_on_a_curved_body_are_those_of_its_polyhedron(tmp_path):
     """Against the elements of one degree more on a mesh that is cut in four."""
     solution = solved(arch(tmp_path, 1))
@@ -239,6 +240,7 @@ for comm in groups(1, 2):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_ranks_agree(tmp_path):
     done = run_script(2, SCRIPT, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -113,6 +113,7 @@ for one, other in zip(solve(MPI.COMM_WORLD), solve(MPI.COMM_SELF)):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_two_ranks_share_a_body_with_friction():
     done = run_script(2, SCRIPT)
     assert done.returncode == 0, done.stderr

@@ -261,6 +261,7 @@ def test_files_that_cannot_be_read(tmp_path, name, damage, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_files_damaged_by_chance(tmp_path, capfd):
     """Whatever is wrong, it is a line, or data: nothing else."""
     chance = random.Random(3)

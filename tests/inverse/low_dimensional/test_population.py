@@ -50,6 +50,7 @@ def closed_form(y, sigma, prior):
     return mean, float(np.sqrt((w * (m - mean) ** 2).sum())), each
 
 
+@pytest.mark.slow
 def test_specimens_far_from_their_prior_are_drawn_again():
     """Their own draws do not reach where the population is; without them it errs by four standard deviations."""
     rng, sigma, prior = np.random.default_rng(1), 1.0, Normal(mean=0.0, std=1.0)
@@ -162,6 +163,7 @@ def test_covariates_are_numbers_or_words():
             grade.row(new)
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_claim():
     """Some of the 200 populations of `python -m benchmarks population`."""
     from benchmarks.population import coverage

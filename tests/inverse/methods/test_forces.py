@@ -287,6 +287,7 @@ def test_fields_of_stiffness_get_their_mean_from_forces(folder):
     np.testing.assert_allclose(predicted, found["measured"].values[found["datum_axis"].values >= 3], rtol=0.06)
 
 
+@pytest.mark.slow
 def test_candidates_are_compared_by_forces_too(folder):
     here(folder / "select.toml", folder / "out-select")
     found = xr.load_dataset(folder / "out-select" / "results.nc", engine="h5netcdf")

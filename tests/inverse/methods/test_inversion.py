@@ -361,6 +361,7 @@ def test_synthetic_surfaces_are_read_again(tmp_path):
             load(tmp_path / "made.toml", [*changes, wrong])
 
 
+@pytest.mark.slow
 def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
     """Turned by 5°, shifted by 10 mm, in mm, with a missing component; and a wider one if that is uncertain."""
     place = folder / "turned"
@@ -458,6 +459,7 @@ def test_one_bad_file_does_not_stop_the_others(folder, looked_at):
         assert np.isfinite(left_out.elpd_loo)
 
 
+@pytest.mark.slow
 def test_solves_without_a_model_are_counted_in_batches_too(folder, monkeypatch):
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
     prior = "parameters.material.mu={ kind = 'normal', mean = 1e4, std = 3e4 }"

@@ -188,6 +188,7 @@ def test_outputs_that_follow_single_cells_are_named(tmp_path):
 
 
 @pytest.mark.fem
+@pytest.mark.slow
 def test_bodies_are_looked_at_on_finer_meshes(tmp_path):
     (tmp_path / "bars.toml").write_text(BARS)
     assert main(["run", str(tmp_path / "bars.toml"), "--out", str(tmp_path / "out"), "--quiet", "--no-report"]) in (

@@ -211,6 +211,7 @@ def test_a_batch_predicts_from_each_posterior(folder):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_neither_ranks_nor_kills_matter(folder, tmp_path):
     """The same bytes where a run ended among the solves for what is predicted, and two ranks went on."""
     (tmp_path / "study.toml").write_text((folder / "same.toml").read_text())

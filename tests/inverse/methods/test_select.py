@@ -96,6 +96,7 @@ def texts(found):
     return [finding.text for finding in findings(found)]
 
 
+@pytest.mark.slow
 def test_uniaxial_data_alone_mislead():
     """Up to fourfold stretch Mooney–Rivlin fits tension, and Yeoh all three modes: what is said in the report."""
     study = load(CONFIGS / "treloar.toml", ["data.between=[1, 4]", "method.samples=64", "method.other_noises={}"])
@@ -155,6 +156,7 @@ def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
     assert any("the model does not explain these data" in one.text and one.severity == "error" for one in found)
 
 
+@pytest.mark.slow
 def test_left_out_scores_of_a_linear_model():
     """A normal posterior has normal predictions of each left-out datum: closed forms."""
     priors = {"C1": Normal(mean=2e5, std=1e5), "C2": Normal(mean=0.0, std=1e5)}

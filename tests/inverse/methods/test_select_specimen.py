@@ -176,6 +176,7 @@ def test_one_line_for_a_mistake(study, old, new, told):
     assert len(caught.value.args) == 1
 
 
+@pytest.mark.slow
 def test_what_a_mesh_does_to_an_evidence(study):
     """Beside the evidence of a model that has no such error, of one candidate that moves little and one that does."""
     it = load(study, ["method.noise.absolute=0.06", "method.samples=64", "method.mesh_error='report'"])

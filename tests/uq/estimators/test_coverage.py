@@ -94,6 +94,7 @@ def is_unbiased(deviations):
     return abs(deviations.mean()) < 4 * deviations.std(ddof=1) / np.sqrt(len(deviations))
 
 
+@pytest.mark.slow
 def test_sensitivity_monte_carlo_is_unbiased_and_a_wrong_expansion_point_is_noticed(monkeypatch):
     method = SensitivityMonteCarlo(samples=32, fields=False)
     mean, variance, *_ = repeats(method)

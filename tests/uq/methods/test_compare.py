@@ -75,6 +75,7 @@ def compared():
     return comparison(PLAIN, CONTROLLED, SOBOL, repeats=40).run(INPUTS, serial())
 
 
+@pytest.mark.slow
 def test_plain_monte_carlo_errs_as_theory_says(compared):
     plain = of(compared, "monte-carlo")
     exact = STD / np.sqrt(plain["budget"])

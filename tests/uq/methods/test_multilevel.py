@@ -467,6 +467,7 @@ def small(tmp_path_factory):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_same_bits_on_any_number_of_groups(small, tmp_path):
     done = run(2, TISSUQ, "run", small / "small.toml", *SMALL, "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr

@@ -210,6 +210,7 @@ def test_claimed_intervals_cover(control, coefficient):
     check_coverage(PRODUCT, 250, samples=256, control=control, coefficient=coefficient)
 
 
+@pytest.mark.slow
 def test_claimed_intervals_cover_with_a_chaos_control():
     check_coverage(STEEP, 200, samples=64, control="chaos", coefficient="one")
 

@@ -136,6 +136,7 @@ main(sys.argv[1:])
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_the_same_bytes_on_groups_of_ranks_and_after_a_kill(tmp_path):
     """The first 64 samples are 16 blocks, and the second prediction is in use when it is killed."""
     study = ["run", "configs/tiny.toml", "--quiet", "--no-report", "--set", "model.body.cells=[2, 1, 1]"]

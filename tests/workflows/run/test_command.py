@@ -150,6 +150,7 @@ def test_another_study_is_refused(finished):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_same_bits_on_any_number_of_groups(finished, tmp_path):
     """On three, and without mpirun; one and two are in the test of kills."""
     done = tissuq("run", TINY, "--out", tmp_path / "out", "--no-report", ranks=3)

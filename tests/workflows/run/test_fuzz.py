@@ -181,7 +181,15 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("name", "how"), [("a.vtu", {"binary": False}), ("a.vtu", {}), ("a.xdmf", {}), ("a.vtk", {})])
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("a.vtu", {"binary": False}),
+        ("a.xdmf", {}),
+        pytest.param("a.vtu", {}, marks=pytest.mark.slow),
+        pytest.param("a.vtk", {}, marks=pytest.mark.slow),
+    ],
+)
 def test_meshes_with_mistakes(tmp_path, name, how, count):
     """As bodies and as files of displacements in turn: some formats are read by a process of their own each time."""
     whole = numbered(box())

@@ -332,6 +332,7 @@ def test_limits_of_files_that_mpi_cannot_bear_are_said(study, tmp_path):
 
 @pytest.mark.fem
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
+@pytest.mark.slow
 def test_a_file_system_that_is_full(tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()

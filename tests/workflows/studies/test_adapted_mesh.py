@@ -100,6 +100,7 @@ def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished, looke
     assert "cells in bright colours" in page
 
 
+@pytest.mark.slow
 def test_the_number_of_ranks_does_not_matter(study, finished):
     directory = study.parent / "on three"
     tissuq("run", study, "--out", directory, "--no-report", ranks=3)

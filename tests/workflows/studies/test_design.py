@@ -503,6 +503,7 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
 
 
 @pytest.mark.fem
+@pytest.mark.slow
 def test_draws_of_a_field_are_found_by_a_restart_and_shared_by_ranks(tmp_path):
     (tmp_path / "field.toml").write_text(FIELD + "number = 3\ndraws = 4\n")
     command = [TISSUQ, "run", tmp_path / "field.toml", "--no-report", "--quiet", "--out"]

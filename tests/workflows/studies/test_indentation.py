@@ -50,6 +50,7 @@ mesh_error = false
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_any_number_of_ranks(tmp_path):
     """Groups give the same bytes; ranks that share a model agree to rounding."""
     study = tmp_path / "ball.toml"

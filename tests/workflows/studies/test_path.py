@@ -64,6 +64,7 @@ def test_curves_are_the_same_on_any_number_of_ranks(tmp_path, looked_at):
 
 
 @pytest.mark.fem
+@pytest.mark.slow
 def test_a_measured_curve_is_inverted(tmp_path, looked_at):
     study = tmp_path / "curve.toml"
     measured = STUDY.partition("[parameters]")[0] + INVERSION

@@ -85,6 +85,7 @@ def texts(directory):
     return [one["text"] for one in json.loads((directory / "summary.json").read_text())["findings"]]
 
 
+@pytest.mark.slow
 def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path, looked_at):
     """The same bytes on any number of ranks and after an end amid it, and without the data a finding that says so."""
     mean, std, each = closed_form(VALUES, 1.0, Normal(mean=0.0, std=1.0))
