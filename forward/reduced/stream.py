@@ -127,6 +127,7 @@ class Stream:
         self.parameters = at.parameters.copy()
         self.outputs = at.outputs.copy()  # at these parameters
         self.lost = False  # whether a new local model is needed
+        self.unbalanced = False  # whether forces were far from balance before the last correction
         self.behind, self.takes, self.besides = False, 0.0, 0.0
         self._bent = np.zeros(len(at.outputs))  # what a tangent misses, over what it predicts
         self._each_frame = [i for i, output in enumerate(model.data.outputs) if output.kind != "peak"]
@@ -135,6 +136,7 @@ class Stream:
         """Use another local model from now on."""
         if self.lost:
             self.modes, self.parameters, self.outputs = at.modes.copy(), at.parameters.copy(), at.outputs.copy()
+            self.unbalanced = False
         else:
             own = self._from_here(at, self.parameters)
             own[self._each_frame] = self.outputs[self._each_frame]
@@ -192,6 +194,7 @@ class Stream:
         if not residual < LOST:
             self.lost = True
             return self.linear(parameters)
+        self.unbalanced = residual > OPEN
         outputs, far = self._from_here(self.here, parameters), self._far(self.here.parameters, parameters)
         far[self._each_frame] = 0.0
         outputs[self._each_frame] = level.some_outputs(self._each_frame, c, parameters)

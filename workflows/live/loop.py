@@ -41,7 +41,7 @@ from forward.model import SolveError
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
-from forward.reduced.stream import OPEN, Frame, Local, Stream, local
+from forward.reduced.stream import Local, Stream, local
 from workflows.config.mistakes import StudyError
 from workflows.live.mail import Mail, pair
 
@@ -228,7 +228,7 @@ class Loop:
         except (ValueError, TypeError, OverflowError, RecursionError):
             return {**own, "error": "expected a table of numbers by parameter, in JSON"}
         frame = self.stream.linear(self._now) if late else self.stream.frame(self._now, WITHIN)
-        beyond, doubt = outside_of(self._data, self._now), self._doubt(frame)
+        beyond, doubt = outside_of(self._data, self._now), self._doubt
         unknown = np.full(len(frame.outputs), np.nan)
         return {
             **own,
@@ -244,11 +244,12 @@ class Loop:
             "microseconds": round(1e6 * (time.perf_counter() - begin)),
         }
 
-    def _doubt(self, frame: Frame) -> str:
+    @property
+    def _doubt(self) -> str:
         """Why the newest frame is not an answer of the model; empty if it is one."""
         if self._refused or self.stream.lost:
             return self._refused or FAR
-        return UNBALANCED if frame.residual > OPEN else ""
+        return UNBALANCED if self.stream.unbalanced else ""
 
     def _set(self, values: dict[str, float]) -> None:
         names = self._data.parameters
@@ -300,7 +301,7 @@ class Loop:
             self._shown = now
             frame = self.stream.linear(self._now)
             known = frame.errors, self.stream.here.spread
-            errors, spread = (np.full(len(x), np.nan) if self._doubt(frame) else x for x in known)
+            errors, spread = (np.full(len(x), np.nan) if self._doubt else x for x in known)
             try:
                 self._view.send((self._now, self.stream.modes, frame.outputs, errors, spread))
             except OSError:  # the page has ended; frames go on

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from forward.reduced import stream
 from forward.reduced.data import load, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.stream import Stream, begin, local
@@ -109,7 +110,7 @@ def test_where_there_is_no_time_the_last_frame_moves_along_the_slopes(model, sma
 WRONG = (b'"soft"', b'"1"', b"true", b"null", b"NaN", b"1e999", b"1" * 400)
 
 
-def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path):  # noqa: F811
+def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path, monkeypatch):  # noqa: F811
     import json
 
     from workflows.live.loop import Loop, listen
@@ -127,9 +128,15 @@ def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path):  # noqa: F81
         late = loop.answer(b'{"loads.pressure.size": 212}', late=True)
         assert late["late"]
         assert late["corrections"] == 0
-        balanced = loop.stream.frame(loop._now)
-        assert loop._doubt(balanced) == ""
-        assert "out of balance" in loop._doubt(balanced._replace(residual=0.02))
+        # A frame that was far from balance says so, and so do those on its tangent, until one is in balance.
+        assert "doubt" not in answer
+        loop.stream.modes = 0.98 * loop.stream.modes
+        monkeypatch.setattr(stream, "MOST", 1)
+        for unbalanced in (True, False):
+            frame = loop.stream.frame(loop._now)
+            assert (frame.residual > stream.OPEN) == unbalanced
+            late = loop.answer(b"{}", late=True)
+            assert ("out of balance" in late.get("doubt", "")) == unbalanced == (set(late["errors"]) == {None})
         assert "outside the trained range" in loop.answer(b'{"loads.pressure.size": 900}')["outside"]
         assert "expected one of" in loop.answer(b'{"x": 1}')["error"]
         for wrong in (b"no", b"[" * 9999, *(b'{"id": 3, "loads.pressure.size": %s}' % x for x in WRONG)):
