@@ -96,48 +96,72 @@ def beside(values: FloatArray, integrals: FloatArray, tolerance: float, kept: Fl
 
 
 class _Normal:
-    """Normal equations of the points that are in, and their Cholesky factor: of it only what changes is made again."""
+    """Normal equations of the points that are in, and their Cholesky factor: only what changes is made or moved.
+
+    Of both the lower triangle is kept, in the corner of an array that has room for more.
+    """
 
     def __init__(self) -> None:
-        self._gram = np.zeros((0, 0))
-        self._factor: FloatArray | None = None  # lower; None where points do the same
+        self._count = 0
+        self._grams, self._factors = np.zeros((0, 0)), np.zeros((0, 0))
+        self._whole = True  # whether there is a factor: there is none where points do the same
 
     def enter(self, beside: FloatArray, among: FloatArray) -> None:
         """Add points, by their products with those that are in (k, b) and among each other (b, b)."""
-        self._gram = np.block([[self._gram, beside], [beside.T, among]])
-        known = self._factor
-        across = None if known is None else solve_triangular(known, beside, lower=True, check_finite=False).T
-        self._go_on(known, across)
+        k, n = beside.shape[0], beside.shape[0] + len(among)
+        if n > len(self._grams):
+            self._grams, self._factors = (_roomier(one, k, 2 * n) for one in (self._grams, self._factors))
+        self._grams[k:n, :k], self._grams[k:n, k:n] = beside.T, among
+        if self._whole and k:
+            across = solve_triangular(self._factors[:k, :k], beside, lower=True, check_finite=False)
+            self._factors[k:n, :k] = across.T
+        self._count = n
+        self._go_on(k)
 
     def leave(self, out: NDArray[np.bool_]) -> None:
         """Leave out some of the points (k,)."""
-        first, stay = int(np.argmax(out)), ~out
-        self._gram = self._gram[np.ix_(stay, stay)]
-        known = None if self._factor is None else self._factor[stay, :first]
-        self._go_on(None if known is None else known[:first], None if known is None else known[first:])
+        first = int(np.argmax(out))
+        behind = first + np.flatnonzero(~out[first:])
+        n = first + len(behind)
+        self._grams[first:n, :first] = self._grams[behind, :first]
+        self._grams[first:n, first:n] = self._grams[np.ix_(behind, behind)]
+        self._factors[first:n, :first] = self._factors[behind, :first]
+        self._count = n
+        self._go_on(first)
 
-    def _go_on(self, known: FloatArray | None, across: FloatArray | None) -> None:
-        """Find the rest of the factor from that (j, j) of the first points, and the part across (k − j, j)."""
-        if known is None or across is None:
-            known, across = np.zeros((0, 0)), np.zeros((len(self._gram), 0))
-        j = len(known)
+    def _go_on(self, j: int) -> None:
+        """Make the rest of the factor from that of the first points, of which there are j, and their part across."""
+        n, j = self._count, j if self._whole else 0
+        across = self._factors[j:n, :j]
+        corner = _raised(self._grams[j:n, j:n], LEAST) - across @ across.T
         try:
-            corner = cholesky(_raised(self._gram[j:, j:], LEAST) - across @ across.T, lower=True, check_finite=False)
+            self._factors[j:n, j:n] = cholesky(corner, lower=True, check_finite=False)
         except LinAlgError:
-            self._factor = None
-            return
-        self._factor = np.block([[known, np.zeros((j, len(corner)))], [across, corner]])
+            self._whole = False
+        else:
+            self._whole = True
 
     def solved(self, right: FloatArray) -> FloatArray:
         """Return the weights (k,) for right sides (k,)."""
-        if self._factor is not None:
-            return np.asarray(cho_solve((self._factor, True), right, check_finite=False))
+        n = self._count
+        if self._whole:
+            factor = self._factors[:n, :n]
+            half = solve_triangular(factor, right, lower=True, check_finite=False)
+            return np.asarray(solve_triangular(factor, half, lower=True, trans=1, check_finite=False))
+        gram = np.tril(self._grams[:n, :n])
+        gram += np.tril(gram, -1).T
         for more in RAISED:
             try:
-                return np.asarray(cho_solve(cho_factor(_raised(self._gram, more)), right))
+                return np.asarray(cho_solve(cho_factor(_raised(gram, more)), right))
             except LinAlgError:
                 continue
-        return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-10)[0])
+        return np.asarray(np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+
+
+def _roomier(corner: FloatArray, k: int, size: int) -> FloatArray:
+    found = np.zeros((size, size))
+    found[:k, :k] = corner[:k, :k]
+    return found
 
 
 def _raised(gram: FloatArray, more: float) -> FloatArray:
