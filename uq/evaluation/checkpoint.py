@@ -11,11 +11,12 @@ import hashlib
 import json
 import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, TypeVar
 
 import h5py
 import numpy as np
@@ -25,6 +26,7 @@ from forward.model import WORK, ModelError, Stability
 from uq.evaluation.hdf5 import creation, image, in_memory
 from uq.evaluation.request import Evaluations, Failure
 
+T = TypeVar("T")
 OPTIONAL = ("mesh_errors", "saturations")  # arrays that evaluations have on request
 HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
 
@@ -83,6 +85,8 @@ class Checkpoint:
     def has(self, key: str) -> bool:
         """Whether a block is finished; one that is damaged or answers another request is removed.
 
+        It may be gone a moment later: a job that finishes the study removes all blocks, whoever still reads them.
+
         Raises
         ------
         ModelError
@@ -95,6 +99,8 @@ class Checkpoint:
             _check(path, key)
             with h5py.File(path, "r") as file:
                 note = str(file.attrs["note"])
+        except FileNotFoundError:
+            return False
         except DamagedError as error:
             sys.stderr.write(f"{error}; computed again\n")
             path.unlink(missing_ok=True)
@@ -118,9 +124,11 @@ class Checkpoint:
         body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
         _write(self.path(key), body, key)
 
-    def load(self, key: str) -> Evaluations:
-        """Read evaluations that `has` has found."""
-        return read(self.path(key))
+    def load(self, key: str, read: Callable[[Path], T]) -> T | None:
+        """Return a block that `has` has found, as `read` reads it; None if it has been removed since."""
+        with suppress(FileNotFoundError):
+            return read(self.path(key))
+        return None
 
     @property
     def answers(self) -> bool:
@@ -272,5 +280,7 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
                 **{name: np.asarray(file[name]) for name in OPTIONAL if name in file},
             )
+    except FileNotFoundError:
+        raise
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

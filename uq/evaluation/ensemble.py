@@ -21,7 +21,7 @@ import numpy as np
 from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError
 from uq.evaluation.block import BlockSolver, Merger
-from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.checkpoint import Checkpoint, read
 from uq.evaluation.evaluate import OfModel
 from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
@@ -323,18 +323,22 @@ class EnsembleEvaluate(OfModel):
                 block = early.pop(i, None)
                 if block is None:
                     assert checkpoint is not None
-                    block = checkpoint.load(kept[i])
+                    block = checkpoint.load(kept.pop(i), read)
+                    if block is None:  # removed since: another job has finished the study
+                        break
                     if i not in told:
                         self.progress(len(block.points), len(block.failures))
                 merger.add(block)
 
+        def missing() -> list[int]:
+            return [i for i in range(merger.count, len(blocks)) if i not in kept and i not in early]
+
         told, news = set[int](), True  # blocks whose progress was
         while True:  # once, unless other jobs work on the study too
-            missing = [i for i in range(merger.count, len(blocks)) if i not in kept]
-            found = {i: keys[i] for i in missing if checkpoint and checkpoint.has(keys[i])}
+            found = {i: keys[i] for i in missing() if checkpoint and checkpoint.has(keys[i])}
             kept |= found
             add_in_order()
-            pending = tuple(i for i in missing if i not in found)
+            pending = tuple(missing())
             if not pending:
                 break
             if claims is not None:

@@ -28,12 +28,14 @@ from forward.model import (
     scattered,
 )
 from uq.evaluation.block import BlockSolver, merge
-from uq.evaluation.checkpoint import HEAD
+from uq.evaluation.checkpoint import HEAD, read
 from uq.evaluation.evaluate import OfModel
 from uq.evaluation.hdf5 import creation, image, in_memory, stored_array
 from uq.evaluation.request import Evaluations, Failure, Request
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from uq.evaluation.checkpoint import Checkpoint
 
 T = TypeVar("T")
@@ -119,7 +121,7 @@ class KeptEvaluate(OfModel):
         return _Asked(self.label, block.points, block.tangents, block.iterations, start)
 
     def _read(self, key: str) -> Evaluations | None:
-        return self.checkpoint.load(key) if self.checkpoint.has(key) else None
+        return self.checkpoint.load(key, read) if self.checkpoint.has(key) else None
 
     def forget(self) -> None:
         """Remove the blocks, once their results are stored."""
@@ -211,7 +213,7 @@ class KeptModel(OneByOne):
         solved = _Solved(self.label, np.array(parameters))
         key = self.checkpoint.key(solved)
         self.keys.append(key)
-        block = self._read(key, self.checkpoint.load)
+        block = self._read(key, read)
         if block is None:
             return self._solved(solved, key, guess)
         self._note(block)
@@ -249,7 +251,7 @@ class KeptModel(OneByOne):
         """Return derivatives, the stored ones if there are any; those of `states` (k, U_local) are distributed."""
         key = self.checkpoint.key(what)
         self.keys.append(key)
-        kept = self._read(key, lambda key: stored_array(self.checkpoint.path(key), "rows"))
+        kept = self._read(key, lambda path: stored_array(path, "rows"))
         if kept is not None:
             return scattered(self.model, kept) if states else kept
         rows = find()
@@ -258,9 +260,9 @@ class KeptModel(OneByOne):
             self.checkpoint.save(key, _Rows(whole))
         return rows
 
-    def _read(self, key: str, load: Callable[[str], T]) -> T | None:
+    def _read(self, key: str, load: Callable[[Path], T]) -> T | None:
         here = self.group.rank == 0 and self.checkpoint.has(key)
-        found: T | None = self.group.bcast(load(key) if here else None)
+        found: T | None = self.group.bcast(self.checkpoint.load(key, load) if here else None)
         return found
 
     def _keep(self, key: str, block: Evaluations) -> None:

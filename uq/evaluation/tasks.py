@@ -84,6 +84,8 @@ class Outcome:
             reason, seconds = str(dataset.attrs.pop("reason")), float(dataset.attrs.pop("seconds"))
             del dataset.attrs["note"]
             solved = holds(path, _SOLVED)
+        except FileNotFoundError:
+            raise
         except (OSError, KeyError, ValueError) as error:
             raise DamagedError(path) from error
         return cls(None if reason else dataset, reason, read(path, _SOLVED) if solved else None, seconds)
@@ -167,9 +169,11 @@ def run_tasks(
     def find(before: int) -> list[int] | None:
         """Read what is finished; return what is not, None if another job has all; on rank 0."""
         for number, key in enumerate(keys):
-            if number not in outcomes and checkpoint is not None and checkpoint.has(key):
-                receive(number, Outcome.read(checkpoint.path(key)))
-                ensemble.count(outcomes[number].solves, 0)
+            if number in outcomes or checkpoint is None or not checkpoint.has(key):
+                continue
+            if (outcome := checkpoint.load(key, Outcome.read)) is not None:
+                receive(number, outcome)
+                ensemble.count(outcome.solves, 0)
         pending = [number for number in range(len(names)) if number not in outcomes]
         if ensemble.claims is not None and pending:
             try:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel, ModelError, SolveError
-from uq.evaluation.checkpoint import Checkpoint, DamagedError
+from uq.evaluation.checkpoint import Checkpoint, DamagedError, read
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import BLOCKS, Request
@@ -58,7 +58,7 @@ def test_residuals_are_kept(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     assert checkpoint.key(request) != checkpoint.key(replace(request, iterations=4))
     checkpoint.save("block", evaluations)
-    found = checkpoint.load("block")
+    found = checkpoint.load("block", read)
     np.testing.assert_array_equal(found.residuals, evaluations.residuals)
     np.testing.assert_array_equal(found.converged, evaluations.converged)
 
@@ -92,7 +92,7 @@ def test_checkpoint_returns_what_was_saved(tmp_path):
     assert not checkpoint.has(key)
     checkpoint.save(key, evaluations)
     assert checkpoint.has(key)
-    found = checkpoint.load(key)
+    found = checkpoint.load(key, read)
     np.testing.assert_array_equal(found.outputs, evaluations.outputs)
     np.testing.assert_array_equal(found.tangents, evaluations.tangents)
     assert found.failures == evaluations.failures

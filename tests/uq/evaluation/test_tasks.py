@@ -11,6 +11,7 @@ from mpi4py import MPI
 from forward.model import FunctionModel, SolveError
 from tests.launch import ROOT, environment, run_script
 from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.claims import Claims, FinishedElsewhere
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Request
@@ -193,6 +194,47 @@ def test_no_task_is_taken_before_turns_start_again():
     """However late that is: it would be done twice, and the job would wait forever for its second outcome."""
     done = run_script(2, LATE, timeout=60)
     assert "[0, 1]\n" in done.stdout, done.stderr
+
+
+@pytest.fixture
+def removed(tmp_path, monkeypatch):
+    """From a call on, another job finishes the study, and removes all blocks, while this one is about to read one."""
+    has, seen = Checkpoint.has, []
+
+    def looked_at(self, key):
+        found = has(self, key)
+        seen.append(found)
+        if sum(seen) == 2:
+            (tmp_path / "summary.json").write_text("{}")
+            self.clear()
+        return found
+
+    return lambda: monkeypatch.setattr(Checkpoint, "has", looked_at)
+
+
+def shared(folder):
+    return Ensemble.split(MPI.COMM_SELF, claims=Claims.of(MPI.COMM_SELF, folder, "slow"))
+
+
+def test_outcomes_that_another_job_removes_are_not_missed(tmp_path, removed):
+    checkpoint = Checkpoint(tmp_path, "study")
+    run_tasks(ensemble(), NAMES, work, checkpoint=checkpoint)
+    removed()
+    with pytest.raises(FinishedElsewhere):
+        run_tasks(shared(tmp_path), NAMES, work, checkpoint=checkpoint)
+
+
+def test_blocks_that_another_job_removes_are_not_missed(tmp_path, removed):
+    checkpoint = Checkpoint(tmp_path, "study")
+    model, points = FunctionModel(lambda p: p**2, ("x",), ("y",)), Request(np.arange(64.0)[:, None])
+
+    def found():
+        return shared(tmp_path).run(model, lambda evaluate: evaluate(points), checkpoint=checkpoint)
+
+    assert found().outputs[:, 0].tolist() == [x**2 for x in range(64)]
+    removed()
+    with pytest.raises(FinishedElsewhere):
+        found()
 
 
 OF_TWO_JOBS = """
