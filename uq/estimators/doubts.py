@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, FloatArray
-from uq.estimators.tails import influences, missed, spread
+from uq.estimators.tails import GROWTH, concentration, influences, missed, spread
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,7 +20,6 @@ SPREAD = 0.7  # standard deviation of logarithms of 64 samples from which a log-
 HOPELESS = (1.1, 4.0)  # the same, and as `TAILS`: from both on, nothing is known about what is beyond the samples
 MISSED = 0.1  # share of the variance beyond 64 samples, by how steeply the outermost ones rise
 WIDENS = 0.25  # `SPREAD` grows with n to this power
-GROWTH = 0.4  # `TAILS` and `MISSED` grow with n to this power: more samples show more of a tail
 KURTOSIS = 4.4  # of 64 samples, from which there is a finding about a field
 SMALL = 1e-3  # of the largest standard deviation of a field, below which it is not looked at
 PART = 0.05  # of the body, from which there is a finding
@@ -88,9 +87,9 @@ def of_tails(
     largest, most = TAILS * more, MISSED * more
     for i, name in enumerate(names):
         variance = deviations[:, i].var()
-        kappa = _concentration(plain[:, i], variance) if relative[i] > MATTERS else 0.0
+        kappa = concentration(plain[:, i], variance) if relative[i] > MATTERS else 0.0
         if controlled is not None:
-            kappa = max(kappa, _concentration(controlled[:, i], variance) / LATER)
+            kappa = max(kappa, concentration(controlled[:, i], variance) / LATER)
         logarithmic = spread(values[:, i]) if relative[i] > SEEN else 0.0
         wider = (n / 64) ** WIDENS
         if logarithmic > HOPELESS[0] * wider and kappa > HOPELESS[1] / TAILS * largest:
@@ -109,7 +108,7 @@ def of_tails(
             )
         elif kappa > largest or beyond[i] > most * variance:
             kurtosis = (deviations[:, i] ** 4).mean() / variance**2
-            kappa = max(kappa, _concentration(plain[:, i], variance))
+            kappa = max(kappa, concentration(plain[:, i], variance))
             yield Finding(
                 "warning",
                 f"The standard deviation of {name} rests on few of its {n} samples, which count as {n / kappa:.0f} "
@@ -139,7 +138,7 @@ def of_differences(
         largest, most = TAILS * more, MISSED * more
         matters = (relative > MATTERS) & (errors[level] > errors.max(axis=0) / 2)
         for i in np.flatnonzero(matters):
-            kappa = _concentration(one[:, i], std[i] ** 2)
+            kappa = concentration(one[:, i], std[i] ** 2)
             if kappa > largest or tails[i] > most * std[i] ** 2:
                 yield Finding(
                     "warning",
@@ -202,12 +201,6 @@ def _short(number: float) -> str:
     return f"{number:.6g}"
 
 
-def _concentration(moved: FloatArray, variance: float) -> float:
-    """Mean square of influences (n,) over the square of their mean size; 0 if all are rounding errors."""
-    size = float(np.abs(moved).mean())
-    return float((moved**2).mean()) / size**2 if size > ROUNDING * variance else 0.0
-
-
 def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator[Finding]:
     """Find the outputs whose control has been dropped."""
     for i, name in enumerate(names):
@@ -257,7 +250,7 @@ def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samp
     moved = influences(deviations, deviations**2)
     largest = CONCENTRATED[0] * max(1.0, samples / 16) ** CONCENTRATED[1]
     for i, (name, error) in enumerate(zip(names, relative.tolist(), strict=True)):
-        kappa = _concentration(moved[:, i], float(deviations[:, i].var())) if error > ROUGH else 0.0
+        kappa = concentration(moved[:, i], float(deviations[:, i].var())) if error > ROUGH else 0.0
         if kappa > largest:
             yield Finding(
                 "warning",

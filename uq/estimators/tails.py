@@ -17,6 +17,8 @@ them rise (`missed`), and what exceeds the same of a normal quantity, which scat
 means as well.
 
 Intervals of a mean are also too short if its samples are skewed, whether they have tails or not: see `skewed`.
+
+Few replicates may agree by chance, and no design makes them agree where few samples carry the variance: `by_chance`.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from typing import TypeVar
 import numpy as np
 
 from forward.model import FloatArray
-from uq.estimators.moments import Estimates, estimate, monomials, ratio
+from uq.estimators.moments import Estimates, error_of_root, estimate, monomials, ratio
 from uq.inputs.random_parameters import Inputs
 
 AGREE = 1e-12  # standard errors of means over the standard deviation up to which replicates are equal
@@ -39,6 +41,10 @@ ENDLESS = 2.1  # kurtosis of logarithms below which they seem bounded: 1.8 for a
 
 OUTERMOST = 0.75  # times n^¾: how many of the outermost influences tell what is beyond them
 STEEPEST = 5.0  # slope of their logarithm against a normal quantity
+GROWTH = 0.4  # limits of tails grow with n to this power: more samples show more of a tail
+CARRIED = 2.5  # `concentration` from which few of 64 samples carry a variance: 2.1 for normal ones
+CHANCE = 0.05  # probability of a scatter so much smaller than it is
+ROUNDING = 1e-9  # of the variance
 
 Found = TypeVar("Found", bound=Estimates)
 
@@ -59,6 +65,43 @@ def skewed(samples: FloatArray) -> FloatArray:
     deviations = ratio(deviations, np.abs(deviations).max(axis=0))  # sixth powers of small and large numbers are none
     squares = (deviations**2).sum(axis=0)
     return np.asarray(np.sqrt(1 + 2.16 * ratio((deviations**3).sum(axis=0) ** 2, squares**3)))
+
+
+def concentration(moved: FloatArray, variance: float) -> float:
+    """Mean square of influences (n,) over the square of their mean size; 0 if all are rounding errors."""
+    size = float(np.abs(moved).mean())
+    return float((moved**2).mean()) / size**2 if size > ROUNDING * variance else 0.0
+
+
+def by_chance(found: Found, moved: FloatArray, replicates: int) -> Found:
+    """Return estimates from few replicates with errors of standard deviations that are not small by chance.
+
+    The squared scatter of R replicates is as good as R − 1 degrees of freedom: two claim a quarter of the true error or
+    less in 16 % of all cases, though their wide intervals hold. Where few samples carry the variance, what an even
+    design gains is little, so that as many independent samples tell the error better: it is at least theirs, but for
+    what chance explains (the ratio that the scatter falls short of in 5 % of all cases: 16 for 2 replicates, 2.9 for 4,
+    1.4 for 16). Of 64 exponentials of half a normal quantity in two sets, errors were more than four times the claim
+    in 16 % of cases, and are in 7 %.
+
+    Parameters
+    ----------
+    found
+        The estimates, with errors from the scatter of the replicates.
+    moved
+        Influences (n, m) of the samples on the variance, with controls if there are any.
+    replicates
+        Their number R ≥ 2.
+    """
+    from scipy.special import chdtri
+
+    n, freedom = len(moved), replicates - 1
+    most = np.sqrt(freedom / chdtri(freedom, 1 - CHANCE)) * found.std_error
+    plain = error_of_root(found.std, moved.std(axis=0) / np.sqrt(max(n - 1, 1)))
+    limit = CARRIED * max(1.0, n / 64) ** GROWTH
+    variances = (found.std**2).tolist()
+    carried = np.array([concentration(one, v) > limit for one, v in zip(moved.T, variances, strict=True)])
+    floor = np.where(carried, np.minimum(plain, most), 0.0)
+    return replace(found, std_error=np.maximum(found.std_error, floor))
 
 
 def counted(

@@ -44,7 +44,10 @@ class QuasiMonteCarlo(MonteCarlo):
 
     Errors are one standard error from the scatter of the scrambles, without the factor of Student's distribution: a
     95 % interval is ± 2.13 of them for 16 scrambles. Those of the standard deviation cover 90 % with 4 points in each
-    scramble, whose means are skewed, and 93 to 95 % from 16 points on.
+    scramble, whose means are skewed, and 93 to 95 % from 16 points on. Where few samples carry it, they are at least
+    those of as many independent samples, unless chance cannot explain that the scrambles agree so well. Tails that no
+    sample shows are in no error: of Student's t with 3 to 5 degrees of freedom and 64 samples in 16 scrambles 71 to
+    88 % of the intervals hold, and 10 to 15 % miss without a finding; an event that no sample has met is not seen.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from forward.model import Finding, FloatArray, ForwardModel, Solution, SolveError, scattered
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, estimate_from_replicates, student
-from uq.estimators.tails import counted, influences, of_influences, skewed
+from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed
 from uq.evaluation.request import Evaluate, Evaluations, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -216,9 +216,11 @@ class Scrambles:
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._asked.coefficient)
+        values, controlled = self.outputs[:, :each][ok], self.controlled(found, each)
+        plain = values - values.mean(axis=0)
+        found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(some.sum()))
         # A tangent grows no faster than a normal quantity; controls that grow faster tell what lies beyond the samples.
-        controlled = self.controlled(found, each)
-        tails = counted(found, self._inputs, self.outputs[:, :each][ok], controlled)
+        tails = counted(found, self._inputs, values, controlled)
         if controlled is None or self._asked.control == "tangent":
             return tails
         of_mean, of_std = self._unseen(each)

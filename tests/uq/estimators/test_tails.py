@@ -8,6 +8,7 @@ from benchmarks import held_out, oddities, tails
 from benchmarks.coverage import CASES as CASES_OF_COVERAGE
 from benchmarks.coverage import Case, Vectorised, measure
 from uq.estimators import tails as estimator
+from uq.estimators.moments import Estimates, estimate_from_replicates
 from uq.findings import findings
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -194,3 +195,32 @@ def test_a_kink_that_many_samples_show_is_no_false_alarm():
         row = measure(hinge, method, 20)
         assert row.found <= most
         assert row.covered[1] >= 0.85
+
+
+def test_two_scrambles_that_agree_by_chance_claim_no_less_than_their_samples():
+    """Of exponentials of half a normal quantity, which few of 64 samples carry in most sets."""
+    R = 2
+    draws = np.exp(np.random.default_rng(5).normal(size=(400, 64, 1)) / 2)
+    true, most = (np.exp(0.25) * np.expm1(0.25)) ** 0.5, ((R - 1) / stats.chi2.ppf(0.05, R - 1)) ** 0.5
+    before, after = [], []
+    for values in draws:
+        groups = values.reshape(R, 64 // R, 1)
+        found = estimate_from_replicates(np.array([groups.mean(axis=1), (groups**2).mean(axis=1)]), np.zeros(1))
+        deviations = values - values.mean(axis=0)
+        floored = estimator.by_chance(found, estimator.influences(deviations, deviations**2), R)
+        assert found.std_error <= floored.std_error <= (1 + 1e-12) * most * found.std_error
+        off = abs(found.std.item() - true)
+        before.append(off > 4 * found.std_error.item())
+        after.append(off > 4 * floored.std_error.item())
+    assert np.mean(before) > 0.1
+    assert np.mean(after) < np.mean(before) / 1.5
+
+
+def test_scrambles_claim_what_they_gain_where_no_few_samples_carry_the_variance():
+    normal = stats.norm.ppf((np.arange(64) + 0.5) / 64)[:, None]
+    even = np.linspace(-1, 1, 64)[:, None]
+    for values in (normal, even):
+        one = np.ones(1)
+        found = Estimates(0 * one, 1e-3 * one, values.std(axis=0), 1e-5 * one, 0 * one, 0 * one)
+        moved = estimator.influences(values, values**2)
+        assert estimator.by_chance(found, moved, 2).std_error.item() == 1e-5
