@@ -12,7 +12,6 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
@@ -99,11 +98,10 @@ class Checkpoint:
             _check(path, key)
             with h5py.File(path, "r") as file:
                 note = str(file.attrs["note"])
-        except FileNotFoundError:
-            return False
-        except DamagedError as error:
-            sys.stderr.write(f"{error}; computed again\n")
-            path.unlink(missing_ok=True)
+        except OSError as error:
+            if path.exists():
+                sys.stderr.write(f"{error}; computed again\n")
+                path.unlink(missing_ok=True)
             return False
         objection = self._code.objection(note) if self._code is not None else None
         if objection is not None:
@@ -126,9 +124,13 @@ class Checkpoint:
 
     def load(self, key: str, read: Callable[[Path], T]) -> T | None:
         """Return a block that `has` has found, as `read` reads it; None if it has been removed since."""
-        with suppress(FileNotFoundError):
-            return read(self.path(key))
-        return None
+        path = self.path(key)
+        try:
+            return read(path)
+        except OSError:  # whatever file systems say of a file that is gone
+            if path.exists():
+                raise
+            return None
 
     @property
     def answers(self) -> bool:
@@ -280,7 +282,5 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
                 **{name: np.asarray(file[name]) for name in OPTIONAL if name in file},
             )
-    except FileNotFoundError:
-        raise
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

@@ -84,8 +84,6 @@ class Outcome:
             reason, seconds = str(dataset.attrs.pop("reason")), float(dataset.attrs.pop("seconds"))
             del dataset.attrs["note"]
             solved = holds(path, _SOLVED)
-        except FileNotFoundError:
-            raise
         except (OSError, KeyError, ValueError) as error:
             raise DamagedError(path) from error
         return cls(None if reason else dataset, reason, read(path, _SOLVED) if solved else None, seconds)
