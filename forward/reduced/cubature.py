@@ -108,7 +108,7 @@ class _Normal:
 
     def enter(self, beside: FloatArray, among: FloatArray) -> None:
         """Add points, by their products with those that are in (k, b) and among each other (b, b)."""
-        k, n = beside.shape[0], beside.shape[0] + len(among)
+        k, n = self._count, self._count + len(among)
         if n > len(self._grams):
             self._grams, self._factors = (_roomier(one, k, 2 * n) for one in (self._grams, self._factors))
         self._grams[k:n, :k], self._grams[k:n, k:n] = beside.T, among
@@ -136,10 +136,9 @@ class _Normal:
         corner = _raised(self._grams[j:n, j:n], LEAST) - across @ across.T
         try:
             self._factors[j:n, j:n] = cholesky(corner, lower=True, check_finite=False)
+            self._whole = True
         except LinAlgError:
             self._whole = False
-        else:
-            self._whole = True
 
     def solved(self, right: FloatArray) -> FloatArray:
         """Return the weights (k,) for right sides (k,)."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, FloatArray
-from uq.estimators.tails import GROWTH, concentration, influences, missed, spread
+from uq.estimators.tails import concentration, influences, missed, shown, spread
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -83,8 +83,7 @@ def of_tails(
     beyond = np.where((relative > MATTERS) & (not expanded), missed(plain), 0.0)
     if controlled is not None:
         beyond = np.maximum(beyond, missed(controlled))
-    more = max(1.0, n / 64) ** GROWTH
-    largest, most = TAILS * more, MISSED * more
+    largest, most = TAILS * shown(n), MISSED * shown(n)
     for i, name in enumerate(names):
         variance = deviations[:, i].var()
         kappa = concentration(plain[:, i], variance) if relative[i] > MATTERS else 0.0
@@ -134,8 +133,7 @@ def of_differences(
     errors = np.array([one.std(axis=0) / len(one) ** 0.5 for one in moved])
     for level, one in enumerate(moved[1:], 1):
         n, tails = len(one), missed(one)
-        more = max(1.0, n / 64) ** GROWTH
-        largest, most = TAILS * more, MISSED * more
+        largest, most = TAILS * shown(n), MISSED * shown(n)
         matters = (relative > MATTERS) & (errors[level] > errors.max(axis=0) / 2)
         for i in np.flatnonzero(matters):
             kappa = concentration(one[:, i], std[i] ** 2)
@@ -186,7 +184,7 @@ def of_field_tails(
     # Rounding aside, and what moves little beside the rest, or is claimed well all the same.
     counts = (variance > ROUNDING * m2) & (variance > SMALL**2 * variance.max(initial=0.0)) & (relative > MATTERS)
     kurtosis = np.where(counts, fourth / np.where(counts, variance, 1.0) ** 2, 0.0).reshape(-1, 3).max(axis=1)
-    heavy = kurtosis > KURTOSIS * max(1.0, n / 64) ** GROWTH
+    heavy = kurtosis > KURTOSIS * shown(n)
     share = float(np.average(heavy, weights=volumes))
     if share > PART:
         yield Finding(

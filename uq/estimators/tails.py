@@ -41,7 +41,7 @@ ENDLESS = 2.1  # kurtosis of logarithms below which they seem bounded: 1.8 for a
 
 OUTERMOST = 0.75  # times n^¾: how many of the outermost influences tell what is beyond them
 STEEPEST = 5.0  # slope of their logarithm against a normal quantity
-GROWTH = 0.4  # limits of tails grow with n to this power: more samples show more of a tail
+GROWTH = 0.4  # limits of tails grow with n to this power
 CARRIED = 2.5  # `concentration` from which few of 64 samples carry a variance: 2.1 for normal ones
 CHANCE = 0.05  # probability of a scatter so much smaller than it is
 ROUNDING = 1e-9  # of the variance
@@ -73,6 +73,11 @@ def concentration(moved: FloatArray, variance: float) -> float:
     return float((moved**2).mean()) / size**2 if size > ROUNDING * variance else 0.0
 
 
+def shown(n: int) -> float:
+    """How much larger limits of tails are for n samples than for 64: more samples show more of a tail."""
+    return float(max(1.0, n / 64) ** GROWTH)
+
+
 def by_chance(found: Found, moved: FloatArray, replicates: int) -> Found:
     """Return estimates from few replicates with errors of standard deviations that are not small by chance.
 
@@ -97,10 +102,9 @@ def by_chance(found: Found, moved: FloatArray, replicates: int) -> Found:
     n, freedom = len(moved), replicates - 1
     most = np.sqrt(freedom / chdtri(freedom, 1 - CHANCE)) * found.std_error
     plain = error_of_root(found.std, moved.std(axis=0) / np.sqrt(max(n - 1, 1)))
-    limit = CARRIED * max(1.0, n / 64) ** GROWTH
     variances = (found.std**2).tolist()
-    carried = np.array([concentration(one, v) > limit for one, v in zip(moved.T, variances, strict=True)])
-    floor = np.where(carried, np.minimum(plain, most), 0.0)
+    kappa = np.array([concentration(one, v) for one, v in zip(moved.T, variances, strict=True)])
+    floor = np.where(kappa > CARRIED * shown(n), np.minimum(plain, most), 0.0)
     return replace(found, std_error=np.maximum(found.std_error, floor))
 
 

@@ -122,6 +122,10 @@ class Checkpoint:
         body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
         _write(self.path(key), body, key)
 
+    def find(self, key: str, read: Callable[[Path], T]) -> T | None:
+        """Return a finished block, as `read` reads it; None if there is none. Errors as for `has`."""
+        return self.load(key, read) if self.has(key) else None
+
     def load(self, key: str, read: Callable[[Path], T]) -> T | None:
         """Return a block that `has` has found, as `read` reads it; None if it has been removed since."""
         path = self.path(key)

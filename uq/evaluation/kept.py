@@ -121,7 +121,7 @@ class KeptEvaluate(OfModel):
         return _Asked(self.label, block.points, block.tangents, block.iterations, start)
 
     def _read(self, key: str) -> Evaluations | None:
-        return self.checkpoint.load(key, read) if self.checkpoint.has(key) else None
+        return self.checkpoint.find(key, read)
 
     def forget(self) -> None:
         """Remove the blocks, once their results are stored."""
@@ -261,8 +261,7 @@ class KeptModel(OneByOne):
         return rows
 
     def _read(self, key: str, load: Callable[[Path], T]) -> T | None:
-        here = self.group.rank == 0 and self.checkpoint.has(key)
-        found: T | None = self.group.bcast(self.checkpoint.load(key, load) if here else None)
+        found: T | None = self.group.bcast(self.checkpoint.find(key, load) if self.group.rank == 0 else None)
         return found
 
     def _keep(self, key: str, block: Evaluations) -> None:

@@ -167,9 +167,9 @@ def run_tasks(
     def find(before: int) -> list[int] | None:
         """Read what is finished; return what is not, None if another job has all; on rank 0."""
         for number, key in enumerate(keys):
-            if number in outcomes or checkpoint is None or not checkpoint.has(key):
+            if number in outcomes or checkpoint is None:
                 continue
-            if (outcome := checkpoint.load(key, Outcome.read)) is not None:
+            if (outcome := checkpoint.find(key, Outcome.read)) is not None:
                 receive(number, outcome)
                 ensemble.count(outcome.solves, 0)
         pending = [number for number in range(len(names)) if number not in outcomes]
