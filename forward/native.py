@@ -16,8 +16,10 @@ from pathlib import Path
 
 from forward.machine import compiled_forms
 
-# NaN and infinity keep their meaning, unlike with -ffast-math.
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros")
+# How all C is compiled, forms too; TISSUQ_CFLAGS in the environment replaces it. Sums are not reordered: what is
+# written keeps its digits on every processor (docs/decisions/0049-nothing-is-reordered.md has what that costs).
+_DEFAULT = "-O2 -ftree-vectorize -g0 -march=native -fno-math-errno -fno-trapping-math -fno-signed-zeros"
+FLAGS = tuple(shlex.split(os.environ.get("TISSUQ_CFLAGS", _DEFAULT)))
 
 
 @cache

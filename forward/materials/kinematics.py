@@ -112,6 +112,9 @@ class Shape(NamedTuple):
     and the stiffness a relative rounding error of ε_machine/ε, if dθ is formed before it is multiplied with anything.
     In a body without strain, the D_k are of size `LEAST`. Source: O. K. Smith, Commun. ACM 4 (1961) 168.
 
+    Where only the volume has changed, D consists of rounding errors, which need not have a trace of zero: r² > q⁶ then.
+    So the trace is taken from D once more, and y² is what q² was increased by plus the positive part of q⁶ − r².
+
     Attributes
     ----------
     spread
@@ -131,10 +134,11 @@ class Shape(NamedTuple):
 def shape(ops: ModuleType | SimpleNamespace, F: Any, at: Deformation, identity: Any) -> Shape:
     """Return the invariants of the change of shape of a deformation."""
     mean = 1 + at.trace / 3
-    D = at.deviator / mean
+    D = (at.deviator - ops.tr(at.deviator) / 3 * identity) / mean
     square, r = ops.tr(D * D), ops.det(D) / 2
-    spread = square / 6 * (1 + APART**2) + LEAST**2
-    y = ops.sqrt(spread**3 - r**2)
+    exact, more = square / 6, square / 6 * APART**2 + LEAST**2
+    spread = exact + more
+    y = ops.sqrt(more * (spread**2 + spread * exact + exact**2) + ops.positive(exact**3 - r**2))
     of_spread = 2 * (1 + APART**2) / (3 * mean) * F * (D - square / 3 * identity)
     of_r = F * (D * D - (square / 3 + 2 * r) * identity) / mean
     slopes = {"spread": of_spread, "angle": (r / (2 * spread) * of_spread - of_r / 3) / y}

@@ -174,10 +174,13 @@ def searched_step(
 def admissible_step(
     system: System, settings: SolverSettings, u: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, Residual]:
-    """Take the full step, or halve it until the energy is defined and J > 0 at every quadrature point."""
+    """Take the full step, or halve it until the energy is defined and J > 0 at every quadrature point.
+
+    The full step leads prescribed unknowns to their targets; there they are put exactly, whatever has been rounded.
+    """
     fraction = 1.0
     while fraction >= settings.minimum_damping:
-        trial = u + fraction * step
+        trial = system.on_target(u + step) if fraction == 1.0 else u + fraction * step
         if system.smallest_jacobian(trial) > 0:
             residual = system.residual(trial)
             if np.isfinite(residual.size):

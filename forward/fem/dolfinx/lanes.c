@@ -1,7 +1,15 @@
 /* What is around a kernel for vectors of LANES cells: types, functions, and the loop over cells. */
 #include <math.h>
 #include <stdint.h>
+/* A vector is one register of what is compiled for; longer ones would be taken apart badly. */
+#if defined(__AVX512F__)
 #define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#else
+#define LANES 2
+#endif
+const int lanes = LANES;
 typedef double V __attribute__((vector_size(8 * LANES)));
 typedef int64_t M __attribute__((vector_size(8 * LANES)));
 typedef int32_t H __attribute__((vector_size(4 * LANES)));
@@ -74,15 +82,15 @@ INLINE void gather(V* w, const int32_t* nodes, const double* values, int count, 
     for (int k = 0; k < size; ++k) w[size * i + k] = EACH(values[(int64_t)size * nodes[LANES * i + l] + k]);
 }
 
-INLINE void scatter(const V* A, const int32_t* nodes, double* out, int count, int size, int lanes)
+INLINE void scatter(const V* A, const int32_t* nodes, double* out, int count, int size, int cells)
 {
-  for (int l = 0; l < lanes; ++l)
+  for (int l = 0; l < cells; ++l)
     for (int i = 0; i < count; ++i)
       for (int k = 0; k < size; ++k) out[(int64_t)size * nodes[LANES * i + l] + k] += A[size * i + k][l];
 }
 
-INLINE void store(const V* A, double* out, int count, int lanes)
+INLINE void store(const V* A, double* out, int count, int cells)
 {
-  for (int l = 0; l < lanes; ++l)
+  for (int l = 0; l < cells; ++l)
     for (int i = 0; i < count; ++i) out[count * l + i] = A[i][l];
 }

@@ -1,30 +1,33 @@
 """Compiled kernels that take several cells at once, in the lanes of the processor's vector unit.
 
 FFCx writes a kernel for one cell, whose long chains of scalar operations at a quadrature point no compiler can
-vectorise. Here every number in it becomes a vector of those of eight cells: the same operations in the same order, in
-the vector types of GCC and Clang. What FFCx writes is regular enough for a few replacements; where they do not apply,
-or do not compile, there is no such kernel, and DOLFINx's own loop over cells does the same.
+vectorise. Here every number in it becomes a vector of those of several cells, as many as fit into a register of the
+processor that is compiled for: the same operations in the same order, in the vector types of GCC and Clang. What FFCx
+writes is regular enough for a few replacements; where they do not apply, or do not compile, there is no such kernel,
+and DOLFINx's own loop over cells does the same, more slowly. That is said once.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
+import logging
 import re
 import shlex
 import subprocess
 import sysconfig
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.fem.dolfinx.compile import FLAGS, compiled, folder_of
+from forward.fem.dolfinx.compile import compiled, folder_of
 from forward.model import FloatArray
+from forward.native import FLAGS
 
-LANES = 8  # of 64 bits: one register of AVX-512, two of AVX2
 LONGEST = 8000  # lines of a kernel; one of 5 400 compiles in 8 s, one of 51 000 in six minutes
 _KERNEL = re.compile(r"^void tabulate_tensor_(?:integral|expression)_\w+\(double\* restrict A,[^{}]*{", re.MULTILINE)
 _TABLE = re.compile(r"^ *static const double .*?;$", re.DOTALL | re.M)
@@ -85,7 +88,7 @@ void assemble(int64_t cells, const double* places, const int32_t* const* nodes, 
   V A[{entries}], w[{width} + 1], x[{places}], c[{constants} + 1];
   for (int i = 0; i < {constants}; ++i) c[i] = ALL(constants[i]);
   for (int64_t first = 0; first < cells; first += LANES) {{
-    const int lanes = cells - first < LANES ? cells - first : LANES;
+    const int left = cells - first < LANES ? cells - first : LANES;
     gather_places(x, places + {places} * first, {places});
 {gathers}
     for (int i = 0; i < {entries}; ++i) A[i] = ALL(0.0);
@@ -137,6 +140,8 @@ class Kernel:
     ----------
     available
         Whether there is such a kernel, on this machine.
+    lanes
+        How many cells it takes at once; 1 without one.
     """
 
     def __init__(
@@ -152,25 +157,34 @@ class Kernel:
         loop = _loop(places.shape[1] * places.shape[2], coefficients, constants, to)
         text = hashlib.sha256(loop.encode()).hexdigest()[:4]  # an expression is stored, or added up
         beside = f"-lanes-{_VERSION}-{text}"
-        self._assemble = compiled(name, lambda folder: self._load(folder, name, loop, comm), comm, beside)
+        self._assemble, self.lanes = compiled(name, lambda folder: self._load(folder, name, loop, comm), comm, beside)
         self.available = self._assemble is not None
         self._cells = len(places)
-        self._places = _grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
+        self._places = self._grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
         self._at = self._places.ctypes.data
-        self._kept = [_grouped(one.nodes) for one in [*coefficients, *added]], [one.values for one in coefficients]
+        self._kept = [self._grouped(one.nodes) for one in [*coefficients, *added]], [one.values for one in coefficients]
         nodes, values = self._kept
         self._nodes, self._values = _addresses(nodes), _addresses(values)
 
-    def _load(self, folder: Path, name: str, loop: str, comm: Any) -> Any:
-        library = folder / "lanes.so"
-        if comm.rank == 0 and not (folder / "lanes.c").exists():
-            _compile(folder_of(name), loop, folder / "lanes.c", library)
+    def _load(self, folder: Path, name: str, loop: str, comm: Any) -> tuple[Any, int]:
+        """Return the function and its number of lanes, or None and 1 without one."""
+        library, source = folder / "lanes.so", folder / "lanes.c"
+        if comm.rank == 0 and not source.exists():
+            _compile(folder_of(name), loop, source, library)
         exists = comm.bcast(library.exists() if comm.rank == 0 else None)
         if not exists:
-            return None
-        function = ctypes.CDLL(str(library)).assemble
-        function.argtypes, function.restype = [ctypes.c_int64, *[ctypes.c_void_p] * 5], None
-        return function
+            if comm.rank == 0:
+                _say_that_it_is_slow(source.read_text(encoding="utf-8"))
+            return None, 1
+        loaded = ctypes.CDLL(str(library))
+        loaded.assemble.argtypes, loaded.assemble.restype = [ctypes.c_int64, *[ctypes.c_void_p] * 5], None
+        return loaded.assemble, ctypes.c_int.in_dll(loaded, "lanes").value
+
+    def _grouped(self, of_cells: NDArray[Any]) -> NDArray[Any]:
+        """Put rows (n_cells, k) into groups (n_groups, k, lanes); the last cell fills the last group."""
+        missing = -len(of_cells) % self.lanes
+        filled = np.concatenate([of_cells, np.repeat(of_cells[-1:], missing, axis=0)])
+        return np.ascontiguousarray(filled.reshape(-1, self.lanes, of_cells.shape[1]).swapaxes(1, 2))
 
     def __call__(self, constants: FloatArray, out: FloatArray) -> None:
         """Add the values of all cells to those of the nodes in `out`, or put those of each cell there."""
@@ -181,17 +195,27 @@ def _addresses(arrays: Sequence[NDArray[Any]]) -> ctypes.Array[ctypes.c_void_p]:
     return (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
 
 
+@cache
+def _say_that_it_is_slow(why: str) -> None:
+    """Say once for each reason, given as a comment in C, that forces are assembled one cell after the other."""
+    reason = why.removeprefix("/* ").removesuffix(" */")
+    logging.getLogger("tissuq").warning("forces take longer, one cell after the other: %s", reason)
+
+
 def _compile(folder: Path, loop: str, source: Path, library: Path) -> None:
-    """Write what is to be compiled; where it is not possible, there is no library."""
+    """Write what is to be compiled; where it is not possible, the reason stands there and there is no library."""
     found = list(folder.glob("*.c"))
     kernel = translated(found[0].read_text(encoding="utf-8")) if len(found) == 1 else None
     if kernel is None:
-        source.touch()
+        source.write_text("/* the compiled form is too long, or unusual, for vectors of cells */", encoding="utf-8")
         return
     source.write_text(f"{_SOURCE.read_text(encoding='utf-8')}\n{kernel}\n{loop}", encoding="utf-8")
     compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")
     command = [*compiler, *FLAGS, "-w", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"]
-    subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode:
+        library.unlink(missing_ok=True)
+        source.write_text(f"/* {compiler[0]} does not compile vectors of cells */", encoding="utf-8")
 
 
 def _loop(places: int, coefficients: Sequence[Numbers], constants: int, to: Numbers | int) -> str:
@@ -203,16 +227,9 @@ def _loop(places: int, coefficients: Sequence[Numbers], constants: int, to: Numb
     if isinstance(to, Numbers):
         count = to.nodes.shape[1]
         entries, rows = count * to.size, f"nodes[{len(coefficients)}] + {count} * first"
-        output = f"scatter(A, {rows}, out, {count}, {to.size}, lanes);"
+        output = f"scatter(A, {rows}, out, {count}, {to.size}, left);"
     else:
-        entries, output = to, f"store(A, out + {to} * first, {to}, lanes);"
+        entries, output = to, f"store(A, out + {to} * first, {to}, left);"
     return _LOOP.format(
         entries=entries, width=width, places=places, constants=constants, gathers="\n".join(gathers), output=output
     )
-
-
-def _grouped(of_cells: NDArray[Any]) -> NDArray[Any]:
-    """Put rows (n_cells, k) into groups (n_groups, k, LANES); the last cell fills the last group."""
-    missing = -len(of_cells) % LANES
-    filled = np.concatenate([of_cells, np.repeat(of_cells[-1:], missing, axis=0)])
-    return np.ascontiguousarray(filled.reshape(-1, LANES, of_cells.shape[1]).swapaxes(1, 2))

@@ -1,12 +1,15 @@
 """Kernels for several cells at once: what DOLFINx's own loop over cells gives."""
 
 import copy
+import platform
+import subprocess
 
 import numpy as np
 import pytest
 import ufl
 from mpi4py import MPI
 
+from forward import native
 from forward.bodies.geometry import Box
 from forward.fem.dolfinx import assembly, compile, lanes, meshes, spaces, version
 from tests.bodies import loaded_body
@@ -70,7 +73,21 @@ def test_functions_of_vectors():
     assert np.isnan(found).any()
 
 
-def test_without_a_compiler_cells_come_one_after_the_other(tmp_path, monkeypatch):
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="processors of one kind are compared")
+def test_lanes_fill_a_register_of_what_is_compiled_for():
+    """Never more, which compilers take apart badly, whatever this processor is."""
+
+    def defined(flags):
+        command = [*lanes.sysconfig.get_config_var("CC").split(), *flags, "-E", "-dM", "-xc", str(lanes._SOURCE)]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    for march, width in (("x86-64-v2", 2), ("x86-64-v3", 4), ("x86-64-v4", 8)):
+        assert f"#define LANES {width}\n" in defined([f"-march={march}"])
+    equations = next(bodies()).equations
+    assert f"#define LANES {equations._residual._lanes.lanes}\n" in defined(native.FLAGS)
+
+
+def test_without_a_compiler_cells_come_one_after_the_other(tmp_path, monkeypatch, caplog):
     comm = MPI.COMM_SELF
     monkeypatch.setattr(compile, "_CACHE", tmp_path)
     monkeypatch.setattr(lanes.sysconfig, "get_config_var", lambda name: "false")
@@ -79,3 +96,7 @@ def test_without_a_compiler_cells_come_one_after_the_other(tmp_path, monkeypatch
     volume = assembly.VectorAssembler(spaces.constant(msh, 1.0) * v * ufl.dx(domain=msh), None, comm, often=True)
     assert volume._lanes is None
     assert volume().sum() == pytest.approx(6.0)
+    again = assembly.VectorAssembler(spaces.constant(msh, 1.0) * v * ufl.dx(domain=msh), None, comm, often=True)
+    assert again._lanes is None
+    (said,) = caplog.messages
+    assert said == "forces take longer, one cell after the other: false does not compile vectors of cells"
