@@ -30,7 +30,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint notebooks bench docs clean system graphics browser
+.PHONY: help setup setup-wheel demo test test-unit test-all test-flags test-wheel lint notebooks bench docs clean system graphics browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -50,6 +50,9 @@ test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
 
 test-all: $(READY) browser ## run the test suite with the slow tests
 	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)
+
+test-flags: $(READY) ## run what depends on compiler flags and on OpenBLAS's kernels with several of them
+	@$(PYTHON) -m tests.flags $(ARGS)
 
 test-wheel: $(WHEEL_READY) ## run the tests that say that DOLFINx 0.11 gives the same results
 	@$(WHEEL_VENV)/bin/python -m pytest -m "not slow and not benchmark and (wheel or not fem and not mpi)" $(WHEEL_TESTS) $(ARGS)

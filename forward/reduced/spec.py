@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from forward.materials.admissible import Materials
 
 LETTERS = 16  # of a hash
-BEYOND = 0.05  # of the trained range, and half a standard deviation: farther out is a finding
+BY_CHANCE = 0.01  # so rarely an end of the distribution is farther from all snapshots than a study may go beyond them
 DOUBTFUL = 0.05  # error on unseen samples, relative to the spread of an output, above which it is one
 
 _APART = ("outputs", "solver", "stresses")  # blocks of a body in which one and its reduced model may differ
@@ -190,13 +190,18 @@ class Reduced(ModelSpec):
         return (*self.outside(ranges), *without_answer(self._about.told), *self._of_errors())
 
     def outside(self, ranges: Ranges) -> Iterator[Finding]:
-        """Find parameters that go beyond the snapshots."""
+        """Find parameters that go beyond the snapshots.
+
+        Snapshots do not reach the ends of a distribution: all n of a uniform one are farther from an end than a share x
+        of its range with probability (1 − x)ⁿ, here `BY_CHANCE`. Half a standard deviation is always allowed.
+        """
         about = self._about
+        seen = BY_CHANCE ** (1 / max(int(about.told["snapshots"]), 1))
         rows = zip(about.parameters, about.lower, about.upper, about.spread, strict=True)
         for path, low, high, spread in rows:
             if path not in ranges:
                 continue
-            margin = max(BEYOND * (high - low), 0.5 * spread)
+            margin = max((1 - seen) / seen * (high - low), 0.5 * spread)
             first, last = ranges[path]
             if first < low - margin or last > high + margin:
                 yield Finding(

@@ -16,7 +16,7 @@ from tests.bodies import loaded_body
 from tests.forward.fem.test_mixed import cantilever
 from tests.forward.fem.test_together import field
 
-pytestmark = [pytest.mark.fem, pytest.mark.wheel]
+pytestmark = [pytest.mark.fem, pytest.mark.wheel, pytest.mark.flags]
 
 
 def cell_by_cell(assembler):

@@ -49,6 +49,7 @@ def test_a_choice_has_the_derivative_of_what_is_chosen():
 
 
 @pytest.mark.unit
+@pytest.mark.flags
 def test_compiled_and_numpy_agree_also_for_what_is_the_same_at_all_points(monkeypatch):
     graph = Graph(3)
     total, _, _ = expression(graph, None)

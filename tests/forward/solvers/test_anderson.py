@@ -6,7 +6,7 @@ import pytest
 from forward.solvers.anderson import AndersonMixing, block_galerkin
 from forward.solvers.rotations import Turned, rotations
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.flags]
 
 RNG = np.random.default_rng(3)
 N = 40

@@ -17,7 +17,7 @@ from forward.specimen import Specimen
 from inverse.criticism.field_samples import bent
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
-from inverse.fields.newton_cg import find_mode
+from inverse.fields.newton_cg import CLOSE, find_mode
 from tests.launch import run_script
 
 POINTS = 9  # along each edge of the cube
@@ -296,6 +296,7 @@ def test_meshes_do_not_matter():
 # --- forces alone ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.flags
 def test_a_field_is_felt_from_forces_alone():
     """Palpation at four places: mode and variance are those of dense algebra, and the stiff side is found."""
     ball = {"kind": "indenter", "shape": "sphere", "radius": 0.8, "on": "z-max", "direction": (0, 0, -1), "depth": 0.08}
@@ -328,10 +329,9 @@ def test_a_field_is_felt_from_forces_alone():
     root = prior.root(np.eye(75))  # rows L e_i
     covariance = root.T @ root
     gap = (posterior.data - mode.point.solution.outputs) / sigma**2
-    np.testing.assert_allclose(
-        values, covariance @ J.T @ gap, atol=2e-3 * np.abs(values).max()
-    )  # where the search ends
     exact = np.linalg.inv(np.linalg.inv(covariance) + J.T @ np.diag(sigma**-2.0) @ J)
+    gradient = np.linalg.solve(covariance, values) - J.T @ gap
+    assert np.sqrt(gradient @ exact @ gradient) < CLOSE  # so many posterior deviations from the mode the search ends
     np.testing.assert_allclose(found.std, np.sqrt(np.diag(exact)), rtol=1e-4)
     top = places[:, 2] > 0.4
     stiff, soft = (values[top & side].mean() for side in (places[:, 0] > 0.6, places[:, 0] < 0.4))

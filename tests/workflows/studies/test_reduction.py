@@ -134,6 +134,7 @@ def test_without_loads_nothing_moves(folder):
             assert np.abs(found.outputs).max() < 1e-9
 
 
+@pytest.mark.flags
 def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):
     (folder / "beyond.toml").write_text(USED.format(upper=2000, more=""))
     said = [one.text for one in load(folder / "beyond.toml").findings]
