@@ -47,7 +47,7 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     assert checked.returncode == 0, checked.stderr
     done = run(2, TISSUQ, "run", study, "--out", out, "--no-report")
     assert done.returncode == 0, done.stderr
-    assert run(None, TISSUQ, "report", out).returncode == 0
+    assert run(None, TISSUQ, "report", "--code", out).returncode == 0
     data = xr.load_dataset(out / "results.nc")
     assert (data["smallest"] > 0).all()
     assert (data["smallest"] < data["largest"]).all()

@@ -152,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--quiet", action="store_true", help="print nothing but errors")
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
+    report.add_argument("--code", action="store_true", help="run code that the studies name besides what is installed")
     schema = commands.add_parser("schema", help="print the JSON Schema of study files, for editors")
     completion = commands.add_parser("completion", help="print what lets a shell complete commands, options and files")
     completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
@@ -247,11 +248,11 @@ def _report(options: argparse.Namespace) -> int:
         message = f"--out {options.out}: is the file of a comparison, expected several directories"
         raise StudyError(message)
     for directory in options.directories:
-        sys.stdout.write(f"{write_report(directory)}\n")
+        sys.stdout.write(f"{write_report(directory, code=options.code)}\n")
     if len(options.directories) > 1:
         out = options.out or Path("comparison.html")
         try:
-            sys.stdout.write(f"{compare(options.directories, out)}\n")
+            sys.stdout.write(f"{compare(options.directories, out, code=options.code)}\n")
         except OSError as error:
             if isinstance(error, FileNotFoundError) and error.filename is None:  # one of the directories, in words
                 raise

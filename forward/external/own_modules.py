@@ -14,17 +14,52 @@ import json
 import sys
 import sysconfig
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
 _TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
+_refused: ContextVar[list[str] | None] = ContextVar("refused", default=None)  # where not all may be imported
+
+
+class OwnCodeError(ModelError):
+    """What was asked for needs code that is neither of this program nor installed, where none of it may run."""
+
+
+@contextmanager
+def installed_only() -> Iterator[list[str]]:
+    """Within this, no module that a study names is imported unless it is installed, and no folder is searched.
+
+    A study is read in many places, and other studies that it names too: all of them import by `imported`, and find
+    modules by `search`.
+
+    Yields
+    ------
+    list
+        Modules that were asked for and not imported, up to now.
+    """
+    refusals: list[str] = []
+    before = _refused.set(refusals)
+    try:
+        yield refusals
+    finally:
+        _refused.reset(before)
+
+
+def refused(module: str) -> bool:
+    """Whether a module may not be imported here: it is not installed, within `installed_only`."""
+    if _refused.get() is None:
+        return False
+    file = _file(find(module))
+    return file is None or _is_own(file)
 
 
 @dataclass(frozen=True)
@@ -161,6 +196,12 @@ class Loaded:
         return None if change is None else other_code(change)
 
 
+def search(folders: Iterable[Path]) -> None:
+    """Let Python look for modules in some folders too, after all other places, unless only what is installed runs."""
+    if _refused.get() is None:
+        sys.path += [name for name in dict.fromkeys(map(str, folders)) if name not in sys.path]
+
+
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:
     """Let Python find modules in some folders too, after all other places.
 
@@ -179,9 +220,11 @@ def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "
         If one of them, or a module imported from these folders, has the same name as a module found elsewhere, so that
         it is ambiguous.
     """
+    if _refused.get() is not None:
+        return
     names = [str(folder) for folder in folders]
     elsewhere = [entry for entry in sys.path if str(Path(entry or ".").resolve()) not in names]
-    sys.path += [name for name in dict.fromkeys(names) if name not in sys.path]
+    search(map(Path, names))
     importers = {(module.partition(".")[0], ""): "" for module in modules}
     for name, spec, imported in _walk(list(modules)):
         file = _file(spec)
@@ -197,7 +240,17 @@ def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "
 
 
 def imported(module: str) -> ModuleType:
-    """Import a module, again if its file or source, or those of its imports, have changed since the last import."""
+    """Import a module, again if its file or source, or those of its imports, have changed since the last import.
+
+    Raises
+    ------
+    OwnCodeError
+        If it may not be imported here.
+    """
+    if refused(module):
+        cast("list[str]", _refused.get()).append(module)
+        message = f"'{module}' is not installed, and code from beside a study runs with --code alone"
+        raise OwnCodeError(message)
     importlib.invalidate_caches()
     now = sources([module]).files
     for name, (file, _) in now.items():

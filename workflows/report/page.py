@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from pydantic import ValidationError
 
+from forward.external.own_modules import OwnCodeError, installed_only, refused
+from forward.settings import one_line
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import Report, located
 from workflows.config.study import parse
@@ -24,8 +29,16 @@ TOP = ("answer", "findings", "body")  # sections of the first screen
 Parts = list[tuple[str, list[Block]]]  # sections by their names
 
 
-def write_report(directory: Path) -> Path:
+def write_report(directory: Path, *, code: bool = False) -> Path:
     """Write report.html beside the results of a study.
+
+    Parameters
+    ----------
+    directory
+        Where the results are.
+    code
+        Run the code that the study names besides what is installed. Without it, what needs such code is left out, and
+        the report and a line on the standard error say so.
 
     Raises
     ------
@@ -35,18 +48,41 @@ def write_report(directory: Path) -> Path:
         If a section that the study asks for does not exist.
     """
     path = directory / "report.html"
-    results = _read(directory)
-    parts = [
-        (name, found)
-        for name, section in sections(_asked(directory))
-        if (found := _made(name, section, results)) is not None
-    ]
+    with _running(code) as refusals:
+        results, asked = _read(directory, refusals), _asked(directory)
+        left_out = [] if asked is None else [name for name in asked.sections if refused(name.rpartition(".")[0])]
+        parts: Parts = []
+        for name, section in sections(asked):
+            try:
+                found = _made(name, section, results)
+            except OwnCodeError:
+                left_out.append(name)
+            else:
+                parts += [] if found is None else [(name, found)]
+    if left_out:
+        asked_for = f" ({', '.join(dict.fromkeys(refusals))})" if refusals else ""
+        said = f"left out, since they need code that is not installed{asked_for}: {', '.join(left_out)}; --code runs it"
+        parts.append(("left-out", [Heading("Sections that were left out"), Text(said, "warning")]))
+        sys.stderr.write(f"{one_line(f'{directory}: {said}')}\n")
     write_text(path, render(f"Study {results.summary['study']}", parts))
     return path
 
 
-def compare(directories: Sequence[Path], out: Path) -> Path:
-    """Write the estimates of several studies side by side to the file `out`.
+def _running(code: bool) -> AbstractContextManager[list[str]]:
+    """Let code of studies run, or not; what is returned lists modules that were refused."""
+    return nullcontext([]) if code else installed_only()
+
+
+class _Withheld:
+    """Stands for a study that cannot be read without running its own code."""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        message = f"'{name}' of the study is not known without its own code"
+        raise OwnCodeError(message)
+
+
+def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Path:
+    """Write the estimates of several studies side by side to the file `out`; `code` as for `write_report`.
 
     Raises
     ------
@@ -55,7 +91,8 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     """
     studies = {}
     for name, directory in zip(_names(directories), directories, strict=True):
-        studies[name] = _read(directory)
+        with _running(code) as refusals:
+            studies[name] = _read(directory, refusals)
         if not comparison.applies(studies[name]):
             message = f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison"
             raise StudyError(message)
@@ -83,6 +120,8 @@ def _made(name: str, section: Section, results: Results) -> list[Block] | None:
     """Return the blocks of a section, if it applies; the rest of the report survives a failing one from outside."""
     try:
         return list(section.content(results)) if section.applies(results) else None
+    except OwnCodeError:
+        raise
     except Exception as error:
         if name in SECTIONS.own:
             raise
@@ -90,7 +129,8 @@ def _made(name: str, section: Section, results: Results) -> list[Block] | None:
         return [Heading(name), Text(f"This section could not be made: {why}", "error")]
 
 
-def _read(directory: Path) -> Results:
+def _read(directory: Path, refusals: list[str]) -> Results:
+    """Read results with their study, unless code that is refused is needed for that."""
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
@@ -101,6 +141,8 @@ def _read(directory: Path) -> Results:
         study = parse(tomllib.loads(dataset.attrs["config"]), folder=directory)
         return Results(dataset, summary, study, directory)
     except StudyError as error:
+        if refusals:
+            return Results(dataset, summary, _Withheld(), directory)
         made = dataset.attrs.get("tissuq", "unknown")
         message = f"{directory}: not a study of this version of tissuq, it was made by version {made} ({error.args[0]})"
         raise StudyError(message) from None

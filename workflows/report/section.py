@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from forward.external.own_modules import make_visible
+from forward.external.own_modules import make_visible, refused
 from forward.readable import and_error
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
@@ -195,7 +195,7 @@ SECTIONS = Kinds(
 
 
 def of_study(report: Report | None) -> dict[str, Section]:
-    """Import the sections that a study asks for.
+    """Import the sections that a study asks for, as far as they may run here.
 
     Raises
     ------
@@ -207,6 +207,8 @@ def of_study(report: Report | None) -> dict[str, Section]:
     make_visible(report.modules, [Path(report.folder), Path.cwd()], "report.sections")
     found: dict[str, Section] = {}
     for name in report.sections:
+        if refused(name.rpartition(".")[0]):
+            continue
         try:
             found[name] = SECTIONS[name]()
         except KindError as error:

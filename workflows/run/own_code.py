@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from forward.external.own_modules import Loaded, Sources, other_code, sources
+from forward.external.own_modules import Loaded, Sources, other_code, search, sources
 from forward.registry import dotted, installed
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document
@@ -76,7 +75,7 @@ def make_visible(directory: Path) -> None:
     """Let Python find the modules behind the results in a directory, where they were when these were computed."""
     known = _kept(directory)
     if known is not None:
-        sys.path += [str(folder) for folder in known.folders if folder.is_dir() and str(folder) not in sys.path]
+        search(folder for folder in known.folders if folder.is_dir())
 
 
 def listed(study: StudyKind) -> list[str]:

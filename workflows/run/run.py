@@ -260,7 +260,7 @@ def _tell(directory: Path, words: str, *, report: bool) -> None:
 def _report(directory: Path) -> None:
     from workflows.report.page import write_report
 
-    write_report(directory)
+    write_report(directory, code=True)  # it has run already
 
 
 def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> int | None:

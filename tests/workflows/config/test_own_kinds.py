@@ -124,7 +124,7 @@ def test_a_model_and_a_method_from_beside_the_study(beside):
 
 
 def test_the_command_line_finds_them_and_the_report_is_made_from_elsewhere(beside, tmp_path_factory):
-    folder, _ = beside
+    folder, name = beside
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     command = [sys.executable, "-m", "workflows"]
     for words in (["run", folder / "study.toml", "--out", folder / "out", "--no-report"], ["report", folder / "out"]):
@@ -133,6 +133,22 @@ def test_the_command_line_finds_them_and_the_report_is_made_from_elsewhere(besid
         )
         assert done.returncode == 0, done.stderr
         assert (folder / "out" / "report.html").exists() == (words[0] == "report")
+    # Its model is code from beside the study, which no report runs unless it is told to.
+    assert f"code that is not installed ({name}): header; --code runs it" in done.stderr
+    plain = (folder / "out" / "report.html").read_text()
+    assert '<section id="answer">' in plain
+    assert '<section id="header">' not in plain
+    done = subprocess.run(
+        [*command, "report", "--code", folder / "out"],
+        cwd=elsewhere,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert not done.stderr
+    assert '<section id="header">' in (folder / "out" / "report.html").read_text()
 
 
 def test_installed_kinds_of_the_same_name_as_a_module_beside_the_study(beside):

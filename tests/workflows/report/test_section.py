@@ -1,5 +1,6 @@
 """Sections of a report: those of the program, and one from outside in one file."""
 
+import json
 import re
 import sys
 
@@ -40,10 +41,10 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("my_sections", None)
 
 
-def tissuq(command, study, out=None):
+def tissuq(command, study, out=None, *more):
     """Exit code of a command, as from a shell without what other tests have imported."""
     sys.modules.pop("my_sections", None)
-    return main([command, str(study), *(["--out", str(out), "--quiet"] if out else [])])
+    return main([command, str(study), *(["--out", str(out), "--quiet"] if out else []), *more])
 
 
 def test_a_section_beside_the_study_stands_where_it_wants_to(folder):
@@ -56,7 +57,7 @@ def test_a_section_beside_the_study_stands_where_it_wants_to(folder):
     assert "Samples of the sag." in page
     assert page.count("document.getElementById('limit').value = '12 cm';") == 1
     (folder / "out" / "report.html").unlink()
-    assert tissuq("report", folder / "out") == 0
+    assert tissuq("report", folder / "out", None, "--code") == 0
     assert (folder / "out" / "report.html").read_text() == page
 
 
@@ -91,10 +92,38 @@ def test_a_section_that_is_not_there_is_said_before_anything_is_solved(folder, c
     assert said in capsys.readouterr().err
 
 
+def test_a_report_runs_no_code_that_its_folder_names(folder, monkeypatch, capsys):
+    """Neither a section, nor a module beside the study or in the folders that results name, nor one of this folder."""
+    assert tissuq("run", folder / "study.toml", folder / "out") == 0
+    ran = folder / "ran"
+    hostile = f"from pathlib import Path\nPath({str(ran)!r}).touch()\n"
+    (folder / "my_sections.py").write_text(hostile)
+    for name in ("my_sections.py", "functions.py", "cftime.py", "sitecustomize.py"):
+        (folder / "out" / name).write_text(hostile)
+    files = {"cftime": [str(folder / "out" / "cftime.py"), ""], "my_sections": [str(folder / "my_sections.py"), ""]}
+    (folder / "out" / "sources.json").write_text(json.dumps({"files": files, "versions": {}}))
+    study = folder / "out" / "study.toml"
+    study.write_text(study.read_text().replace('"my_sections.Limit"', '"my_sections.Limit", "cftime.A", "nowhere.B"'))
+    monkeypatch.chdir(folder / "out")
+    capsys.readouterr()
+    assert tissuq("report", ".") == 0
+    assert not ran.exists()
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "my_sections.Limit, cftime.A, nowhere.B; --code runs" in said
+    page = (folder / "out" / "report.html").read_text()
+    assert "nowhere.B; --code runs it" in page
+    assert '<section id="distribution">' in page
+    assert main(["report", ".", str(folder / "out"), "--out", str(folder / "both.html")]) == 0
+    assert not ran.exists()
+    assert tissuq("report", ".", None, "--code") == 2  # what is named is no section, but it has run
+    assert ran.exists()
+
+
 def test_a_section_that_is_gone_is_said(folder, capsys):
     assert tissuq("run", folder / "study.toml", folder / "out") == 0
     (folder / "my_sections.py").unlink()
-    assert tissuq("report", folder / "out") == 2
+    assert tissuq("report", folder / "out", None, "--code") == 2
     said = capsys.readouterr().err
     assert f"No module named 'my_sections'; expected in my_sections.py in {folder}" in said
     assert len(said.splitlines()) == 1
@@ -126,6 +155,9 @@ def test_an_installed_package_adds_a_section(folder, monkeypatch):
     (metadata / "entry_points.txt").write_text("[tissuq]\nsection.limit = my_sections:Limit\n")
     monkeypatch.syspath_prepend(folder)
     assert tissuq("run", folder / "plain.toml", folder / "out") == 0
+    assert '<section id="limit">' in (folder / "out" / "report.html").read_text()
+    (folder / "out" / "report.html").unlink()
+    assert tissuq("report", folder / "out") == 0
     assert '<section id="limit">' in (folder / "out" / "report.html").read_text()
 
 
