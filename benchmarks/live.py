@@ -25,6 +25,7 @@ from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from workflows.__main__ import main as command
 from workflows.live.loop import real_time
+from workflows.live.token import kept
 
 CONFIG = Path(__file__).parent.parent / "configs" / "slab.toml"
 FRAMES, PERIOD = 100_000, 1e-3
@@ -58,6 +59,7 @@ def main(words: Sequence[str] = ()) -> None:
         try:
             assert served.stdout is not None
             port = int(served.stdout.readline().split(":")[2].split(",")[0])
+            served.stdout.readline()  # where the token is
             print(served.stdout.readline().strip())
             first, *others = sorted(os.sched_getaffinity(0))
             os.sched_setaffinity(served.pid, {first})
@@ -84,10 +86,11 @@ def _pictures(model: Path, seconds: float) -> None:
                 time.sleep(0.1)
                 with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", ports[1])):
                     break
-            tab.open(f"http://127.0.0.1:{ports[1]}/")
+            tab.open(f"http://127.0.0.1:{ports[1]}/#{kept()}")
             shown = "document.getElementById('rate').textContent"
             tab.wait(f"/[1-9]\\d* pictures/.test({shown})")
             device = socket.create_connection(("127.0.0.1", ports[0]))
+            device.sendall(json.dumps({"token": kept()}).encode() + b"\n")
             lines = device.makefile("rb")
             x = json.loads(lines.readline())["parameters"]["loads.spot.x"]
             rates, ends, k = [], time.monotonic() + seconds, 0
@@ -109,6 +112,7 @@ def _measure(port: int, frames: int, path: Path) -> None:
     """Send and receive; what is late is sent at once."""
     device = socket.create_connection(("127.0.0.1", port))
     device.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    device.sendall(json.dumps({"token": kept()}).encode() + b"\n")
     lines = device.makefile("rb")
     told = json.loads(lines.readline())
     x, y = (told["parameters"][f"loads.spot.{axis}"] for axis in "xy")

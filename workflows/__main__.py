@@ -121,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument("--page", type=int, default=8043, help="port of the page (default: 8043)")
     live.add_argument("--no-page", action="store_true", help="the socket alone")
     live.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts devices on other machines too")
+    live.add_argument("--no-token", action="store_true", help="serve everyone who reaches the ports")
     live.add_argument("--quiet", action="store_true", help="print nothing but errors")
     live.set_defaults(command=_live)
     for command in (check, run, reduce, serve):
@@ -277,7 +278,7 @@ def _live(options: argparse.Namespace) -> int:
     from workflows.live.loop import serve
 
     page = None if options.no_page else options.page
-    serve(options.model, options.host, options.port, page, quiet=options.quiet)
+    serve(options.model, options.host, options.port, page, quiet=options.quiet, secret=not options.no_token)
     return DONE
 
 

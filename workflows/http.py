@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from email.message import Message
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -125,13 +126,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def _check_origin(self) -> None:
         """Refuse requests from browser pages, also under a name that was made to point to this host."""
-        host, origin = self.headers.get("Host"), self.headers.get("Origin")
-        if self.server.local and host is not None and not _is_local(host, self.server.called):
-            message = f"Host: {host[:80]!r}, expected localhost: this server answers only this machine"
-            raise RefusalError("Forbidden", message, 403)
-        if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
-            message = f"Origin: {origin[:80]!r}, expected none: this server does not answer browser pages"
-            raise RefusalError("Forbidden", message, 403)
+        objection = foreign(self.headers, self.server.called if self.server.local else None)
+        if objection:
+            raise RefusalError("Forbidden", objection, 403)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Say what is wrong with the header of a request."""
@@ -187,6 +184,24 @@ class Server(ThreadingHTTPServer):
         error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
             sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
+
+
+def foreign(headers: Message, called: str | None) -> str:
+    """Say why a request is that of a page elsewhere, which a browser shows; empty if it is not.
+
+    Parameters
+    ----------
+    headers
+        Of the request.
+    called
+        The name of a server that answers this machine alone; None for others, which have any name.
+    """
+    host, origin = headers.get("Host"), headers.get("Origin")
+    if called is not None and host is not None and not _is_local(host, called):
+        return f"Host: {host[:80]!r}, expected localhost: this server answers only this machine"
+    if origin is not None and (not host or origin.partition("://")[2].lower() != host.lower()):
+        return f"Origin: {origin[:80]!r}, expected none: this server does not answer browser pages"
+    return ""
 
 
 def parsed(body: bytes) -> dict[str, Any]:

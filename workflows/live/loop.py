@@ -4,12 +4,18 @@ One process does nothing else, with the priority of real time where the system l
 frames come. A second one makes local models of the newest frame, over and over; a third one serves the page. What they
 have to say is taken between frames in whole messages (`workflows.live.mail`), so a frame never waits for them.
 
-A client connects and is told in one line what there is: the `parameters` with their means, the names and units of
+A client connects and says in its first line which `token` it has been given (`workflows.live.token`; with `--no-token`,
+nothing). It is told in one line what there is: the `parameters` with their means, the names and units of
 the `outputs`, and which of them come from the `local` model alone. Then each line that it sends, a table of the
 parameters that have changed, is answered by one line: `outputs`, estimated `errors` to be added, `spread` (one standard
 deviation due to the parameters that nobody has set), the `residual`, the number of `corrections`, whether the frame is
 `late`, the age of the local model (`local_ms`), and the `microseconds` that the answer took. `id` comes back as sent.
 There is one body: what one client sets moves it for all. One that does not read its answers is not read either.
+
+Others may connect too: a page in a browser, which can send requests of HTTP and nothing else, or whoever wants to keep
+devices out. What begins with anything but a table is none of ours, whatever follows. Who has not spoken within
+`FIRST` seconds leaves, at most `STRANGERS` are waited for and `CLIENTS` served; where there are more, who has been
+silent for longest leaves. What a client may send at once, and what is kept for it, is bounded.
 
 A frame is corrected as long as that is done within `WITHIN`. Where a correction takes longer, the answer is the last
 frame moved along the slopes of the local model (`corrections` is 0), and the correction follows once it has been sent.
@@ -22,6 +28,8 @@ null then: those that are known are of another place.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import gc
 import json
 import multiprocessing
@@ -31,7 +39,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +52,16 @@ from forward.reduced.newton import outside_of
 from forward.reduced.stream import Local, Stream, local
 from workflows.config.mistakes import StudyError
 from workflows.live.mail import Mail, pair
+from workflows.live.token import kept, place, same
 
 WITHIN = 0.5e-3  # s that the corrections of a frame may take
 REST = 5e-5  # s in which the system delivers an answer before its correction is made
 SHOWN = 1 / 60  # s between states that are sent to the page
 BEHIND = 5  # how much nicer the other processes are than the loop
 LONGEST = 2**16  # bytes of a line
+FIRST = 5.0  # s until the first line is there
+AT_ONCE = 2**13  # bytes that are read of one client before others have their turn
+CLIENTS, STRANGERS = 16, 16  # that are connected at the same time: those who have spoken, and those who have not
 FAR = "the body has moved too far at once: outputs are on the tangent at another place, until this one is solved"
 UNBALANCED = "forces were out of balance by more than 1 % before the last correction: the body moves too fast to follow"
 NOT_PROMPT = "the usual one: frames are late where others want the processors (`ulimit -r 1` would let it be real time)"
@@ -72,6 +84,31 @@ def followed(path: str, mail: Mail) -> None:
         return
 
 
+@dataclass
+class _Client:
+    """What is known of one that is connected.
+
+    Attributes
+    ----------
+    heard
+        When it last said something, by the monotonic clock.
+    known
+        Whether it has said its first line.
+    rest
+        What came of a line that is not complete.
+    unsent
+        Answers for which there was no room.
+    skipping
+        Whether what comes is the rest of a line that was too long.
+    """
+
+    heard: float
+    known: bool = False
+    rest: bytes = b""
+    unsent: bytes = b""
+    skipping: bool = False
+
+
 class Loop:
     """Frames for all clients, one after the other.
 
@@ -83,9 +120,13 @@ class Loop:
         Where clients connect.
     view
         Sends what the page shows, and what its sliders say comes back; None without a page.
+    token
+        What clients must say first; None if anyone on this machine, or that reaches it, is served.
     """
 
-    def __init__(self, path: Path, listening: socket.socket, view: Mail | None = None) -> None:
+    def __init__(
+        self, path: Path, listening: socket.socket, view: Mail | None = None, token: str | None = None
+    ) -> None:
         data = load(path)
         self._model = ReducedModel(data, data.parameters)
         self._data, self._view = data, view
@@ -101,15 +142,14 @@ class Loop:
         theirs.close()
         self._busy, self._shown, self._asked = False, 0.0, data.nominal.copy()
         self._refused = ""  # why there is no local model where one was asked for last
-        self._listening = listening
+        self._listening, self._token = listening, token
+        listening.setblocking(False)  # one that has gone before it was accepted keeps nobody waiting
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
         self._selector.register(self._helper, selectors.EVENT_READ, self._local)
         if view is not None:
             self._selector.register(view, selectors.EVENT_READ, self._slid)
-        self._buffers: dict[socket.socket, bytes] = {}
-        self._refused_lines: set[socket.socket] = set()  # clients whose line was too long; its rest is left out
-        self._unsent: dict[socket.socket, bytes] = {}
+        self._clients: dict[socket.socket, _Client] = {}
         self.ended = False
 
     def run(self) -> None:
@@ -120,13 +160,14 @@ class Loop:
         try:
             while not self.ended:
                 ready = self._selector.select(SHOWN)
-                for key, _ in sorted(ready, key=lambda one: one[0].fileobj not in self._buffers):  # clients first
+                for key, _ in sorted(ready, key=lambda one: one[0].fileobj not in self._clients):  # they first
                     handle: Callable[[Any], None] = key.data
                     handle(key.fileobj)
                 if self.stream.behind:
                     time.sleep(REST)
                     self.stream.frame(self._now, self.stream.takes + self.stream.besides)  # one correction
                 self._share()
+                self._dismiss()
                 if not ready:
                     gc.collect(0)
         finally:
@@ -136,7 +177,7 @@ class Loop:
     def close(self) -> None:
         """Let go of everything."""
         self.ended = True
-        for one in (*self._buffers, self._listening):
+        for one in (*self._clients, self._listening):
             one.close()
         self._helper.close()
         self._process.terminate()
@@ -155,51 +196,102 @@ class Loop:
     # --- clients -----------------------------------------------------------------------------------------------------
 
     def _accept(self, listening: socket.socket) -> None:
-        client, _ = listening.accept()
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            client, _ = listening.accept()
+        except OSError as error:
+            if error.errno in {errno.EMFILE, errno.ENFILE}:  # there is room for it once another one has left
+                self._leave(min(self._clients, key=lambda one: self._clients[one].heard, default=None))
+                time.sleep(REST)
+            return  # or else it has gone again
         client.setblocking(False)
-        self._buffers[client] = b""
+        with contextlib.suppress(OSError):
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients[client] = _Client(time.monotonic())
         self._selector.register(client, selectors.EVENT_READ, self._read)
-        self._send(client, [self.greeting()])
+        if self._token is None:
+            self._send(client, [self.greeting()])
+        self._make_room(STRANGERS, known=False)
 
     def _read(self, client: socket.socket) -> None:
-        if client in self._unsent:
+        one = self._clients.get(client)
+        if one is None:  # it has had to leave since
+            return
+        if one.unsent:
             self._send(client, [])
             return
         try:
-            arrived = client.recv(LONGEST)
+            arrived = client.recv(AT_ONCE)
+        except BlockingIOError:
+            return
         except OSError:
             arrived = b""
         if not arrived:
             self._leave(client)
             return
-        if client in self._refused_lines:
+        if one.skipping:
             _, newline, arrived = arrived.partition(b"\n")
             if not newline:
                 return
-            self._refused_lines.discard(client)
-        *lines, rest = (self._buffers[client] + arrived).split(b"\n")
-        answers = [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)]
-        if len(rest) > LONGEST:
+            one.skipping = False
+        *lines, one.rest = (one.rest + arrived).split(b"\n")
+        answers: list[dict[str, Any]] = []
+        if not one.known:
+            if not lines and len(one.rest) <= LONGEST and one.rest.lstrip()[:1] in {b"", b"{"}:
+                return
+            objection, first = self._introduced(lines[0] if lines else b"")
+            if objection:
+                self._send(client, [{"error": objection}])
+                self._leave(client)
+                return
+            one.known, one.heard = True, time.monotonic()
+            self._make_room(CLIENTS, known=True)
+            answers = [] if self._token is None else [self.greeting()]
+            lines[:1] = first
+        if lines:
+            one.heard = time.monotonic()
+        answers += [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)]
+        if len(one.rest) > LONGEST:
             answers.append({"error": f"a line of more than {LONGEST} bytes, expected a table of numbers"})
-            self._refused_lines.add(client)
-            rest = b""
-        self._buffers[client] = rest
+            one.skipping, one.rest = True, b""
         self._send(client, answers)
 
-    def _leave(self, client: socket.socket) -> None:
-        if client in self._buffers:
+    def _introduced(self, line: bytes) -> tuple[str, list[bytes]]:
+        """Return what is wrong with a first line, or else what is to be answered of it besides the token."""
+        try:
+            table = _table(line)
+        except (ValueError, TypeError, RecursionError):
+            return "expected a table in JSON as the first line; nothing else is answered here", []
+        given = table.pop("token", None)
+        if self._token is not None and not same(given, self._token):
+            return f'expected {{"token": "..."}} first, with what is in {place()} where `tissuq live` runs', []
+        return "", [json.dumps(table).encode()] if table or given is None else []
+
+    def _make_room(self, most: int, *, known: bool) -> None:
+        """Have the one leave that has been silent for longest, where there are more than this number of its kind."""
+        kind = [client for client, one in self._clients.items() if one.known == known]
+        if len(kind) > most:
+            self._leave(min(kind, key=lambda client: self._clients[client].heard))
+
+    def _dismiss(self) -> None:
+        """Have those leave that were to say a token and have said nothing."""
+        if self._token is None:
+            return
+        now = time.monotonic()
+        for client, one in list(self._clients.items()):
+            if not one.known and now - one.heard > FIRST:
+                self._send(client, [{"error": f'expected {{"token": "..."}} within {FIRST:.0f} s'}])
+                self._leave(client)
+
+    def _leave(self, client: socket.socket | None) -> None:
+        if client is not None and self._clients.pop(client, None) is not None:
             self._selector.unregister(client)
-            del self._buffers[client]
-            self._unsent.pop(client, None)
-            self._refused_lines.discard(client)
             client.close()
 
     def _send(self, client: socket.socket, tables: list[dict[str, Any]]) -> None:
         """Send answers; of what there is no room for now, the rest once there is, and nothing is read before."""
-        lines = b"".join(json.dumps(table).encode() + b"\n" for table in tables)
-        before = self._unsent.pop(client, b"")
-        content = before + lines
+        one = self._clients[client]
+        before = one.unsent
+        content = before + b"".join(json.dumps(table).encode() + b"\n" for table in tables)
         try:
             sent = client.send(content) if content else 0
         except BlockingIOError:
@@ -207,11 +299,9 @@ class Loop:
         except OSError:  # it has gone
             self._leave(client)
             return
-        if sent < len(content):
-            self._unsent[client] = content[sent:]
-        if before or client in self._unsent:
-            wanted = selectors.EVENT_WRITE if client in self._unsent else selectors.EVENT_READ
-            self._selector.modify(client, wanted, self._read)
+        one.unsent = content[sent:]
+        if before or one.unsent:
+            self._selector.modify(client, selectors.EVENT_WRITE if one.unsent else selectors.EVENT_READ, self._read)
 
     def answer(self, line: bytes, *, late: bool = False) -> dict[str, Any]:
         """Return the answer to a line."""
@@ -358,7 +448,7 @@ def listen(host: str, port: int, option: str) -> socket.socket:
         raise StudyError(message) from None
 
 
-def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False) -> None:
+def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False, secret: bool = True) -> None:
     """Serve a reduced model until the user ends it.
 
     Parameters
@@ -371,13 +461,17 @@ def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = F
         Port of the page; None for no page.
     quiet
         Say nothing.
+    secret
+        Serve only those who have the token.
 
     Raises
     ------
     StudyError
-        If a port is taken.
+        If a port is taken, or there is no token.
     """
     from workflows.live.page import show
+
+    token = kept() if secret else None
 
     context = multiprocessing.get_context("spawn")
     listening = listen(host, port, "--port")
@@ -386,16 +480,17 @@ def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = F
         shown = listen("127.0.0.1", page, "--page")
         page = shown.getsockname()[1]
         view, theirs = pair()
-        process = context.Process(target=show, args=(str(path), shown, theirs), daemon=True)
+        process = context.Process(target=show, args=(str(path), shown, theirs, token), daemon=True)
         process.start()
         theirs.close()
         shown.close()
-    loop = Loop(path, listening, view)
+    loop = Loop(path, listening, view, token)
     prompt = real_time()
     if not quiet:
         sys.stdout.write(f"frames: {host}:{listening.getsockname()[1]}, a line of JSON each\n")
         if page is not None:
-            sys.stdout.write(f"page: http://127.0.0.1:{page}/\n")
+            sys.stdout.write(f"page: http://127.0.0.1:{page}/{'' if token is None else f'#{token}'}\n")
+        sys.stdout.write(f"token: {'none, whoever reaches the port is served' if token is None else place()}\n")
         sys.stdout.write(f"priority: {'that of real time' if prompt else NOT_PROMPT}\n")
         sys.stdout.flush()
     try:

@@ -1,11 +1,19 @@
-"""The page of `tissuq live`: one file, the surface of the body at the newest frame, and sliders that move it."""
+"""The page of `tissuq live`: one file, the surface of the body at the newest frame, and sliders that move it.
+
+The file is the same for everyone. What it shows and moves is for those who have the token, which stands in the page's
+address behind the `#`, where browsers send it to nobody; the page itself sends it in a header, which no page elsewhere
+can. Pages elsewhere are refused besides, and of connections beyond `CONNECTIONS` the one is closed that has been
+without an answer for longest.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -16,10 +24,14 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.reduced.data import ReducedData, load
+from workflows.http import foreign
 from workflows.live.mail import Mail
+from workflows.live.token import same
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request
+CONNECTIONS = 24  # that are open at the same time; a browser has six
+IDLE = 10.0  # s after which one is closed of which nothing comes
 HEXAHEDRA = {12, 25, 29, 72}  # VTK's numbers of their types; the others are tetrahedra
 _OF_HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 _OF_TETRAHEDRON = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
@@ -75,30 +87,64 @@ class Scene:
 
 
 class _Server(ThreadingHTTPServer):
-    """Serves a scene at a socket; `move` is called with what sliders say."""
+    """Serves a scene at a socket to those who have the token; `move` is called with what sliders say."""
 
-    def __init__(self, scene: Scene, listening: socket.socket, move: Callable[[dict[str, float]], object]) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        listening: socket.socket,
+        move: Callable[[dict[str, float]], object],
+        token: str | None = None,
+    ) -> None:
         super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket = listening
-        self.scene, self.move = scene, move
+        self.scene, self.move, self.token = scene, move, token
+        self._answered: dict[socket.socket, float] = {}  # open connections, and when they had their last answer
+        self._lock = threading.Lock()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, and close another one if there are too many."""
+        with self._lock:
+            if len(self._answered) >= CONNECTIONS:
+                silent = min(self._answered, key=lambda one: self._answered[one])
+                del self._answered[silent]
+                with contextlib.suppress(OSError):
+                    silent.shutdown(socket.SHUT_RDWR)  # its thread closes it
+            self._answered[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            self._answered.pop(request, None)
+        super().shutdown_request(request)
+
+    def answered(self, request: socket.socket) -> None:
+        """Note that a connection has had an answer."""
+        with self._lock:
+            if request in self._answered:
+                self._answered[request] = time.monotonic()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a page that was closed."""
-        if not isinstance(sys.exception(), ConnectionError):
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
+    timeout = IDLE
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True  # or a picture takes 40 ms
 
-    def _own(self) -> bool:
-        """Whether it was asked by this name: a page elsewhere can make its name point here."""
-        name = self.headers.get("Host", "").rsplit(":", 1)[0]
-        if name in {"127.0.0.1", "localhost"}:
+    def _may(self) -> bool:
+        """Whether it is our page that asks, with the token; a page elsewhere can make its name point here."""
+        token = self.server.token
+        given = self.headers.get("Authorization", "").removeprefix("Bearer ")
+        if not foreign(self.headers, "127.0.0.1") and (token is None or self.path == "/" or same(given, token)):
             return True
+        self.close_connection = True  # what has not been read would be taken for the next request
         self.send_error(403)
         return False
 
@@ -107,11 +153,13 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Frame-Options", "DENY")
         self.end_headers()
         self.wfile.write(content)
+        self.server.answered(self.connection)
 
     def do_GET(self) -> None:
-        if not self._own():
+        if not self._may():
             return
         match self.path:
             case "/":
@@ -133,7 +181,7 @@ class _Handler(BaseHTTPRequestHandler):
         raise ValueError
 
     def do_POST(self) -> None:
-        if not self._own():
+        if not self._may():
             return
         try:
             values = self._values()
@@ -148,10 +196,10 @@ class _Handler(BaseHTTPRequestHandler):
         return
 
 
-def show(path: str, listening: socket.socket, mail: Mail) -> None:
+def show(path: str, listening: socket.socket, mail: Mail, token: str | None = None) -> None:
     """Serve the page of a model whose newest frames come by mail, until that is closed."""
     scene = Scene(load(Path(path)))
-    found = _Server(scene, listening, mail.send)
+    found = _Server(scene, listening, mail.send, token)
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:
