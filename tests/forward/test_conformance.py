@@ -58,6 +58,7 @@ class Faulty:
         return Wrapped(self.inner.solve(parameters, guess), **self.faults)
 
 
+@pytest.mark.unit
 def test_right_derivatives_pass():
     found = check_derivatives(MODEL, POINT, SCALE)
     assert found.mistakes() == ()
@@ -69,6 +70,7 @@ def test_right_derivatives_pass():
     assert found.directions == ("'a'", "'b'", "a direction of 2 parameters")
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("output", [0, 1, 2])
 @pytest.mark.parametrize("factor", [1.001, 0.999])
 def test_a_fault_of_a_thousandth_in_a_tangent_is_caught(output, factor):
@@ -85,6 +87,7 @@ def test_a_fault_of_a_thousandth_in_a_tangent_is_caught(output, factor):
         found.require()
 
 
+@pytest.mark.unit
 def test_a_fault_in_the_derivative_of_one_parameter_is_caught():
     wrong = replace(MODEL, jacobian=lambda x: jacobian(x) * np.array([1, 1.001]))
     lines = check_derivatives(wrong, POINT, SCALE).mistakes()
@@ -92,22 +95,26 @@ def test_a_fault_in_the_derivative_of_one_parameter_is_caught():
     assert not any("along 'a'" in line for line in lines)
 
 
+@pytest.mark.unit
 def test_an_adjoint_that_is_not_the_transpose_is_caught():
     found = check_derivatives(Faulty(MODEL, {"adjoint_factor": 1 + 1e-8}), POINT, SCALE)
     assert any(line.startswith("adjoint of 'wave' along 'a': off by") for line in found.mistakes())
     assert not any("tangent of" in line for line in found.mistakes())
 
 
+@pytest.mark.unit
 def test_a_tangent_that_is_not_linear_is_caught():
     found = check_derivatives(Faulty(MODEL, {"bias": 1e-7}), POINT, SCALE)
     assert any("not linear" in line for line in found.mistakes())
 
 
+@pytest.mark.unit
 def test_derivatives_that_are_not_finite_are_caught():
     found = check_derivatives(Faulty(MODEL, {"tangent_factor": np.nan}), POINT, SCALE)
     assert any("off by nan" in line for line in found.mistakes())
 
 
+@pytest.mark.unit
 def test_a_stale_linearisation_is_caught():
     class Stale(FunctionModel):
         """Differentiates where it was solved last."""
@@ -134,6 +141,7 @@ def test_a_stale_linearisation_is_caught():
     assert any("after another solve" in line for line in found.mistakes())
 
 
+@pytest.mark.unit
 def test_a_solution_that_can_be_changed_is_caught():
     class Open(FunctionModel):
         def solve(self, parameters, guess=None):
@@ -147,6 +155,7 @@ def test_a_solution_that_can_be_changed_is_caught():
     assert any("outputs of a solution can change" in line for line in found.mistakes())
 
 
+@pytest.mark.unit
 def test_an_output_of_which_the_second_derivative_vanishes_passes():
     model = FunctionModel(np.sin, ("a",), ("sine",), np.cos)
     found = check_derivatives(model, [0.0], [1.0])
@@ -156,6 +165,7 @@ def test_an_output_of_which_the_second_derivative_vanishes_passes():
     assert check_derivatives(spoilt, [0.0], [1.0]).mistakes()
 
 
+@pytest.mark.unit
 def test_a_wrong_shape_is_caught():
     class Column(FunctionSolution):
         def tangent(self, direction):
@@ -169,11 +179,13 @@ def test_a_wrong_shape_is_caught():
         check_derivatives(Model(values, MODEL.parameters, MODEL.outputs, jacobian), POINT, SCALE)
 
 
+@pytest.mark.unit
 def test_a_model_without_derivatives_is_refused():
     with pytest.raises(DerivativeError, match="no derivatives"):
         check_derivatives(replace(MODEL, jacobian=None), POINT, SCALE)
 
 
+@pytest.mark.unit
 def test_a_function_model_keeps_nothing_of_its_caller():
     buffer = np.zeros(4)
 
@@ -191,6 +203,7 @@ def test_a_function_model_keeps_nothing_of_its_caller():
     np.testing.assert_array_equal(solution.tangent(SCALE), slope)
 
 
+@pytest.mark.unit
 def test_too_few_steps_are_refused():
     with pytest.raises(ValueError, match="2 steps given, expected at least 3"):
         check_derivatives(MODEL, POINT, SCALE, steps=(0.1, 0.05))

@@ -305,6 +305,7 @@ def changed(**field):
     return STUDY | {"model": STUDY["model"] | {"fields": [given]}}
 
 
+@pytest.mark.unit
 def test_coefficients_are_parameters_of_a_study():
     study = parse(STUDY | {"parameters": {"material.D1": {"kind": "uniform", "lower": 1e5, "upper": 3e5}}})
     assert parse(document(study)) == study
@@ -314,6 +315,7 @@ def test_coefficients_are_parameters_of_a_study():
     assert len(parse(changed(basis="noise", modes=None)).inputs.names) == 20
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("field", "words"),
     [
@@ -330,6 +332,7 @@ def test_mistakes(field, words):
         parse(changed(**field))
 
 
+@pytest.mark.unit
 def test_mistakes_of_several_blocks():
     model = STUDY["model"]
     with pytest.raises(StudyError, match="2 of them are called 'stiffness'"):
@@ -389,6 +392,7 @@ def test_samples_are_corrected_from_the_state_at_the_mean(noisy, monkeypatch):
     np.testing.assert_allclose(found.tangents, plain.tangents, atol=1e-5 * np.abs(plain.tangents).max())
 
 
+@pytest.mark.unit
 def test_many_parameters_of_one_distribution_are_quick():
     study = parse(changed(basis="noise", modes=None))
     normal = study.inputs.marginals["fields.stiffness.0"]

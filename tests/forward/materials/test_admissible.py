@@ -78,6 +78,7 @@ def test_bodies_and_their_regions():
         Hyperelastic.model_validate(block | {"material": block["material"] | {"C2": -2e3}})
 
 
+@pytest.mark.unit
 def test_material_points():
     model = HomogeneousModel("mooney-rivlin", {}, [MaterialTest(mode="uniaxial", at=(1.1,))], ("C1", "C2"))
     assert model.solve(np.array([2.0, -1.0])).outputs[0] > 0

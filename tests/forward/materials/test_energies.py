@@ -51,10 +51,12 @@ def symbols(kind):
     return {name: sp.Symbol(name, positive=True) for name in constants(MATERIALS[kind])}
 
 
+@pytest.mark.unit
 def test_every_material_is_tested():
     assert set(VALUES) == set(MODULI) == set(MATERIALS)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("kind", MATERIALS)
 def test_small_strain_moduli(kind):
     expected = MODULI[kind](**VALUES[kind])
@@ -62,6 +64,7 @@ def test_small_strain_moduli(kind):
     assert small_strain_moduli(MATERIALS[kind], VALUES[kind]) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e4, 1e8])
 def test_small_strain_moduli_of_any_compressibility(ratio):
     found = small_strain_moduli("demiray", {"a": 3.0, "b": 40.0, "D1": 1.5 * ratio})
@@ -96,6 +99,7 @@ def test_what_is_called_D1_multiplies_the_whole_volumetric_part(kind):
     assert W(scale, D1=0) == pytest.approx(isochoric, rel=1e-10)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("kind", [kind for kind in MATERIALS if "D1" not in VALUES[kind]])
 def test_energies_without_a_split_say_so(kind):
     assert not splits(kind)
@@ -108,6 +112,7 @@ def test_isochoric_energies_against_the_formula(kind):
     assert float(energy_density(kind, sp.Matrix(F), **VALUES[kind])) == pytest.approx(expected, rel=1e-13)
 
 
+@pytest.mark.unit
 def test_other_energies_against_the_formula():
     E = (F.T @ F - np.eye(3)) / 2
     expected = 1e5 / 2 * np.trace(E) ** 2 + 4e4 * np.tensordot(E, E)
@@ -128,6 +133,7 @@ def test_limits_of_the_fung_and_gent_energies_are_neo_hookean():
     )
 
 
+@pytest.mark.unit
 def test_every_constant_has_a_unit_and_a_name_has_one():
     of = {}
     for kind in MATERIALS:
@@ -148,6 +154,7 @@ def test_materials_need_nothing_heavy():
     assert run_script(None, script).returncode == 0
 
 
+@pytest.mark.unit
 def test_fibres_bear_tension_only():
     """Simple shear I + γ e1⊗e2 makes I4 of fibres along (± 0.6, 0.8) 1 ± 0.96 γ + 0.64 γ²."""
     values = {"c": 2e4, "k1": 1e4, "k2": 0.8, "D1": 2e5}

@@ -33,6 +33,7 @@ def model(kind: str, values: dict[str, float], *tests: MaterialTest) -> Homogene
     return HomogeneousModel(kind, values, chosen, tuple(values), [(1.0, 0.0, 0.0)] if alike else ())
 
 
+@pytest.mark.unit
 def test_every_energy_is_read():
     assert set(CONSTANTS) == set(MATERIALS)
 
@@ -209,6 +210,7 @@ def test_many_parameter_sets_at_once():
     np.testing.assert_allclose(solution.tangent(np.array([1e4, 0.0])), found[0], rtol=1e-12)  # P is linear in μ
 
 
+@pytest.mark.unit
 def test_mistakes_are_named():
     for settings, told in (
         ({"mode": "uniaxial", "at": (0.0,)}, "stretch 0"),

@@ -34,6 +34,7 @@ def run(lengths, most, broken=()):
     return seen, columns
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("most", [1, 3, 50])
 def test_results_come_in_turn_whatever_is_together(most):
     lengths = [3, 1, 0, 9, 2, 2, 0, 0, 5, 1, 1, 4]
@@ -43,11 +44,13 @@ def test_results_come_in_turn_whatever_is_together(most):
     assert max(columns) == min(most, sum(n > 0 for n in lengths))
 
 
+@pytest.mark.unit
 def test_as_many_as_possible_are_together():
     _, columns = run([1, 2, 3, 4] * 25, 4)
     assert columns[:-4] == [4] * (len(columns) - 4)
 
 
+@pytest.mark.unit
 def test_one_that_takes_long_does_not_let_results_pile_up():
     seen, columns = run([40] + [1] * 30, 4)
     assert seen[1:] == [2.0 * i for i in range(1, 31)]
@@ -55,6 +58,7 @@ def test_one_that_takes_long_does_not_let_results_pile_up():
     assert 1 in columns  # the others wait for the first
 
 
+@pytest.mark.unit
 def test_what_fails_is_returned_in_its_place():
     seen, _ = run([2, 2, 2, 2], 2, broken={1, 3})
     assert [isinstance(one, SolveError) for one in seen] == [False, True, False, True]
@@ -62,6 +66,7 @@ def test_what_fails_is_returned_in_its_place():
     assert run([], 4) == ([], [])
 
 
+@pytest.mark.unit
 def test_a_solver_through_an_approximate_inverse():
     def halved(x):
         return (yield x / 2) + 1

@@ -120,6 +120,7 @@ def test_distances_are_those_to_the_nearest_point_of_the_surface(shape):
     np.testing.assert_allclose(indenter.gaps(on_surface), 0, atol=1e-12)
 
 
+@pytest.mark.unit
 def test_the_pressure_is_the_slope_of_the_energy_and_smooth():
     gap = np.linspace(-3, 2, 5001)
     of = (tools.NUMPY, gap, 2.0, 1.0)
@@ -327,11 +328,13 @@ def test_where_a_tool_stops_is_said_in_millimetres():
         spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
 
 
+@pytest.mark.unit
 def test_a_tool_does_not_hold_what_it_pushes_away():
     with pytest.raises(ValidationError, match="nothing holds the body along z"):
         body(tool(), displacements=ON_ROLLERS[:2])
 
 
+@pytest.mark.unit
 def test_the_force_of_an_unknown_tool():
     output = {"kind": "force", "name": "F", "tool": "punch"}
     with pytest.raises(ValidationError, match="unknown tool; expected one of: indenter"):
@@ -342,6 +345,7 @@ def test_the_force_of_an_unknown_tool():
         body(tool(name="ball"), outputs=({"kind": "force", "name": "F"},))
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     "held",
     [
@@ -376,6 +380,7 @@ def test_samples_that_a_tool_does_not_suit_are_said_before(name, ends, said):
     assert not any("In some samples" in one.text for one in spec.findings_over({path: (0.98 * near, 1.02 * near)}))
 
 
+@pytest.mark.unit
 def test_a_tool_sharper_than_the_mesh_is_said_to_be():
     texts = [finding.text for finding in body(tool(radius=1e-3, depth=1e-4)).findings]
     assert any("below the edges of the cells there" in text for text in texts)
@@ -384,6 +389,7 @@ def test_a_tool_sharper_than_the_mesh_is_said_to_be():
     assert not body(only("flat", radius=8e-3, edge=4e-3)).findings
 
 
+@pytest.mark.unit
 def test_words():
     words = body(tool()).loads[0].words({name: f"<{name}>" for name in body(tool()).loads[0].scalars})
     expected = "indenter on z-max: rigid sphere, radius <radius>; moved by <depth> along (0, 0, -1)"

@@ -101,6 +101,7 @@ def test_residuals_tell_a_wrong_model():
     assert found.agreement_probability < 0.02
 
 
+@pytest.mark.unit
 def test_few_data_of_many_parameters():
     model = FunctionModel(lambda p: [p.sum()], ("a", "b", "c"), ("y",), lambda p: [[1.0, 1.0, 1.0]])
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in "abc"})
@@ -112,6 +113,7 @@ def test_few_data_of_many_parameters():
     assert found.passed
 
 
+@pytest.mark.unit
 def test_neighbours_are_of_the_same_group_and_measured():
     places = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [0, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
     groups = np.array([0, 0, 0, 1, 1, 1])
@@ -139,6 +141,7 @@ def test_neighbours_depend_on_distances_only():
             assert {(min(i, j), max(i, j)) for i, j in pairs} == expected
 
 
+@pytest.mark.unit
 def test_neighbours_on_a_grid_stand_along_its_axes():
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 0.3, 4)), axis=-1).reshape(-1, 2)
     first, second = neighbours(grid, np.zeros(28, dtype=np.int64))

@@ -13,6 +13,7 @@ def scores(seed, models, data, spread):
     return rng.standard_normal((models, data)) * spread + 0.3 * rng.standard_normal((models, 1)) - 20
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("seed", range(20))
 def test_no_weights_predict_better(seed):
     """The gradient at a maximum: 1 where a weight is positive, at most 1 elsewhere."""
@@ -27,6 +28,7 @@ def test_no_weights_predict_better(seed):
     np.testing.assert_allclose(gradient[w > 1e-3], 1, atol=1e-4)
 
 
+@pytest.mark.unit
 def test_two_models_by_a_grid():
     found = scores(3, 2, 40, 1.0)
     grid = np.linspace(0, 1, 100_001)

@@ -33,6 +33,7 @@ def read(tmp_path, text):
     return read_outputs(file, OUTPUTS, steps_of(SPEC))
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     "text",
     [
@@ -51,6 +52,7 @@ def test_curves_in_any_units(tmp_path, text):
     assert found.labels[2] == "curve.csv: line 3"
 
 
+@pytest.mark.unit
 def test_long_tables_of_the_same_data_are_read_too(tmp_path):
     found = read(tmp_path, "# truth.material.mu = 1000\noutput,value\nforce.2,-5e-3\nforce.2,-6e-3\n")
     assert found.names == ("force.2", "force.2")
@@ -58,6 +60,7 @@ def test_long_tables_of_the_same_data_are_read_too(tmp_path):
     assert found.truth == {"material.mu": 1000.0}
 
 
+@pytest.mark.unit
 def test_measurements_may_be_repeated_and_steps_numbered(tmp_path):
     assert read(tmp_path, "z,force\n-1e-3,1\n-1e-3,1.1\n-2e-3,2\n").names == ("force.1", "force.1", "force.2")
     assert read(tmp_path, "step,force\n2,1\n1,2\n").names == ("force.2", "force.1")
@@ -96,6 +99,7 @@ def test_what_a_curve_cannot_be(tmp_path, text, message):
     assert message in " ".join(caught.value.args)
 
 
+@pytest.mark.unit
 def test_units_of_heads():
     assert split_head("depth [mm]") == ("depth", "mm")
     assert split_head("depth(mm)") == ("depth", "mm")

@@ -53,6 +53,7 @@ def test_densities_scores_and_normal_scores(errors):
     assert mean == pytest.approx(density.expect(lambda x: float(errors.score(np.array(x))) ** 2), rel=1e-6)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("noise", [None, NOISE])
 def test_gradients_are_those_of_the_density(noise):
     here = posterior(HEAVY, noise)

@@ -1,6 +1,7 @@
 """Models that are restricted to what was measured."""
 
 import numpy as np
+import pytest
 
 from forward.model import MeshError, Saturation, Work
 from inverse.data.measured_model import MeasuredSolution
@@ -18,6 +19,7 @@ class Estimated:
         return FACTORS
 
 
+@pytest.mark.unit
 def test_calibrations_are_those_of_the_measured_outputs():
     """All of them: an output may be measured twice, or not at all."""
     solution = MeasuredSolution(Estimated(), [2, 0, 2], 3)

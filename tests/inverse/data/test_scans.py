@@ -182,6 +182,7 @@ def test_pairs_of_surfaces(tmp_path, form):
     assert digest_of(tmp_path / "scan.toml") != before
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("form", ["HDF", "Binary"])
 def test_numbers_that_are_stored_elsewhere_belong_to_a_scan(tmp_path, form):
     """A file whose numbers have changed is another one, also where its text is the same."""
@@ -233,6 +234,7 @@ def test_units_of_heads(tmp_path, head, settings, told):
     assert told in str(caught.value)
 
 
+@pytest.mark.unit
 def test_units_agree(tmp_path):
     (tmp_path / "scan.csv").write_text("x [mm],y [mm],z [mm],ux [mm]\n1,2,3,4\n")
     for settings in ({}, {"units": "mm"}, {"unit": 1e-3}):
@@ -281,6 +283,7 @@ def test_files_damaged_by_chance(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.unit
 def test_pairs_that_do_not_belong_together(tmp_path):
     def told(deformed, reference="rest.ply", case="press"):
         with pytest.raises(DataError) as caught:
@@ -327,6 +330,7 @@ def test_mistakes_in_descriptions(tmp_path, text, told):
     assert any(told in line for line in caught.value.args), caught.value.args
 
 
+@pytest.mark.unit
 def test_scans_of_another_body(tmp_path):
     """Distances that are huge, a wrong unit, points within the body that should lie on its surface."""
     write(tmp_path / "scan.vtu")
@@ -347,6 +351,7 @@ def test_scans_of_another_body(tmp_path):
     assert len(placed.observations.places) == 4
 
 
+@pytest.mark.unit
 def test_nearest_places_of_surfaces():
     """Those of a box by its planes, on any division of its faces."""
     points = np.random.default_rng(1).uniform(-0.02, 0.07, size=(300, 3))

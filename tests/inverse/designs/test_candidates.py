@@ -18,6 +18,7 @@ NONE = np.zeros(7, dtype=bool)
 ALL = ("pull.top.0.x", "pull.top.0.z", "pull.side.1.x", "pull.force", "push.top.0.x", "push.force")
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("each", "names", "which"),
     [
@@ -39,6 +40,7 @@ def test_values_are_gathered(each, names, which):
         assert np.isnan(found.places).all()
 
 
+@pytest.mark.unit
 def test_steps_and_outputs_of_a_path():
     values = Values(("F.1", "u.1", "F.2", "u.2"), np.full((4, 3), np.nan), ("1", "1", "2", "2"), ("F", "u", "F", "u"))
     steps = Candidates.of(values, "step", NONE[:4])
@@ -48,6 +50,7 @@ def test_steps_and_outputs_of_a_path():
     assert values.kinds == [("", "F"), ("", "u"), ("", "F"), ("", "u")]
 
 
+@pytest.mark.unit
 def test_goals_are_no_candidates():
     goals = VALUES.matching("*.force")
     found = Candidates.of(VALUES, "value", goals)
@@ -55,6 +58,7 @@ def test_goals_are_no_candidates():
     assert (found.which[goals] == -1).all()
 
 
+@pytest.mark.unit
 def test_costs_by_names():
     found = Candidates.of(VALUES, "point", NONE)
     assert found.numbers({"pull.*": 2.0, "*.force": 7.0}).tolist() == [2, 2, 7, 1, 7]

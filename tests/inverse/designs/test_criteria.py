@@ -22,6 +22,7 @@ def information(rows, chosen):
     return np.linalg.slogdet(np.eye(rows.shape[-1]) + A.T @ A)[1] / 2
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
 def test_what_a_set_tells_is_the_determinant(scale):
     rows = scale * problem(draws=1)[0]
@@ -32,6 +33,7 @@ def test_what_a_set_tells_is_the_determinant(scale):
     np.testing.assert_allclose(told(rows[order].reshape(-1, 4)), expected[-1], rtol=1e-7, atol=1e-14)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e7])
 def test_covariances_are_those_that_are_left(scale):
     R = scale * np.random.default_rng(1).standard_normal((3, 5))
@@ -41,6 +43,7 @@ def test_covariances_are_those_that_are_left(scale):
     np.testing.assert_allclose(root @ root.T, right, atol=1e-9)
 
 
+@pytest.mark.unit
 def test_what_an_observation_adds_never_grows():
     criterion = Information(problem())
     every = np.arange(8)
@@ -52,6 +55,7 @@ def test_what_an_observation_adds_never_grows():
         before = after
 
 
+@pytest.mark.unit
 def test_variances_of_goals_are_those_of_the_posterior():
     rows, G = problem(draws=2), np.random.default_rng(2).standard_normal((3, 4))
     goals = [G.T @ G, 4 * np.eye(4)]
@@ -65,6 +69,7 @@ def test_variances_of_goals_are_those_of_the_posterior():
     np.testing.assert_allclose(criterion.left, [np.trace(goals[0]) - taken[0], 16 - taken[1]], rtol=1e-9)
 
 
+@pytest.mark.unit
 def test_values_that_are_measured_together_are_one_candidate():
     rows = np.arange(24.0).reshape(8, 3)
     which = np.array([1, -1, 0, 1, 1, 1, 1, 0])
@@ -91,6 +96,7 @@ def test_expected_information_of_a_nonlinear_model_is_that_of_nested_sampling():
     assert error < 0.03
 
 
+@pytest.mark.unit
 def test_parameters_are_whitened_by_their_prior():
     own = {"a": Normal(mean=2.0, std=3.0), "b": Uniform(lower=0.0, upper=1.0)}
     rng = np.random.default_rng(4)

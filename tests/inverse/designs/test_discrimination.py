@@ -31,6 +31,7 @@ def divergence(k, l, rows):
     return (np.trace(inverse @ S) - len(rows) + gap @ inverse @ gap + volumes) / 2
 
 
+@pytest.mark.unit
 def test_expected_ln_bayes_factors_are_divergences_of_dense_predictions():
     one = criterion()
     worth = list(along(one, [4, 0, 1]))
@@ -43,6 +44,7 @@ def test_expected_ln_bayes_factors_are_divergences_of_dense_predictions():
     assert (np.diff([0.0, *worth]) > 0).all()
 
 
+@pytest.mark.unit
 def test_expected_ln_bayes_factors_are_those_of_monte_carlo():
     one = criterion(2)
     for candidate in (0, 1, 4):
@@ -56,6 +58,7 @@ def test_expected_ln_bayes_factors_are_those_of_monte_carlo():
         assert error < 0.05 * log_factors.mean()
 
 
+@pytest.mark.unit
 def test_the_observation_that_differs_most_is_chosen_first():
     means = [np.zeros(4), np.array([0.1, 3.0, 3.0, 0.5])]
     roots = [np.zeros((4, 1)), np.array([[0.0], [9.0], [0.1], [0.0]])]
@@ -65,6 +68,7 @@ def test_the_observation_that_differs_most_is_chosen_first():
     np.testing.assert_allclose(made().gains(np.array([3])), [0.125], rtol=1e-12)
 
 
+@pytest.mark.unit
 def test_moments_of_draws():
     A, sigma = RNG.standard_normal((M, 2)), RNG.uniform(0.5, 2, M)
     outputs = 3 + RNG.standard_normal((500, 2)) @ A.T

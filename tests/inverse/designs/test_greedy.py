@@ -20,6 +20,7 @@ def mean_information(rows, chosen):
     return np.mean([information(one, chosen) for one in rows])
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("seed", range(8))
 def test_choices_are_nearly_the_best_of_all_sets(seed):
     rows = problem(seed, draws=3, count=9, k=1 + seed % 3)
@@ -30,6 +31,7 @@ def test_choices_are_nearly_the_best_of_all_sets(seed):
     assert found.worth > 0.95 * best
 
 
+@pytest.mark.unit
 def test_orthogonal_observations_are_chosen_best():
     sizes = np.array([0.3, 2.0, 1.0, 0.1, 3.0])
     found = choose(lambda: Information([np.diag(sizes)[:, None, :]]), np.ones(5), number=3, budget=None)
@@ -37,6 +39,7 @@ def test_orthogonal_observations_are_chosen_best():
     np.testing.assert_allclose(found.gains, np.log1p(sizes[[4, 1, 2]] ** 2) / 2, rtol=1e-12)
 
 
+@pytest.mark.unit
 def test_few_candidates_are_looked_at_again():
     rng = np.random.default_rng(5)
     rows = [10 ** rng.uniform(-2, 1, (400, 1, 1)) * rng.standard_normal((400, 3, 6)) for _ in range(3)]
@@ -47,6 +50,7 @@ def test_few_candidates_are_looked_at_again():
     assert lazy.looks < plain.looks / 5
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("seed", range(5))
 def test_budgets_are_kept_and_nearly_used_best(seed):
     rows, rng = problem(seed, count=9), np.random.default_rng(seed)
@@ -57,12 +61,14 @@ def test_budgets_are_kept_and_nearly_used_best(seed):
     assert found.worth > 0.9 * max(mean_information(rows, s) for s in sets)
 
 
+@pytest.mark.unit
 def test_one_that_tells_all_is_not_passed_over_for_a_cheap_one():
     rows = [np.array([[[0.2, 0.0]], [[0.0, 100.0]]])]
     found = choose(lambda: Information(rows), np.array([0.01, 5.0]), number=None, budget=5.0)
     assert found.order == (1,)
 
 
+@pytest.mark.unit
 def test_variances_are_reduced_most():
     rows, goals = problem(3, draws=2, count=9), [np.diag([1.0, 0, 0, 0]), np.diag([0.5, 0.5, 0, 0])]
     found = choose(lambda: Variance(rows, goals), np.ones(9), number=1, budget=None)

@@ -10,6 +10,7 @@ from inverse.fields.newton_cg import find_mode
 from tests.problems import DATA, Linear, N, curved, solved
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("holes", [0, 7])
 def test_everything_is_exact_with_all_pairs(holes):
     problem = Linear(holes=holes)
@@ -39,6 +40,7 @@ def test_everything_is_exact_with_all_pairs(holes):
     assert found.information == pytest.approx((divergence - expected) / 2, rel=1e-8)
 
 
+@pytest.mark.unit
 def test_predictions_and_resolution_are_those_of_the_exact_posterior():
     problem = Linear(holes=7)
     _, found = solved(problem, cutoff=1e-12)
@@ -77,6 +79,7 @@ def test_the_error_of_a_truncation_is_that_of_the_first_neglected_pair(limit):
     np.testing.assert_allclose(found.narrowing**2, 1 / (1 + problem.values[:r]), rtol=1e-9)
 
 
+@pytest.mark.unit
 def test_the_rank_follows_the_spectrum():
     problem = Linear()
     point = find_mode(problem.posterior).point
@@ -87,6 +90,7 @@ def test_the_rank_follows_the_spectrum():
         assert (found.residuals <= 1e-2 * found.values).all()
 
 
+@pytest.mark.unit
 def test_equal_values_and_exhausted_spaces():
     rng = np.random.default_rng(0)
     Q, _ = np.linalg.qr(rng.standard_normal((40, 40)))
@@ -124,6 +128,7 @@ def test_calibration():
 # --- models that are not linear --------------------------------------------------------------------------------------
 
 
+@pytest.mark.unit
 def test_gradient_and_product_are_derivatives():
     posterior = curved()
     rng = np.random.default_rng(0)
@@ -141,6 +146,7 @@ def test_gradient_and_product_are_derivatives():
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("limit", [np.inf, 4.0])
 def test_the_mode_is_stationary_also_where_steps_leave_what_can_be_solved(limit):
     posterior = curved(limit)
@@ -156,6 +162,7 @@ def test_the_mode_is_stationary_also_where_steps_leave_what_can_be_solved(limit)
     assert mode.solves == 1 + sum(row.solves for row in mode.iterations)
 
 
+@pytest.mark.unit
 def test_what_cannot_be_is_refused():
     posterior = curved()
     with pytest.raises(ValueError, match="expected 25 of each"):

@@ -49,6 +49,7 @@ def test_linear_models(prior):
     np.testing.assert_allclose(found.posterior.sigma, found.factor * problem.sigma)
 
 
+@pytest.mark.unit
 def test_the_density_of_the_factor_is_that_of_the_model():
     problem = Linear(holes=7)
     mode, found = solved(problem, cutoff=1e-12)
@@ -79,6 +80,7 @@ def test_the_factor_lies_within_its_standard_deviations():
     assert (np.square(scores)).sum() == pytest.approx(25, abs=3 * np.sqrt(50))
 
 
+@pytest.mark.unit
 def test_models_that_are_not_linear():
     exact = curved()
     truth_sigma = 0.05
@@ -90,6 +92,7 @@ def test_models_that_are_not_linear():
     np.testing.assert_allclose(found.mode.point.whitened, again, atol=0.02)
 
 
+@pytest.mark.unit
 def test_noise_that_cannot_be_is_refused():
     problem = Linear()
     with pytest.raises(ValueError, match="median of the prior of the noise is -100"):

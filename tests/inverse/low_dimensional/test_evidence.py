@@ -102,6 +102,7 @@ def test_wider_priors_by_the_same_points():
         assert error < 0.1
 
 
+@pytest.mark.unit
 def test_pareto_shapes_are_those_of_arviz():
     """Values of psislw of ArviZ 0.21 for the same weights."""
     for n, k, expected in (
@@ -115,6 +116,7 @@ def test_pareto_shapes_are_those_of_arviz():
     assert pareto_shape(np.ones(20)) == np.inf
 
 
+@pytest.mark.unit
 def test_where_there_is_no_answer():
     model = FunctionModel(two_of_four, FOUR, ("u", "v"), slopes_of_four)
     good = ridge(0.1)

@@ -13,6 +13,7 @@ from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 
 
+@pytest.mark.unit
 def test_kernels_are_exact_for_normal_posteriors_under_normal_priors():
     """p/π_0 of N(1, 0.5) under N(0, 1) is the likelihood N(2 | z, 1); few draws of a density that has wide kernels."""
     from scipy.stats import norm
@@ -78,6 +79,7 @@ def test_specimens_far_from_their_prior_are_drawn_again():
     assert "They cannot be drawn again: no data." in text
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_priors_of_specimens_that_are_drawn_again_cover_the_population(logarithmic):
     rng = np.random.default_rng(3)
@@ -139,6 +141,7 @@ def test_covariates_move_the_mean_as_a_regression_says():
     assert without.std.mean() > 2.5 * left  # the grade is then a part of how specimens vary
 
 
+@pytest.mark.unit
 def test_covariates_are_numbers_or_words():
     names = ["one", "two", "three", "four"]
     region = dict(zip(names, ("cortex", "thalamus", "cortex", "corona"), strict=True))
@@ -187,6 +190,7 @@ def test_correlations_have_the_density_that_is_said(d):
     np.testing.assert_allclose(second[~np.eye(d, dtype=bool)], 1 / (3 + d), rtol=0.03)
 
 
+@pytest.mark.unit
 def test_densities_of_correlated_priors():
     from scipy.stats import multivariate_normal
 

@@ -29,6 +29,7 @@ def ridge(noise=None):
     return Posterior(inputs, SerialEvaluate(model), np.array([1.2, 1.9]), np.array([0.1, 0.2]), noise)
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize("noise", [None, FACTOR], ids=["known", "inferred"])
 def test_gradient(noise):
     """Taylor remainders fall by four when the step is halved."""
@@ -43,6 +44,7 @@ def test_gradient(noise):
         assert remainder[0] / remainder[1] == pytest.approx(4, abs=0.1)
 
 
+@pytest.mark.unit
 def test_curvature_of_linear_models_is_exact():
     posterior = on_treloar("yeoh", LINEAR["yeoh"], FACTOR)
     x = np.array([[0.1, -0.2, 0.3, 0.4]])
@@ -88,6 +90,7 @@ def test_mode_is_stationary_from_every_start():
         assert np.abs(step).max() < 1e-5
 
 
+@pytest.mark.unit
 def test_second_derivatives_by_differences():
     posterior = ridge()
     found = laplace(posterior)
@@ -98,6 +101,7 @@ def test_second_derivatives_by_differences():
     np.testing.assert_allclose(found.hessian, (gradients[:c] - gradients[c:]) / (2 * h), rtol=2e-2, atol=0.1)
 
 
+@pytest.mark.unit
 def test_points_are_joined_in_an_order():
     posterior = ridge()
     x = np.random.default_rng(0).normal(size=(6, 3))
@@ -110,6 +114,7 @@ def test_points_are_joined_in_an_order():
     assert Density.joined([posterior.at(x[:2]), parts[1]]).tangents is None
 
 
+@pytest.mark.unit
 def test_where_there_is_no_answer():
     def refuse(p):
         raise SolveError("never")
@@ -122,6 +127,7 @@ def test_where_there_is_no_answer():
         laplace(posterior)
 
 
+@pytest.mark.unit
 def test_mistakes_are_named():
     posterior = ridge()
     for sigma, told in ((np.ones(3), "2 data with 3 standard deviations"), (np.array([1.0, 0.0]), "expected positive")):

@@ -210,6 +210,7 @@ def test_what_is_zero_by_symmetry_is_not_compared():
     assert not any("v " in text.split(": ", 1)[-1] for text in said)
 
 
+@pytest.mark.unit
 def test_estimates_too_far_for_one_linear_step_are_refused():
     class Far(SolvedOnMesh):
         def mesh_error(self):

@@ -121,6 +121,7 @@ def test_a_running_mean_in_the_second_moment_is_noticed(monkeypatch):
     assert not is_unbiased(repeats(method, 1000)[1])
 
 
+@pytest.mark.unit
 def test_a_coefficient_fitted_to_the_samples_it_corrects_is_noticed():
     """The optimal coefficient from independent samples has no bias; from the four that it corrects it has one."""
     rng = np.random.default_rng(3)

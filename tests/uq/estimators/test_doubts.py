@@ -190,6 +190,7 @@ def indices(**changes):
     return xr.Dataset(data, coords={"output": ["y"], "parameter": ["a", "b"]})
 
 
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -1,6 +1,7 @@
 """Quantiles from groups of models: no bias, intervals that hold, and closer than samples of the model alone."""
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from uq.estimators.blue import subsets
@@ -41,6 +42,7 @@ def test_intervals_hold_and_are_closer_than_those_of_the_model_alone():
     assert (np.abs(np.mean(errors, axis=0)) < 0.35 * rms).all()
 
 
+@pytest.mark.unit
 def test_shares_are_those_of_the_model_where_it_is_alone():
     one = Samples((0, 1), np.random.default_rng(0).standard_normal((50, 2, 1)), np.zeros((50, 2, 1)))
     t = np.array([-1.0, 0.0, 0.7])
@@ -50,6 +52,7 @@ def test_shares_are_those_of_the_model_where_it_is_alone():
     np.testing.assert_allclose(error, np.sqrt(plain * (1 - plain) / 49 + 0.5 / 50**2), rtol=1e-9)
 
 
+@pytest.mark.unit
 def test_samples_apart_tell_weights_only():
     apart, *others = drawn(1, (40, 0, 0)) + drawn(2, (60, 0, 2000))
     t = np.array([0.0])

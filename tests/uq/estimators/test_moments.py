@@ -21,6 +21,7 @@ def repeats(**settings):
     return estimate(monomials(w, x).sum(axis=1), N, zero, zero + 1, **settings)
 
 
+@pytest.mark.unit
 def test_plain_estimates_are_numpys():
     x = np.random.default_rng(0).normal(3, 2, size=(50, 4))
     reference = np.full(4, 2.9)
@@ -67,6 +68,7 @@ def test_a_control_that_hurts_is_dropped():
     np.testing.assert_allclose(optimal.coefficient, -1)
 
 
+@pytest.mark.unit
 def test_expansion_away_from_the_mean_is_caught():
     """A control whose mean is not zero biases the estimate: the check above would fail."""
     x = np.random.default_rng(1).normal(size=(N, REPEATS))
@@ -74,6 +76,7 @@ def test_expansion_away_from_the_mean_is_caught():
     assert abs(m.mean.mean()) > 4 * max(m.mean.std(), 1e-12) / np.sqrt(REPEATS)
 
 
+@pytest.mark.unit
 def test_nodes_that_do_not_move_have_no_error():
     sums = monomials(np.zeros((10, 3)), np.zeros((10, 3))).sum(axis=1)
     m = estimate(sums, 10, np.zeros(3), np.zeros(3), "optimal")
@@ -81,6 +84,7 @@ def test_nodes_that_do_not_move_have_no_error():
         np.testing.assert_array_equal(value, 0)
 
 
+@pytest.mark.unit
 def test_an_estimated_variance_below_nothing_has_a_finite_error():
     """The square of a mean that is known badly may exceed the mean of the squares."""
     means = np.random.default_rng(0).normal(size=(2, 16, 500)) * [[[0.3]], [[1e-2]]]
@@ -103,6 +107,7 @@ def test_quantile_intervals_cover(n, draw):
     assert ((np.abs(found.central - exact) <= 1.96 * found.error).mean(axis=1) >= held).all()
 
 
+@pytest.mark.unit
 def test_the_interval_of_the_median_lies_between_the_order_statistics_of_the_binomial_distribution():
     """Of 25 samples, X_(8) and X_(18) hold it with 95.7 %, X_(9) and X_(17) with 89 %."""
     found = quantiles(np.arange(1.0, 26)[:, None], (0.5,))
@@ -110,6 +115,7 @@ def test_the_interval_of_the_median_lies_between_the_order_statistics_of_the_bin
     assert 17.7 < found.upper.item() < 18
 
 
+@pytest.mark.unit
 def test_errors_of_standard_deviations_of_skewed_samples_cover():
     """Intervals of ln σ²: σ ± 1.96 e/(2σ) covers 80 %."""
     n, count = 64, 4000
@@ -118,6 +124,7 @@ def test_errors_of_standard_deviations_of_skewed_samples_cover():
     assert (np.abs(found.std - 1) < 1.96 * found.std_error).mean() > 0.86
 
 
+@pytest.mark.unit
 def test_claims_of_fitted_coefficients_count_what_the_fit_hides():
     """Of 32 samples of x + x²/5 residuals alone hold 82 % of the standard deviations."""
     n = 32

@@ -49,6 +49,7 @@ def test_share_of_the_variance_beyond_samples_is_the_integral(n, s):
     assert estimator.unseen(NO_TAIL, values).item() == 0
 
 
+@pytest.mark.unit
 def test_what_does_not_look_log_normal_has_no_spread():
     z = stats.norm.ppf((np.arange(256) + 0.5) / 256)
     for values in (z, 5 + z, z**2, np.exp(-(z**2)), np.linspace(0.1, 5, 256), np.exp(np.linspace(0, 4, 256))):
@@ -118,6 +119,7 @@ def test_scrambles_that_agree_by_chance_claim_what_their_samples_do():
 # --- tails on both sides -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.unit
 def test_what_squares_of_normal_samples_miss_is_covered_by_their_scatter():
     for n in (64, 256, 1024):
         z = stats.norm.ppf((np.arange(n) + 0.5) / n)[:, None]
@@ -162,6 +164,7 @@ def test_misses_are_not_silent(method, name):
     assert measure(ODD[name], method, 25 if method.kind == "chaos" else 50).silent[1] <= 0.12
 
 
+@pytest.mark.unit
 def test_bounded_parameters_and_good_controls_claim_no_more_than_before(monkeypatch):
     case = Case("smooth", lambda x: np.exp(x[:, 0]) * (1 + x[:, 1]), Inputs({"a": UNIT, "b": UNIT}))
     data = MonteCarlo(samples=64, fields=False).run(case.inputs, Vectorised(case))
@@ -216,6 +219,7 @@ def test_two_scrambles_that_agree_by_chance_claim_no_less_than_their_samples():
     assert np.mean(after) < np.mean(before) / 1.5
 
 
+@pytest.mark.unit
 def test_scrambles_claim_what_they_gain_where_no_few_samples_carry_the_variance():
     normal = stats.norm.ppf((np.arange(64) + 0.5) / 64)[:, None]
     even = np.linspace(-1, 1, 64)[:, None]

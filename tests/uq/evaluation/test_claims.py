@@ -20,6 +20,7 @@ def jobs(tmp_path):
     return job
 
 
+@pytest.mark.unit
 def test_one_of_two_has_a_claim_until_it_drops_it(jobs):
     one, two = jobs("1"), jobs("2")
     assert one.take("block")
@@ -31,6 +32,7 @@ def test_one_of_two_has_a_claim_until_it_drops_it(jobs):
     assert not one.take("block")
 
 
+@pytest.mark.unit
 def test_what_a_job_of_the_same_name_has_left_is_free_and_that_of_others_is_not(jobs):
     assert jobs("1").take("block")
     assert jobs("2").take("other")
@@ -66,6 +68,7 @@ def test_patience_grows_with_the_longest_piece_of_work(jobs):
     assert not slow.take("left")  # 0.4 s are less than five times 0.2
 
 
+@pytest.mark.unit
 def test_nothing_is_claimed_nor_awaited_once_the_study_is_finished(jobs, tmp_path):
     one, two = jobs("1"), jobs("2")
     assert one.take("block")
@@ -79,6 +82,7 @@ def test_nothing_is_claimed_nor_awaited_once_the_study_is_finished(jobs, tmp_pat
     assert sorted(path.name for path in (tmp_path / "claims").iterdir()) == ["block.claim", "results.claim"]
 
 
+@pytest.mark.unit
 def test_a_folder_that_is_gone_is_made_again_unless_the_study_is_finished(jobs, tmp_path):
     one = jobs("1")
     (tmp_path / "claims").rmdir()
@@ -91,6 +95,7 @@ def test_a_folder_that_is_gone_is_made_again_unless_the_study_is_finished(jobs, 
     assert not (tmp_path / "claims").exists()
 
 
+@pytest.mark.unit
 def test_jobs_begin_apart(jobs):
     pieces = tuple(range(100))
     turned = [jobs(name).turned(pieces) for name in ("0", "1", "2", "3", "a job")]

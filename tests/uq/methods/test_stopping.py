@@ -56,6 +56,7 @@ def test_whichever_comes_first() -> None:
     assert "100 samples, as asked" in stopped(budget_seconds=1e6, samples=100)
 
 
+@pytest.mark.unit
 def test_other_models_are_evaluated_and_charged() -> None:
     double = replace(MODEL, function=lambda p: 2 * np.exp(p[0]) * (1 + p[1]))
     first: Evaluate = SerialEvaluate(MODEL, others={"double": double})
