@@ -15,11 +15,15 @@ if TYPE_CHECKING:
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most severe first
 NUMBER = r"−?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?"
 MANY = 3  # steps at which a list says the same
+UNKNOWN = "mesh_unknown"  # attribute of results, see `keep_unknown`
+NOT_KNOWN = "mesh not known"  # beside every error that is of sampling alone
+DIGITS = 2  # of numbers whose error of the mesh was to be known, and is not
 
 
-def add(dataset: xr.Dataset, *found: Finding) -> None:
-    """Keep findings in ``dataset.attrs["findings"]``, each once, after those that are there."""
-    kept = list(dict.fromkeys([*_kept(dataset), *found]))
+def add(dataset: xr.Dataset, *found: Finding, first: bool = False) -> None:
+    """Keep findings in ``dataset.attrs["findings"]``, each once, after those that are there, or before them."""
+    there = _kept(dataset)
+    kept = list(dict.fromkeys([*found, *there] if first else [*there, *found]))
     if kept:
         dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
 
@@ -120,6 +124,28 @@ def _steps(steps: Collection[int]) -> str:
 def findings(dataset: xr.Dataset) -> list[Finding]:
     """Return the findings that a dataset keeps, the most severe first."""
     return sorted(_kept(dataset), key=lambda one: SEVERITIES.index(one.severity))
+
+
+def keep_unknown(dataset: xr.Dataset, names: Collection[str], planned: Collection[str]) -> None:
+    """Keep which outputs have a mesh whose error is not known, so that their errors are of sampling alone.
+
+    Parameters
+    ----------
+    dataset
+        The results.
+    names
+        These outputs.
+    planned
+        Outputs whose error of the mesh was to be estimated.
+    """
+    if names:
+        dataset.attrs[UNKNOWN] = json.dumps({name: name in planned for name in names}, ensure_ascii=False)
+
+
+def meshes_unknown(dataset: xr.Dataset) -> dict[str, bool]:
+    """Return the outputs whose error of the mesh is not known, and whether its estimates have failed."""
+    found: dict[str, bool] = json.loads(dataset.attrs.get(UNKNOWN, "{}"))
+    return found
 
 
 def _kept(dataset: xr.Dataset) -> list[Finding]:

@@ -24,6 +24,7 @@ EXACT = 1e-9  # of a value: errors that are no more than that are rounding
 LOOSE = 1e-8  # tolerance of the solver from which its error may be as large as one of a mesh
 VISIBLE = 1e-3  # of a mean: doubts below do no harm
 LISTED = 8  # outputs that a sentence names
+FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 Names = NDArray[Any]  # of the outputs (m,)
 
 
@@ -80,6 +81,11 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[
         )
 
 
+def failed(why: str) -> Finding:
+    """Say that the error of the mesh was to be estimated and is not known."""
+    return Finding("error", f"The error of the mesh is not known: {why}. What stands after ± does not hold it.")
+
+
 def _unexplained(names: Names, dataset: xr.Dataset, counts: NDArray[np.bool_]) -> Iterator[Finding]:
     """Find errors of the mesh that vary with the parameters as no expansion says."""
     error, doubt = np.abs(dataset["mesh_error"].to_numpy()), dataset["mesh_error_doubt"].to_numpy()
@@ -126,7 +132,8 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
     n, ok = len(estimates.points), int(estimates.ok.sum())
     if ok < n:
         reason = estimates.failures[0].reason
-        rest = "the others are used" if ok > 1 else "so that nothing is known of the error of the mesh"
+        known = ok >= FEWEST_ANSWERS
+        rest = "the others are used" if known else "so that nothing is known of the error of the mesh"
         if told.contact:
             said = (
                 f"{n - ok} of {n} estimates of the error of the mesh failed, as they mostly do in contact, where the "
@@ -135,8 +142,8 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
             )
         else:
             said = f"{n - ok} of {n} estimates of the error of the mesh failed ({reason}); {rest}."
-        yield Finding("warning", said)
-    if ok < 2:
+        yield Finding("warning" if known else "error", said)
+    if ok < FEWEST_ANSWERS:
         return
     assert estimates.mesh_errors is not None
     known = np.isfinite(estimates.mesh_errors[estimates.ok])
@@ -156,7 +163,7 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
             f"There is no estimate of the error of the mesh at some points of {listed}, and so none of its effect: "
             "richer elements give no finite value there. Take more cells, or leave these outputs out."
         )
-        yield Finding("warning", text)
+        yield Finding("error", text)
 
 
 def _large(names: Names, word: str, error: FloatArray, size: FloatArray) -> Iterator[Finding]:

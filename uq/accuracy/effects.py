@@ -19,7 +19,7 @@ import numpy as np
 
 from forward.model import Finding, FloatArray
 from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
-from uq.accuracy.doubts import Told, doubts
+from uq.accuracy.doubts import FEWEST_ANSWERS, Told, doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
 from uq.estimators.moments import ESTIMATES
 from uq.findings import add
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
-FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
 ELSEWHERE, CHANGED = 0.15, 0.5  # the same of what was found at the mean, at other parameters, and where errors vary
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
@@ -102,7 +101,7 @@ def with_mesh_errors(
     if found.fields is not None and len(found.points) >= FEWEST_ANSWERS:
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
     dataset = dataset.assign(variables)
-    add(dataset, *doubts(dataset, found.evaluations, told))
+    add(dataset, *doubts(dataset, found.evaluations, told), first=True)
     left_out = [words for name, words in WITHOUT.items() if name in dataset]
     if "mesh_error" in dataset and left_out:
         text = (

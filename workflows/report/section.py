@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import and_error
+from forward.readable import and_error, margin, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import NONE
+from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
 from workflows.report.words import solves
 
@@ -88,11 +89,20 @@ class Results:
             self._of_outputs[output] = self.dataset.sel(output=output)
         return self._of_outputs[output]
 
+    @cached_property
+    def meshes_unknown(self) -> dict[str, bool]:
+        """Outputs whose error of the mesh is not known, and whether its estimates have failed."""
+        return meshes_unknown(self.dataset)
+
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
-        of_output = self.of(output)
-        value = float(of_output[name])
-        return NONE if np.isnan(value) else and_error(value, float(of_output[f"{name}_error"]), self.unit(output))
+        of_output, unit = self.of(output), self.unit(output)
+        value, error = float(of_output[name]), float(of_output[f"{name}_error"])
+        if np.isnan(value) or output not in self.meshes_unknown or name.endswith("corrected"):
+            return NONE if np.isnan(value) else and_error(value, error, unit)
+        if self.meshes_unknown[output]:
+            return f"{size(value, unit, DIGITS)} (sampling ± {margin(error, unit, like=value)}, {NOT_KNOWN})"
+        return f"{and_error(value, error, unit)} ({NOT_KNOWN})"
 
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from forward.words import with_error
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
+from uq.findings import NOT_KNOWN
 from uq.methods.compare import ESTIMATED
 
 if TYPE_CHECKING:
@@ -39,8 +40,11 @@ def summarise(dataset: xr.Dataset) -> Part:
     return summary
 
 
-def inverted(summary: Mapping[str, Any]) -> list[str]:
-    """Say in a line what was found for each data set, if data were inverted."""
+def inverted(summary: Mapping[str, Any], unknown: Collection[str]) -> list[str]:
+    """Say in a line what was found for each data set, if data were inverted.
+
+    Of the predictions in `unknown`, whose error of the mesh nobody knows, that is said too.
+    """
     lines = []
     for name, found in summary.get("data_sets", {}).items():
         if "failed" in found:
@@ -48,7 +52,10 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
             continue
         values = [f"{path} {with_error(at['mode'], at['std'])}" for path, at in found["posterior"].items()]
         lines.append(f"{name}: {', '.join(values)}")
-        lines += [_predicted(f"{name}: {goal}", at) for goal, at in found.get("predictions", {}).items()]
+        lines += [
+            _predicted(f"{name}: {goal}", at, known=goal not in unknown)
+            for goal, at in found.get("predictions", {}).items()
+        ]
     if "data" in summary:
         lines.append(f"{summary['data']} data made")
     if "design" in summary:
@@ -56,11 +63,12 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _predicted(what: str, at: Mapping[str, Any]) -> str:
+def _predicted(what: str, at: Mapping[str, Any], *, known: bool) -> str:
     """Say in a line what is predicted of an output."""
     if at["mean"] is None:
         return f"{what} is not predicted"
-    mesh = "" if at["mesh_error"] is None else f", mesh {at['mesh_error']:+.2g}"
+    untold = "" if known else f", {NOT_KNOWN}"
+    mesh = untold if at["mesh_error"] is None else f", mesh {at['mesh_error']:+.2g}"
     before = "" if at["prior_mean"] is None else f" (before the data {with_error(at['prior_mean'], at['prior_std'])})"
     return f"{what} {with_error(at['mean'], at['std'])}{before}{mesh}"
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from forward.words import NONE, named, places, with_error
 from uq.estimators.rounding import only_rounding
+from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.report import words
 from workflows.results.summary import inverted
 
@@ -23,13 +24,17 @@ Row = Sequence[str]
 
 
 def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    """Summarise the results at the end of a run."""
-    lines = [
+    """Summarise the results at the end of a run: after what makes them doubtful, which is read first."""
+    severe = [one for one in summary["findings"] if one["severity"] != "note"]
+    notes = [one for one in summary["findings"] if one["severity"] == "note"]
+    lines = _said(severe)
+    before = len(lines)
+    lines += [
         f"{model}: ln Z {with_error(found['log_evidence'], found['log_evidence_error'])}, "
         f"probability {found['probability']:.3g}{_stacking(found)}"
         for model, found in summary.get("models", {}).items()
     ]
-    lines += inverted(summary)
+    lines += inverted(summary, meshes_unknown(dataset))
     lines += _outputs(dataset, summary.get("outputs", {}))
     lines += _bars(summary)
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
@@ -39,7 +44,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
             f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
             f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
         )
-    if not lines:
+    if len(lines) == before:
         lines += _derivatives(dataset, summary)
     failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
     lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
@@ -47,8 +52,11 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         lines.append(words.stability(summary["stability"]))
     if "note" in summary:
         lines.append(summary["note"])
-    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_said(notes)]) + "\n"
+
+
+def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
+    return [f"{one['severity']}: {one['text']}" for one in findings]
 
 
 def _stacking(found: Mapping[str, Any]) -> str:
@@ -57,9 +65,10 @@ def _stacking(found: Mapping[str, Any]) -> str:
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Moments of the outputs: in a table with the errors of the mesh where there are any, else a line each."""
+    unknown = meshes_unknown(dataset)
     if not any(values.get("mesh_error") is not None for values in outputs.values()):
         for output, values in outputs.items():
-            yield _line(output, values, _unit(dataset, output))
+            yield _line(output, values, _unit(dataset, output), unknown.get(output))
         return
     rounding = only_rounding(dataset, {output: _unit(dataset, output) for output in outputs})
     rows: list[Row] = [("", "value", "sampling", "mesh", "in all", "corrected")]
@@ -67,7 +76,7 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
         rows.append((named(output, _unit(dataset, output)) + (": zero but for rounding" if nothing else ""),))
         for name, first in ESTIMATES.items() if not nothing else ():
             error = values.get(f"{first}mesh_error")
-            of_mesh = [NONE]
+            of_mesh = ["not known" if output in unknown else NONE]
             if error is not None and f"{name}_corrected" in values:
                 total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
                 doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
@@ -78,7 +87,8 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
                 total = values.get(f"{first}total_error")
                 of_mesh = [f"{error:+.2g}", NONE if total is None else _error(total), NONE]
             sampling = values[f"{name}_error"]
-            rows.append((f"  {name}", _value(values[name], sampling), _error(sampling), *of_mesh))
+            value = _two(values[name]) if unknown.get(output) else _value(values[name], sampling)
+            rows.append((f"  {name}", value, _error(sampling), *of_mesh))
     yield from _table(rows)
 
 
@@ -100,31 +110,33 @@ def _bars(summary: Mapping[str, Any]) -> list[str]:
     return [*lines, *(f"  {reason}" for reason in told["reasons"])]
 
 
-def _line(output: str, values: Mapping[str, Any], unit: str) -> str:
-    """Moments of an output."""
+def _line(output: str, values: Mapping[str, Any], unit: str, failed: bool | None) -> str:
+    """Moments of an output, and whether estimates of the error of its mesh have failed: None if it is known."""
+    write = _two_plus_minus if failed else _plus_minus
     return (
-        f"{output}: mean {_plus_minus(values['mean'], values['mean_error'])} {unit}, "
-        f"standard deviation {_plus_minus(values['std'], values['std_error'])} {unit}"
-    )
+        f"{output}: mean {write(values['mean'], values['mean_error'])} {unit}, "
+        f"standard deviation {write(values['std'], values['std_error'])} {unit}"
+    ) + ("" if failed is None else f" (± is of sampling, {NOT_KNOWN})")
 
 
 def _derivatives(dataset: xr.Dataset, summary: Mapping[str, Any]) -> Iterator[str]:
     """Outputs at the mean parameters, and the effects of the parameters to first order."""
     nominal = summary.get("nominal", {})
     known = any(values["mesh_error"] is not None for values in nominal.values())
+    unknown = meshes_unknown(dataset)
     rows: list[Row] = [("", "value", *(("mesh", "corrected") if known else ()))]
     for output, slopes in summary.get("local_per_range", {}).items():
         rows.append((named(output, _unit(dataset, output)),))
         at = nominal.get(output, {"value": float(dataset["nominal"].sel(output=output)), "mesh_error": None})
-        rows.append(
-            ("  at the mean parameters", *_with_mesh(at["value"], at["mesh_error"], at.get("mesh_error_doubt")))
-        )
+        digits, gap = DIGITS if unknown.get(output) else 4, ("not known",) * (known and output in unknown)
+        here = _with_mesh(at["value"], at["mesh_error"], at.get("mesh_error_doubt"), digits)
+        rows.append(("  at the mean parameters", *here, *gap))
         spreads = [_spread(dataset, summary, output, name, slope) for name, slope in slopes.items()]
         spreads.sort(key=lambda one: -abs(one[1]))
         for name, value, factor in spreads[:PARAMETERS]:
             errors = [summary.get(f"local_mesh_error{end}", {}).get(output, {}).get(name) for end in ("", "_doubt")]
-            scaled = [None if error is None else error * factor for error in errors]
-            rows.append((f"  {name}", *_with_mesh(value, *scaled)))
+            error, doubt = (None if one is None else one * factor for one in errors)
+            rows.append((f"  {name}", *_with_mesh(value, error, doubt, digits)))
         if len(spreads) > PARAMETERS:
             rows.append((f"  {len(spreads) - PARAMETERS} smaller ones are in summary.json",))
     if len(rows) > 1:
@@ -142,9 +154,9 @@ def _spread(
     return name, float("nan") if effect is None else effect, float(dataset["parameter_std"].sel(parameter=name))
 
 
-def _with_mesh(value: float, error: float | None, doubt: float | None) -> list[str]:
+def _with_mesh(value: float, error: float | None, doubt: float | None, digits: int) -> list[str]:
     if error is None or doubt is None:
-        return [f"{value:.4g}"]
+        return [f"{value:.{digits}g}"]
     return [f"{value:.6g}", _signed(error, doubt), _plus_minus(value + error, doubt)]
 
 
@@ -154,6 +166,15 @@ def _unit(dataset: xr.Dataset, output: str) -> str:
 
 def _plus_minus(value: float, error: float) -> str:
     return f"{_value(value, error)} ± {_error(error)}"
+
+
+def _two_plus_minus(value: float, error: float) -> str:
+    return f"{_two(value)} ± {_error(error)}"
+
+
+def _two(value: float) -> str:
+    """Write a value of whose error only a part is known."""
+    return f"{value:.{DIGITS}g}"
 
 
 def _error(error: float) -> str:

@@ -24,7 +24,7 @@ from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.posteriors import NamedCandidate, candidates, read
 from workflows.studies.sampling import Study
-from workflows.studies.sampling_job import with_errors_of_draws
+from workflows.studies.sampling_job import with_errors_of_draws, with_unknown_meshes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -164,7 +164,7 @@ class AveragedStudy(Study):
         for name, found in evaluations.items():
             told = branch.findings(self.parts[name].inputs, found, continued=False)
             add(dataset, *(one._replace(text=f"Candidate '{name}': {one.text}") for one in told))
-        return dataset
+        return with_unknown_meshes(self, dataset)
 
     def summary(self, job: Job) -> dict[str, Any]:
         """Return the probabilities."""

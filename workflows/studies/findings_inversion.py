@@ -12,7 +12,7 @@ from forward.readable import told
 from forward.registry import named
 from inverse.data.shared_motion import said
 from uq.findings import add
-from workflows.studies.predictions import has_mesh, of_file
+from workflows.studies.predictions import of_file
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,6 +29,8 @@ def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
     """Look for everything that makes the posteriors of an inversion doubtful; return the results with verdicts."""
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
+    if study.predict is not None:
+        named("workflows.studies.predicted:keep_unknown_meshes")(study, dataset)
     for k, name in enumerate(dataset.data_set.values):
         if not bool(dataset["ok"][k]):
             said.append(Finding("warning", f"{name} could not be inverted: {words[k]}"))
@@ -38,8 +40,7 @@ def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
         said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
         said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
         if study.predict is not None:
-            meshed = has_mesh(study.model)
-            said += named("workflows.studies.predicted:findings")(dataset.isel(data_set=k), name, meshed=meshed)
+            said += named("workflows.studies.predicted:findings")(dataset.isel(data_set=k), name)
     found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
     add(found, *said)
     return found

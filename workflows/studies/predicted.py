@@ -13,12 +13,13 @@ from forward.model import Finding, FloatArray, ForwardModel
 from forward.settings import nearest
 from forward.specimen import SHARED, LoadCase, Specimen
 from inverse.methods import predict
+from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
 from workflows.config.predict import LEAST
 from workflows.config.priors import ranges
 from workflows.studies.inversion import PREDICTED
-from workflows.studies.predictions import has_mesh
+from workflows.studies.predictions import has_mesh, never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -216,7 +217,19 @@ def of_field(study: InversionStudy, model: Callable[[str], ForwardModel]) -> Cal
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-def findings(one: xr.Dataset, name: str, *, meshed: bool) -> Iterator[Finding]:
+def keep_unknown_meshes(study: InversionStudy, dataset: xr.Dataset) -> None:
+    """Keep which predictions have an error of a mesh that nobody knows, of any data set."""
+    spec = study.predicted
+    if not has_mesh(spec):
+        return
+    goals = dataset["goal"].values
+    solved, error = (np.isfinite(dataset[f"prediction_{what}"].to_numpy()) for what in ("std", "mesh_error"))
+    unknown = [str(goal) for goal in goals[(solved & ~error).any(axis=0)]]
+    looked = study.method.treatment is not None and not spec.remembers and not spec.hidden
+    keep_unknown(dataset, unknown, set(unknown) - set(never_estimable(spec, unknown)) if looked else ())
+
+
+def findings(one: xr.Dataset, name: str) -> Iterator[Finding]:
     """Say what is doubtful of the predictions of a data set."""
     why = str(one["prediction_why"].item())
     if why:
@@ -230,9 +243,14 @@ def findings(one: xr.Dataset, name: str, *, meshed: bool) -> Iterator[Finding]:
     if rough:
         text = f"the mean is known to {rough} standard deviations only: more predict.samples reduce that"
         yield Finding("warning", f"{name}: predictions: {text}.")
+    unknown = meshes_unknown(one) if np.isfinite(std).any() else {}
     untold = [str(goal) for goal, error in zip(one["goal"].values, mesh, strict=True) if np.isnan(error)]
-    if meshed and untold and np.isfinite(std).any():
-        yield Finding("note", f"{name}: predictions: the error of the mesh is not estimated of {', '.join(untold)}.")
+    failed, never = ([goal for goal in untold if unknown.get(goal) is planned] for planned in (True, False))
+    if failed:
+        words = f"estimates of the error of the mesh failed of {', '.join(failed)}"
+        yield Finding("error", f"{name}: predictions: {words}.")
+    if never:
+        yield Finding("note", f"{name}: predictions: the error of the mesh is not estimated of {', '.join(never)}.")
 
 
 def _over(one: xr.Dataset, errors: FloatArray, std: FloatArray) -> str:

@@ -286,6 +286,7 @@ class Study(Sourced, StudyKind):
         """Add how the stability of each sample was tested."""
         with_stability = named("workflows.studies.sampling_job:with_stability")
         found: xr.Dataset = with_stability(self, dataset, evaluations["/"])
+        found = named("workflows.studies.sampling_job:with_unknown_meshes")(self, found)
         return named("workflows.studies.adapted_mesh:with_history")(self, found) if self.model.adaptive else found
 
     def summary(self, job: Job) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from forward.external.derivatives import contradicted
-from forward.model import Finding, SolveError, Stability
+from forward.model import SolveError, Stability
 from forward.registry import named
 from uq.accuracy.budget import spare_for
 from uq.estimators import branch
@@ -18,13 +18,14 @@ from uq.estimators.rounding import settled
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN, Evaluate, Evaluations
-from uq.findings import add, once_for_steps
+from uq.findings import add, keep_unknown, once_for_steps
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
 from workflows.studies.findings_solves import measured
 from workflows.studies.job import Job, MethodJob
+from workflows.studies.predictions import never_estimable
 from workflows.studies.stresses import stressed, with_stresses
 
 if TYPE_CHECKING:
@@ -121,6 +122,7 @@ def _with_mesh_errors(
     estimates: list[Evaluations],
 ) -> xr.Dataset:
     """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
+    from uq.accuracy.doubts import failed
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
@@ -132,7 +134,7 @@ def _with_mesh_errors(
         whole = at_mean and first.tangents is not None and first.fields.size > 0
         centre = linearised(inputs, evaluate, first) if whole else linearise(inputs, evaluate)
     except SolveError as error:
-        add(found, Finding("note", f"The error of the mesh is not estimated: {error}."))
+        add(found, failed(f"{error}"), first=True)
         return found
     count, seed = study.estimates_of(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(
@@ -140,6 +142,16 @@ def _with_mesh_errors(
     )
     estimates.append(errors.evaluations)
     return with_mesh_errors(found, inputs, centre, errors, told_of(study))
+
+
+def with_unknown_meshes(study: Study, dataset: xr.Dataset) -> xr.Dataset:
+    """Keep which outputs have an error of a mesh that nobody knows, for all who print them."""
+    if (study.spec.meshed or study.spec.hidden) and "output" in dataset.coords:
+        kind = next((name for name in ("mesh_error", "nominal_mesh_error") if name in dataset), None)
+        errors = np.full(dataset.sizes["output"], np.nan) if kind is None else dataset[kind].to_numpy()
+        names = [str(name) for name in dataset["output"].values[np.isnan(errors)]]
+        keep_unknown(dataset, names, set(names) - set(never_estimable(study.spec, names)) if study.estimates else ())
+    return dataset
 
 
 def with_errors_of_draws(study: Study, found: xr.Dataset) -> xr.Dataset:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import Finding, FloatArray, SolveError
+from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.goal import Goal
 from uq.estimators.moments import half_width
@@ -65,7 +66,7 @@ def within(
         try:
             mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate), before["estimates"])
         except SolveError as error:
-            unknown = (Finding("warning", f"The error of the mesh is not estimated: {error}."),)
+            unknown = (failed(f"{error}"),)
         else:
             estimates.append(mesh.errors.evaluations)
             goal = replace(goal, mesh=mesh.doubts)
@@ -80,7 +81,7 @@ def within(
         goal = now
         if settled:
             break
-    add(found, *unknown)
+    add(found, *unknown, first=True)
     parts = goal.parts(_moments(found), half_width(found))
     told = _told(study, found, goal, parts, before)
     found.attrs["accuracy"] = json.dumps(told, ensure_ascii=False)

@@ -15,10 +15,12 @@ from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.predict import after_field, before_field
 from tests.launch import TISSUQ, assert_same_bits, environment, run, run_script
+from uq.findings import keep_unknown
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
+from workflows.studies.predicted import findings as said_of
 
 # --- fields, by closed forms -----------------------------------------------------------------------------------------
 
@@ -423,3 +425,18 @@ def test_what_cannot_be_predicted_of_a_specimen(specimens, change, said):
         load(specimens / "few.toml", [change.replace("ENERGY", "[{name='e', kind='strain-energy'}]")])
     assert said in str(refused.value)
     assert len(refused.value.args) == 1
+
+
+@pytest.mark.unit
+def test_estimates_of_the_mesh_of_predictions_that_failed_are_an_error():
+    numbers = {"mean_error": [0.0, 0.0], "std": [1.0, 1.0], "mesh_error": [np.nan, np.nan]}
+    found = xr.Dataset(
+        {"prediction_why": "", **{f"prediction_{name}": ("goal", values) for name, values in numbers.items()}},
+        {"goal": ["sag", "stress"]},
+    )
+    assert not list(said_of(found, "set"))  # a model without a mesh
+    keep_unknown(found, ["sag", "stress"], ["sag"])
+    error, note = said_of(found, "set")
+    assert (error.severity, note.severity) == ("error", "note")
+    assert error.text.endswith("failed of sag.")
+    assert note.text.endswith("not estimated of stress.")

@@ -336,12 +336,15 @@ def test_failed_estimates_are_said_and_left_out():
     assert np.isnan(found["mesh_error"]).all()
     assert np.isnan(found["total_error"]).all()
     np.testing.assert_array_equal(found["mean"], before["mean"])
-    assert any("nothing is known" in one.text for one in findings(found))
+    assert "nothing is known" in findings(found)[0].text
+    assert findings(found)[0].severity == "error"
 
 
 def test_what_is_not_estimated_is_said_by_name():
     _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.0, np.nan]))
-    assert any("no estimate" in one.text and "of v (3 of 3)" in one.text for one in findings(found))
+    assert any(
+        "no estimate" in one.text and "of v (3 of 3)" in one.text and one.severity == "error" for one in findings(found)
+    )
     np.testing.assert_array_equal(np.isnan(found["total_error"]), [False, True])
     told = Told(TOLD.units, frozenset({"v"}))
     _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.0, np.nan]), told=told)

@@ -276,3 +276,53 @@ def test_models_without_a_mesh_say_so_where_its_error_is_asked_for():
     texts = [one.text for one in load(own, ["accuracy.mesh_error=true"]).findings]
     assert any("a model of kind 'python' has no mesh of its own" in text for text in texts)
     assert not any("mesh" in one.text for one in load(own).findings)
+
+
+SMALL = ("model.body.cells=[2, 1, 1]", "method.samples=4")
+FAR_TOO_COARSE = (*SMALL, "model.body.cell='tetrahedron'", "model.body.degree=1", "model.material.C2=1e3")
+
+
+def of_run(directory, *settings):
+    """The exit code of a run, what it prints at its end, and its summary."""
+    sets = [word for one in settings for word in ("--set", one)]
+    done = run(None, TISSUQ, "run", TINY, *sets, "--out", directory, "--no-report")
+    return done.returncode, done.stdout, json.loads((directory / "summary.json").read_text())
+
+
+@pytest.mark.fem
+def test_estimates_that_were_planned_and_failed_are_an_error(tmp_path):
+    code, printed, summary = of_run(tmp_path / "D", *FAR_TOO_COARSE)
+    assert code == 3
+    assert summary["failed"] == 0
+    first = summary["findings"][0]
+    assert first["severity"] == "error"
+    assert "estimates of the error of the mesh failed" in first["text"]
+    lines = printed.splitlines()
+    assert lines[0] == f"error: {first['text']}"
+    for output in ("uy_max", "ux_max"):
+        line = next(line for line in lines if line.startswith(f"{output}: "))
+        assert "mesh not known" in line
+        value = re.search(r"mean (\S+) ±", line)[1]
+        assert len(value.replace(".", "").strip("-0")) <= 2, line  # digits
+    assert main(["report", str(tmp_path / "D")]) == 0
+    page = (tmp_path / "D" / "report.html").read_text()
+    assert first["text"] in page
+    assert "mesh not known; ±" in page
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(
+    "method",
+    ["{kind='monte-carlo', samples=4}", "{kind='chaos', samples=8, max_order=2}", "{kind='local-sensitivity'}"],
+)
+def test_no_error_stands_alone_where_that_of_the_mesh_was_not_asked_for(method, tmp_path):
+    code, printed, summary = of_run(tmp_path / "D", OFF, f"method={method}", SMALL[0])
+    assert code == 0
+    assert all("mesh not known" in line for line in printed.splitlines() if "±" in line)
+    assert not [one for one in summary["findings"] if one["severity"] == "error"]
+
+
+def test_a_function_has_no_mesh_that_could_be_unknown(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "configs")
+    found = load(ROOT / "configs" / "own-model.toml").run()
+    assert "mesh_unknown" not in found.attrs

@@ -10,6 +10,7 @@ import numpy as np
 
 from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
 from forward.words import duration, number, power_of_ten, with_error
+from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
 from workflows.report.sections.design import card as design
@@ -100,14 +101,16 @@ def forward(results: Results) -> Card:
             errors["reduced model"] = itself
         error = whole(errors)
         lines = [] if not sampled else [spread(one, unit, value)]
-        lines += known(errors, unit, value)
+        unknown = output in results.meshes_unknown
+        lines += known(errors, unit, value, mesh=not unknown)
         if f"{name}_corrected" in one and np.isfinite(one[f"{name}_corrected"]):
             doubt = f"{name}_corrected_error" if sampled else "nominal_mesh_error_doubt"
             better, left = float(one[f"{name}_corrected"]), float(one[doubt])
             lines.append(f"corrected for the mesh: {and_error(better, left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
         curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
-        answers.append(Answer(called(results, output), quantity(value, error, unit), lines, curve, inside, ends))
+        shown = size(value, unit, DIGITS) if results.meshes_unknown.get(output) else quantity(value, error, unit)
+        answers.append(Answer(called(results, output), shown, lines, curve, inside, ends))
     return Card(question, answers)
 
 
@@ -144,8 +147,8 @@ def whole(errors: dict[str, float]) -> float:
     return total if np.isfinite(total) else float(np.sqrt(np.sum(np.square(parts))))
 
 
-def known(errors: dict[str, float], unit: str, value: float) -> Iterator[str]:
-    """Say how well a number is known, and the parts of its error."""
+def known(errors: dict[str, float], unit: str, value: float, *, mesh: bool) -> Iterator[str]:
+    """Say how well a number is known, and the parts of its error; or that of its `mesh` it is not."""
     total = whole(errors)
     parts = [
         f"{source} {margin(e, unit, like=value)}"
@@ -153,9 +156,11 @@ def known(errors: dict[str, float], unit: str, value: float) -> Iterator[str]:
         if source != "total" and np.isfinite(e) and e >= UNSEEN * total
     ]
     if total > 0:
-        yield f"known to ± {margin(total, unit, like=value)}" + (f": {', '.join(parts)}" if parts else "")
-    if "sampling" in errors and "mesh" in errors and not np.isfinite(errors["mesh"]):
-        yield "the error of its mesh is not known"
+        all_parts = f": {', '.join(parts)}" if parts else ""
+        error = f"± {margin(total, unit, like=value)}"
+        yield f"known to {error}{all_parts}" if mesh else f"{NOT_KNOWN}; {error} without it{all_parts}"
+    elif not mesh:
+        yield NOT_KNOWN
 
 
 def spread(one: xr.Dataset, unit: str, value: float) -> str:
@@ -250,9 +255,11 @@ def inversion(results: Results) -> Card:
         answers.insert(0, _stiffness(one))
     if "prediction_share" in one:
         goals = [str(name) for name in one["goal"].values]
-        told = [_goal(name) for name in goals]
-        question += f" And what {'is' if len(goals) == 1 else 'are'} {listed(told)}, which nobody measured?"
-        answers = [*(_predicted(one.sel(goal=name), _goal(name)) for name in goals[:GOALS]), *answers]
+        asked = listed([_goal(name) for name in goals])
+        question += f" And what {'is' if len(goals) == 1 else 'are'} {asked}, which nobody measured?"
+        unknown = results.meshes_unknown
+        told = [_predicted(one.sel(goal=name), _goal(name), known_mesh=name not in unknown) for name in goals[:GOALS]]
+        answers = [*told, *answers]
     return Card(question, answers)
 
 
@@ -270,7 +277,7 @@ def _goal(name: str) -> str:
             return name
 
 
-def _predicted(at: xr.Dataset, name: str) -> Answer:
+def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
     """A quantity that was not measured, by the posterior."""
     mean, std, lower, upper, before, wide, mesh = (
         float(at[f"prediction_{which}"])
@@ -284,6 +291,8 @@ def _predicted(at: xr.Dataset, name: str) -> Answer:
         lines.append(f"before the data {and_error(before, wide, unit)}")
     if np.isfinite(mesh):
         lines.append(f"to be added for the mesh: {size(mesh, unit, like=mean)}")
+    elif not known_mesh:
+        lines.append(NOT_KNOWN)
     return Answer(f"{name}, predicted", quantity(mean, std, unit), lines, leads=True)
 
 

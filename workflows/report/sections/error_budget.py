@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import and_error, margin, quantity
+from forward.readable import and_error, margin, quantity, size
 from forward.words import NONE
 from uq.estimators.rounding import only_rounding
+from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -110,7 +111,7 @@ def sentence(results: Results, name: str) -> str:
         if not counts:
             zero.append(output)
         elif "mesh" not in known:
-            words.append(f"{output} (the error of its mesh is not estimated)")
+            words.append(f"{output} ({NOT_KNOWN})")
         else:
             largest = max(known, key=lambda source: known[source])
             whole = float(total[i]) if total is not None else known[largest]
@@ -143,9 +144,11 @@ def table(results: Results, names: list[str]) -> Table:
             rows.append(
                 (
                     f"{ESTIMATES[name]} of {output}",
-                    quantity(value, total if np.isfinite(total) else known(f"{name}_error"), unit),
+                    size(value, unit, DIGITS)
+                    if results.meshes_unknown.get(output)
+                    else quantity(value, total if np.isfinite(total) else known(f"{name}_error"), unit),
                     margin(known(f"{name}_error"), unit, like=value),
-                    NONE if np.isnan(error) else and_error(error, doubt, unit, like=value),
+                    "not known" if np.isnan(error) else and_error(error, doubt, unit, like=value),
                     margin(total, unit, like=value),
                     NONE if np.isnan(error) else and_error(corrected, its_error, unit),
                 )
