@@ -26,6 +26,7 @@ NAMES = (
     "inversion",
     "calibration",
     "selection",
+    "specimens",
     "population",
     "designs",
     "intervals",

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.selection import Comparison
 
+SEVERAL = 2  # specimens and candidates, from which on they may disagree
+LISTED = 8  # specimens that are named
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
 MIXED = 0.1  # weight of the others in the best mixture that is said
@@ -87,6 +89,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     wrong = conflicts(dataset, best)
     if wrong:
         said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
+    said += _disagreement(dataset)
     said += _depends(dataset, order)
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
@@ -100,11 +103,53 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         from inverse.data.shared_motion import said as determined
 
         said.append(Finding("note", f"{best}: {determined(dataset['motion_eigenvalue'].sel(model=best).to_numpy())}."))
-    doubtful, samples = _doubtful(dataset, order)
+    return said
+
+
+def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
+    """Say that specimens are rather of two materials than of one."""
+    from inverse.criticism.specimens import DISAGREE, mixture
+
+    evidence = dataset["group_log_evidence"].transpose("model", "group").to_numpy()
+    if min(evidence.shape) < SEVERAL or not np.isfinite(evidence).all():
+        return
+    found = mixture(evidence, dataset["prior_probability"].to_numpy())
+    if found.log_bayes_factor <= DISAGREE:
+        return
+    names = [str(dataset["model"].values[k]) for k in found.pair]
+    first = found.first > 1 / 2
+    sides = sorted(zip(names, (first, ~first), strict=True), key=lambda side: -side[1].sum())
+    (most, _), (fewer, theirs) = sides
+    groups = [str(group) for group in dataset["group"].values[theirs]]
+    listed = ", ".join([*groups[:LISTED], *([f"and {len(groups) - LISTED} more"] if len(groups) > LISTED else [])])
+    text = (
+        f"Specimens disagree: of {first.size}, {(~theirs).sum()} are rather {most} and {theirs.sum()} rather {fewer} "
+        f"({listed}); ln of the Bayes factor over one material for all: {number(found.log_bayes_factor, 3)}. "
+        "Probabilities of the candidates are for one material of all specimens: compare them apart, or in two studies."
+    )
+    yield Finding("warning", text)
+
+
+def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> Iterator[Finding]:
+    """Find evidences that cannot be trusted.
+
+    Parameters
+    ----------
+    found
+        The comparison, judged by the weights of its points.
+    judged
+        The same, judged by derivatives and meshes too.
+    wrong
+        Candidates with wrong derivatives, of which that is said.
+    """
+    doubtful, samples = _doubtful(found, by_probability(found, found["log_evidence"]))
     if doubtful:
         text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."
-        said.append(Finding("warning", text))
-    return said
+        yield Finding("error", text)
+    by_mesh = (found["trusted"] & ~judged["trusted"]).any("group")
+    names = [str(name) for name in found["model"].values[by_mesh.to_numpy()] if name not in wrong]
+    if names:
+        yield Finding("error", f"Evidences not to be trusted for what meshes do to them: {', '.join(names)}.")
 
 
 def _depends(dataset: xr.Dataset, order: list[str]) -> Iterator[Finding]:

@@ -15,6 +15,7 @@ from workflows.studies.findings_selection import (
     doubts_of_selection,
     findings,
     trusted_on_meshes,
+    untrusted,
     with_right_derivatives,
 )
 from workflows.studies.finer import FINER, solved_by
@@ -70,8 +71,11 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         units = {name: study.units_of(name) for name in candidates}
         doubts = doubts_of_selection(found, candidates, study.method.noise.factor, units)
         wrong = {name: contradictions(study, name, make) for (name, _), make in makers.items()}
-        add(found, *findings(found), *doubts, *(one for several in wrong.values() for one in several))
-        return trusted_on_meshes(with_right_derivatives(found, [name for name, several in wrong.items() if several]))
+        of_wrong = [name for name, several in wrong.items() if several]
+        judged = trusted_on_meshes(with_right_derivatives(found, of_wrong))
+        add(judged, *findings(found), *untrusted(found, judged, of_wrong), *doubts)
+        add(judged, *(one for several in wrong.values() for one in several))
+        return judged
 
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
     finer_ones = {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}

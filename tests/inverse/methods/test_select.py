@@ -26,7 +26,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.run.plan import plan
 from workflows.starter import starter
-from workflows.studies.findings_selection import doubts_of_selection, findings, grade
+from workflows.studies.findings_selection import doubts_of_selection, findings, grade, untrusted
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")
@@ -530,6 +530,59 @@ def test_a_study_from_the_command_line(small, looked_at, capsys):
     expected = found["constant_mean"].sel(model="mooney-rivlin", parameter="C1")
     spread = found["constant_std"].sel(model="mooney-rivlin", parameter="C1")
     assert (abs(drawn - expected) < 0.1 * spread).all()
+
+
+def test_specimens_that_disagree(small, capsys):
+    """Half of the specimens stiffen and half do not: that is said before the probability of one material for all."""
+    at = (1.1, 1.4, 1.8, 2.2, 2.6)
+    test = (MaterialTest(mode="uniaxial", at=at),)
+    soft = HomogeneousModel("neo-hookean", {}, test, ("C1",))
+    stiffening = HomogeneousModel("demiray", {"b": 0.3}, test, ("a",))
+    rng, rows = np.random.default_rng(1), ["specimen,mode,stretch,stress"]
+    for k in range(6):
+        stress = (soft, stiffening)[k % 2].stresses(np.array([[500.0 + 50 * k]]))[0]
+        values = stress * (1 + 0.1 * rng.standard_normal(len(at))) / 1e3
+        rows += [f"s{k},uniaxial,{x},{value}" for x, value in zip(at, values, strict=True)]
+    (small.parent / "table.csv").write_text("\n".join(rows))
+    text = SMALL
+    for old, new in (
+        ("unit = 1e3", 'unit = 1e3\ngroup = "specimen"'),
+        ('"mooney-rivlin", C2 = 10 }\nparameters.C1', '"demiray", b = 0.3 }\nparameters.a'),
+        ("candidates.mooney-rivlin", "candidates.demiray"),
+        ("held_out = true\n", ""),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    small.write_text(text)
+    assert main(["run", str(small), "--out", str(small.parent / "out"), "--no-report"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    said = next(k for k, line in enumerate(lines) if "Specimens disagree: of 6, 3 are rather" in line)
+    assert "s0, s2, s4" in lines[said] or "s1, s3, s5" in lines[said]
+    assert said < next(k for k, line in enumerate(lines) if ": ln Z" in line)
+
+
+@pytest.mark.unit
+def test_evidences_that_cannot_be_trusted_are_an_error():
+    by = ("model", "group")
+    found = xr.Dataset(
+        {
+            "log_evidence": ("model", [-3.0, -4.0]),
+            "prior_probability": ("model", [0.5, 0.5]),
+            "trusted": (by, [[True], [True]]),
+            "effective": (by, [[500.0], [3.0]]),
+            "tail": (by, [[0.1], [0.9]]),
+            "point": ((*by, "point", "parameter"), np.zeros((2, 1, 640, 1))),
+        },
+        {"model": ["one", "other"], "group": ["all"]},
+    )
+    assert not list(untrusted(found, found, ()))
+    few = found.assign(trusted=(by, [[True], [False]]))
+    (error,) = untrusted(few, few, ())
+    assert error.severity == "error"
+    assert error.text.startswith("Evidences not to be trusted: other (")
+    (error,) = untrusted(found, few, ())  # its mesh was looked at afterwards
+    assert error == ("error", "Evidences not to be trusted for what meshes do to them: other.")
+    assert not list(untrusted(found, few, ("other",)))
 
 
 @pytest.mark.slow

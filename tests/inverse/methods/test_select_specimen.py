@@ -315,12 +315,14 @@ def test_a_study_says_what_its_meshes_do(study, monkeypatch):
     table = meshes(found)
     assert [row[0] for row in table.rows] == ["right", "stiff"]
     blind = study.parent / "blind"
-    main(["run", str(study), "--out", str(blind), "--quiet", "--set", "method.mesh_check=false"])
+    assert main(["run", str(study), "--out", str(blind), "--quiet", "--set", "method.mesh_check=false"]) == 3
     summary = json.loads((blind / "summary.json").read_text())
     assert not any(one["trusted"] for one in summary["models"].values())
     said = [one["text"] for one in summary["findings"] if one["severity"] == "warning"]
     assert "stiff: not checked for the mesh: method.mesh_check = false." in said
     assert "right: not checked for the mesh: method.mesh_check = false." in said
+    text = "Evidences not to be trusted for what meshes do to them: right, stiff."
+    assert {"severity": "error", "text": text} in summary["findings"]
     assert any("no result will be called trusted" in line for line in plan(load(study, ["method.mesh_check=false"])))
     assert any("mesh check  about 4 solves of" in line for line in plan(load(study)))
 
