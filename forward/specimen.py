@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
 
@@ -48,6 +48,38 @@ class LoadCase(Settings):
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
     outputs: tuple[Output, ...] = ()
+
+
+def shared_paths(cases: Sequence[LoadCase]) -> dict[str, dict[str, float]]:
+    """Return the paths of numbers that differ between load cases where an item has no name, with values by case.
+
+    Items of one name share their parameters, as is meant where the name is stated. Without names that is by accident:
+    two tractions are both called `traction`, and two displacements of a boundary have the name of it.
+    """
+    found: dict[str, dict[str, float]] = {}
+    unnamed: set[str] = set()
+    for case in cases:
+        numbers = [
+            *((f"loads.{one.label}.{key}", s.value, one.name) for one in case.loads for key, s in one.scalars.items()),
+            *(
+                (f"displacements.{one.label}.{axis}", value, one.name)
+                for one in case.displacements
+                for axis, value in one.components.items()
+            ),
+        ]
+        for path, value, name in numbers:
+            found.setdefault(path, {})[case.name] = value
+            unnamed |= set() if name else {path}
+    return {path: values for path, values in found.items() if path in unnamed and len(set(values.values())) > 1}
+
+
+def in_words(path: str, values: Mapping[str, float]) -> str:
+    """Say why such a number can be no parameter, with its values by load case."""
+    listed = ", ".join(f"{value:g} in {case}" for case, value in values.items())
+    return (
+        f"'{path}' is {listed}, without a name: as a parameter it would have one value everywhere; expected a name for "
+        "each, or the same name for all if they are one parameter"
+    )
 
 
 class Observed(Settings):
@@ -141,9 +173,27 @@ class Specimen(Solid):
         return found
 
     @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths: unnamed items with other values share them."""
+        return {path: in_words(path, values) for path, values in shared_paths(self.cases).items()}
+
+    @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the load cases before anything is solved, each once."""
-        return tuple(dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings))
+        return (
+            *dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings),
+            *self._of_shared_paths(),
+        )
+
+    def _of_shared_paths(self) -> Iterator[Finding]:
+        """Say which paths stand for several numbers, none of which is a parameter."""
+        paths = shared_paths(self.cases)
+        if paths:
+            text = (
+                f"Without names, different numbers of several load cases share a path: {', '.join(paths)}. Each keeps "
+                "its own value, but none can be a parameter: a name for each tells them apart."
+            )
+            yield Finding("note", text)
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
         """Find that outputs are not known, and random fields whose coefficients cannot be drawn."""

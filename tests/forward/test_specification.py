@@ -7,6 +7,8 @@ from pydantic import ValidationError
 from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS, constants, measures
 from forward.solvers.settings import SolverSettings
+from forward.specimen import Specimen
+from workflows.studies.sampling import Study
 
 pytestmark = pytest.mark.unit
 
@@ -239,3 +241,61 @@ def test_an_energy_that_does_not_split_keeps_the_displacement_form():
 
 def test_settings_of_the_solver_have_defaults():
     assert Hyperelastic.model_validate(BLOCKS).solver == SolverSettings()
+
+
+PULLS = (  # in two load cases, with and without names
+    {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 10.0},
+    {"kind": "traction", "on": "x-max", "direction": (0.0, 1.0, 0.0), "size": 20.0},
+)
+
+
+def pulled(*loads, displacements=((), ())):
+    """A specimen with a load in each of two load cases."""
+    case = {
+        "clamp": ("x-min",),
+        "outputs": ({"name": "sag", "kind": "displacement", "at": (1, 0, 0), "component": "y"},),
+    }
+    cases = [
+        case | {"name": name, "loads": (load,), "displacements": moved}
+        for name, load, moved in zip(("pull", "shear"), loads, displacements, strict=True)
+    ]
+    body = {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (1, 1, 1)}
+    return Specimen(body=body, material={"kind": "neo-hookean", "C1": 1e3, "D1": 1e4}, cases=cases)
+
+
+def study_of(specimen, *paths):
+    parameters = {path: {"kind": "uniform", "lower": 10.0, "upper": 20.0} for path in paths}
+    return Study(model=specimen, parameters=parameters, method={"kind": "monte-carlo", "samples": 4})
+
+
+@pytest.mark.unit
+def test_unnamed_loads_of_different_size_are_no_one_parameter():
+    several = pulled(*PULLS)
+    (note,) = [one for one in several.findings if "share a path" in one.text]
+    assert note.severity == "note"
+    assert "loads.traction.size" in note.text
+    with pytest.raises(ValidationError, match=r"'loads\.traction\.size' is 10 in pull, 20 in shear, without a name"):
+        study_of(several, "loads.traction.size")
+    study_of(several, "material.C1")  # no parameter touches it
+    same = PULLS[1] | {"size": 10.0}
+    one_named = (PULLS[0] | {"name": "traction"}, PULLS[1])
+    with pytest.raises(ValidationError, match="without a name"):
+        study_of(pulled(*one_named), "loads.traction.size")
+    both = [one | {"name": "hook"} for one in PULLS]
+    for fine, path in (
+        (pulled(PULLS[0], same), "loads.traction.size"),
+        (pulled(*both), "loads.hook.size"),
+        (pulled(PULLS[0], PULLS[1] | {"name": "hook"}), "loads.hook.size"),
+    ):
+        assert not [one for one in fine.findings if "share a path" in one.text]
+        study_of(fine, path)
+
+
+@pytest.mark.unit
+def test_displacements_of_one_boundary_in_several_load_cases():
+    moved = [({"on": "y-max", "y": y},) for y in (0.1, -0.1)]
+    several = pulled(PULLS[0], PULLS[0], displacements=moved)
+    with pytest.raises(ValidationError, match=r"'displacements\.y-max\.y' is 0\.1 in pull, -0\.1 in shear"):
+        study_of(several, "displacements.y-max.y")
+    named = [({"on": "y-max", "y": y, "name": name},) for y, name in ((0.1, "up"), (-0.1, "down"))]
+    study_of(pulled(PULLS[0], PULLS[0], displacements=named), "displacements.up.y")

@@ -29,10 +29,18 @@ def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, flo
 
 
 def mistakes_of_draws(
-    scalars: Mapping[str, Scalar], draws: Draws, constants: Collection[str] = ()
+    scalars: Mapping[str, Scalar],
+    draws: Draws,
+    constants: Collection[str] = (),
+    unavailable: Mapping[str, str] | None = None,
 ) -> Iterator[Mistake]:
-    """Find draws at most of which the model is impossible; constants of materials are judged together."""
+    """Find draws at most of which the model is impossible; constants of materials are judged together.
+
+    Numbers that are `unavailable` come with the reason.
+    """
     for name, values in zip(draws.names, draws.values.T, strict=True):
+        if name in (unavailable or {}):
+            yield ("parameters", "from"), (unavailable or {})[name], name
         share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
         if share > 1 - LEAST:
             message = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
@@ -82,9 +90,9 @@ def mistakes_of_parameters(
     `unavailable` come with the reason.
     """
     for path, distribution in parameters.items():
-        if path not in scalars:
-            why = (unavailable or {}).get(path) or f"not a number of the model; {nearest(path, tuple(scalars))}"
-            yield ("parameters",), why, path
+        why = (unavailable or {}).get(path)
+        if why is not None or path not in scalars:
+            yield ("parameters",), why or f"not a number of the model; {nearest(path, tuple(scalars))}", path
             continue
         if path in constants:
             continue

@@ -208,5 +208,5 @@ class DesignStudy(Sourced, StudyKind):
             yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         if self.draws is not None:
-            yield from mistakes_of_draws(self.model.scalars, self.draws)
+            yield from mistakes_of_draws(self.model.scalars, self.draws, (), self.model.unavailable)
         yield from mistakes(self.method, self.model)

@@ -43,7 +43,25 @@ class MeasuredTest(MaterialTest):
                 raise ValueError(message)
         return self
 
+    @model_validator(mode="after")
+    def _check_signs(self) -> MeasuredTest:
+        """Refuse that what is shortened pulls, as strains do that are read as stretches; not for an error near rest."""
+        if self.mode == "simple-shear" or self.component != "P1":
+            return self
+        # Tension is along the longer sides (M. Baker, J. L. Ericksen, J. Wash. Acad. Sci. 44 (1954) 33): here along 1.
+        across = self.across or ()
+        along = [(x * x * z) ** (1 / 3) for x, z in zip(self.at, across, strict=True)] if across else self.at
+        shortest, at, stress = min(zip(along, self.at, self.measured, strict=True))
+        if shortest < SHORTENED and stress > 0:
+            message = (
+                f"at: {at:g} with a tension of {stress:.4g} Pa: is it a strain? Expected stretches, 1 + strain "
+                "(1 is undeformed); if it is one, the stress of a compression is negative"
+            )
+            raise ValueError(message)
+        return self
 
+
+SHORTENED = 0.9  # stretch below which no error of measurement makes a compression a tension
 LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
@@ -254,7 +272,10 @@ def _refuse_repeats(table: Table, path: Path) -> None:
 
 
 def _stretch(text: str, place: str, column: str, *, positive: bool) -> float:
-    value = _number(text, place, column, positive=positive)
+    value = _number(text, place, column)
+    if positive and value <= 0:
+        message = f"data: {place}: {column} is {text!r}, expected a number more than 0: stretches, 1 + strain"
+        raise StudyError(message)
     if abs(value) > LARGEST_STRETCH:
         message = f"data: {place}: {column} is {text!r}, expected a stretch (1 is undeformed), or an amount of shear"
         raise StudyError(message)

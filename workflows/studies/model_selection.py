@@ -67,7 +67,8 @@ class ModelCandidate(Settings):
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of the priors does not fit the model."""
         materials = spec.materials(self.parameters)
-        yield from mistakes_of_parameters(spec.scalars, self.parameters, () if materials is None else materials.names)
+        constants = () if materials is None else materials.names
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
         if materials is not None and all(path in spec.scalars for path in self.parameters):
             with suppress(ValueError):  # correlations, which are reported elsewhere
                 yield from mistakes_of_materials(self.restricted(spec), materials)

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from forward.model import Finding, FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import SHARED, LoadCase, Specimen
+from forward.specimen import SHARED, LoadCase, Specimen, in_words, shared_paths
 from inverse.methods import predict
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
@@ -112,9 +112,20 @@ def mistakes(study: InversionStudy) -> Iterator[Mistake]:
     if not outputs:
         yield ("predict",), "nothing is predicted, expected outputs or places", {}
         return
+    yield from _of_shared_paths(study.model, made, _unknown(study))
     if not {*made.scalars, *made.coefficients} & set(_unknown(study)):
         message = f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted"
         yield ("predict",), message, {}
+
+
+def _of_shared_paths(measured: ModelSpec, made: ModelSpec, unknown: tuple[str, ...]) -> Iterator[Mistake]:
+    """Find unknowns that would give what is predicted another load than it states."""
+    if not (isinstance(measured, Specimen) and isinstance(made, Specimen)):
+        return
+    there = [case.model_copy(update={"name": f"what is predicted in {case.name}"}) for case in made.cases]
+    for path, values in shared_paths([*measured.cases, *there]).items():
+        if path in unknown:
+            yield ("predict", "cases"), in_words(path, values), path
 
 
 def _of_cases(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:

@@ -393,4 +393,4 @@ class Study(Sourced, StudyKind):
         constants = () if materials is None else materials.names
         yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
         if self.draws is not None:
-            yield from mistakes_of_draws(spec.scalars, self.draws, constants)
+            yield from mistakes_of_draws(spec.scalars, self.draws, constants, spec.unavailable)

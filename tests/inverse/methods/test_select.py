@@ -27,6 +27,7 @@ from workflows.config.study import dump, load, parse
 from workflows.run.plan import plan
 from workflows.starter import starter
 from workflows.studies.findings_selection import doubts_of_selection, findings, grade, untrusted
+from workflows.studies.material_tests import MeasuredTest
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")
@@ -601,3 +602,47 @@ def test_probabilities_are_calibrated():
         members = (low <= P) & (high >= P)
         spread = np.sqrt((P[members] * (1 - P[members])).sum()) + 0.5
         assert abs(true[members].sum() - P[members].sum()) < 3 * spread, (low, high)
+
+
+def strains(mode, at, across=(), sign=1):
+    """Stresses of rubber in a table whose column of stretches holds strains."""
+    stretches = 1 + np.array(at)
+    other = {"across": tuple(1 + np.array(across))} if len(across) else {}
+    stress = model("neo-hookean", [MaterialTest(mode=mode, at=tuple(stretches), **other)]).stresses([[2e5]])[0]
+    return {"mode": mode, "at": at, **({"across": across} if len(across) else {}), "measured": tuple(sign * stress)}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("mode", ["uniaxial", "equibiaxial", "pure-shear"])
+def test_strains_are_not_read_as_stretches(mode):
+    for at in ((0.05, 0.1, 0.2), (0.5, 1.0, 2.0, 4.0)):
+        with pytest.raises(ValueError, match="is it a strain"):
+            MeasuredTest(**strains(mode, at))
+    with pytest.raises(ValueError, match="is it a strain"):  # of a compression, both without their sign
+        MeasuredTest(**strains(mode, (-0.1, -0.2), sign=-1) | {"at": (0.1, 0.2)})
+    tested = np.array([0.6, 0.8, 0.95, 1.3, 2.0])  # what is right stays right
+    stress = model("neo-hookean", [MaterialTest(mode=mode, at=tuple(tested))]).stresses([[2e5]])[0]
+    noisy = np.where(tested == 0.95, 1e3, stress)  # nearly at rest an error may have the other sign
+    MeasuredTest(mode=mode, at=tuple(tested), measured=tuple(noisy))
+
+
+@pytest.mark.unit
+def test_strains_in_two_directions_and_in_shear():
+    with pytest.raises(ValueError, match="is it a strain"):
+        MeasuredTest(**strains("biaxial", (0.1, 0.2), (0.2, 0.1)))
+    MeasuredTest(**strains("simple-shear", (0.0, 0.1)) | {"measured": (0.0, 2e3)})  # amounts of shear
+    # Shortened along 1 by a load across, it still pulls.
+    at, across = (0.85, 0.95), (2.0, 2.0)
+    stress = model("neo-hookean", [MaterialTest(mode="biaxial", at=at, across=across)]).stresses([[2e5]])[0]
+    assert stress.min() > 0
+    MeasuredTest(mode="biaxial", at=at, across=across, measured=tuple(stress))
+
+
+def test_a_table_of_strains_is_one_line(small, capsys):
+    strained = TABLE.replace("1.1,", "0.1,").replace("1.2,", "0.2,")
+    for table, told in ((strained, "is it a strain?"), (strained.replace("0.1,0.3", "0,0"), "1 + strain")):
+        (small.parent / "table.csv").write_text(table)
+        assert main(["check", str(small)]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert told in lines[0]
