@@ -30,7 +30,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-all test-flags test-wheel lint notebooks bench docs clean system graphics browser
+.PHONY: help setup setup-wheel demo test test-unit test-faults test-flags test-all test-wheel lint notebooks bench docs clean system graphics browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -47,6 +47,9 @@ test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
 
 test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
 	@$(PYTHON) -m pytest -m unit $(ARGS)
+
+test-faults: $(READY) ## plant faults in formulas in turn, and say which of them the unit tests see (ARGS="bias" plants one)
+	@$(PYTHON) -m tests.faults $(ARGS)
 
 test-all: $(READY) browser ## run the test suite with the slow tests
 	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)

@@ -464,3 +464,31 @@ def test_what_estimates_miss_is_added_and_its_doubt_is_told():
     told = "do not agree on the error of the mesh for u, v"
     assert any(told in one.text for one in findings(unsure))
     assert not any("do not agree" in one.text for one in findings(sure))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("error", [0.02, -0.05])
+def test_errors_are_what_is_to_be_added(error):
+    """Exact minus computed: they have the sign of what the mesh misses, and corrected values are the exact ones."""
+    exact = FunctionModel(
+        lambda p: np.array([p[0] / p[1] + error, 2 * p[0] / p[1] * (1 + error)]), ("a", "b"), ("u", "v")
+    )
+
+    def coarse(p):
+        return np.array([p[0] / p[1], 2 * p[0] / p[1]])
+
+    def slopes(p):
+        return np.array([[1 / p[1], -p[0] / p[1] ** 2], [2 / p[1], -2 * p[0] / p[1] ** 2]])
+
+    model = OnMesh(coarse, ("a", "b"), ("u", "v"), slopes, exact)
+    data, found = studied(MonteCarlo(samples=64), model)
+    mean, std = data["mean"].to_numpy(), data["std"].to_numpy()
+    np.testing.assert_allclose(found["mesh_error"], [error, error * mean[1]], rtol=0.05)
+    np.testing.assert_allclose(found["mean_corrected"], mean + found["mesh_error"], rtol=1e-12)
+    np.testing.assert_allclose(found["std_corrected"], std * [1, 1 + error], rtol=0.01)
+    np.testing.assert_allclose(found["nominal_corrected"], exact.function(INPUTS.mean), rtol=1e-3)
+    for name, sampling in (("", data["mean_error"]), ("std_", data["std_error"])):
+        doubt, size = found[f"{name}mesh_error_doubt"].to_numpy(), np.abs(found[f"{name}mesh_error"].to_numpy())
+        np.testing.assert_allclose(found[f"{name}total_error"], np.hypot(sampling, size + doubt), rtol=1e-12)
+        corrected = found["mean_corrected_error" if not name else "std_corrected_error"]
+        np.testing.assert_allclose(corrected, np.hypot(sampling, doubt), rtol=1e-12)

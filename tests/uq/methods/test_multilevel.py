@@ -131,6 +131,7 @@ def test_rates_are_recovered(control):
     assert "note" not in data.attrs
 
 
+@pytest.mark.unit
 def test_bias_and_rates_of_known_sequences():
     differences = np.array([[1.0, -3.0], [0.5, 0.75]])
     np.testing.assert_allclose(rate(differences), [1, 2])
