@@ -1,15 +1,16 @@
-"""Whether the stated derivatives of another program's model are those of its values, checked at one point.
+"""Whether another program's model answers the same when it is asked again, and states derivatives of its values.
 
-Two more evaluations along a direction that moves all parameters; only if these contradict the derivatives, four more
-for each parameter, to name it. An output may have a kink at the point, or be rough: a derivative between the slopes on
-both sides is accepted, and so is one that shorter differences do not contradict in the same way.
+It is asked again at one point. There, and at a few others, two more evaluations along a direction that moves all
+parameters; only if these contradict the derivatives, four more for each parameter, to name it. An output may have a
+kink at the point, or be rough: a derivative between the slopes on both sides is accepted, and so is one that shorter
+differences do not contradict in the same way.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from forward.model import Finding, FloatArray, ForwardModel, SolveError
+from forward.model import Finding, FloatArray, ForwardModel, Solution, SolveError
 
 STEP = 1e-2  # of a difference, in standard deviations
 SHORTER = 4  # ratio of the steps to those of the differences that confirm
@@ -18,9 +19,87 @@ ROUGHNESS = 1e-7  # error of values of an output, relative to it
 SAME = 0.1  # difference between slopes of both lengths, over the contradiction
 MANY = 25  # number of parameters above which they are not checked one by one
 SHOWN = 3
+AT_MEAN = "at the mean parameters"
 
 
-def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> tuple[Finding, ...]:
+def mistrusted(
+    model: ForwardModel,
+    points: FloatArray,
+    scale: FloatArray,
+    known: FloatArray | None = None,
+    spread: FloatArray | None = None,
+) -> tuple[Finding, ...]:
+    """Ask a model again, and compare its derivatives with differences of its values; not collective.
+
+    Derivatives of a model that answers differently are not compared.
+
+    Parameters
+    ----------
+    model
+        Any model of outputs.
+    points
+        The mean of the parameters, at which it is asked again, and others (n, d) at which its derivatives are compared.
+    scale
+        Scales (d,) of the parameters, such as their standard deviations.
+    known
+        What it has answered at the mean (m,); it is asked twice if that is not known.
+    spread
+        Standard deviations (m,) of the outputs, if they are known; otherwise those to first order.
+
+    Returns
+    -------
+    tuple
+        What is wrong; empty if there is nothing, or if the model has no answer at the mean.
+    """
+    try:
+        if known is None:
+            known = model.solve(points[0]).outputs
+        again = model.solve(points[0])
+        if spread is None and model.differentiable:
+            spread = np.sqrt((np.asarray(again.tangent(np.diag(scale))) ** 2).sum(axis=0))
+    except SolveError:
+        return ()
+    found = _unsteady(model.outputs, known, again.outputs, spread)
+    if found:
+        return found
+    at_mean = contradicted(model, points[0], scale, middle=again)
+    if at_mean:
+        return at_mean
+    for point in points[1:]:
+        numbers = ", ".join(f"{name} = {value:.4g}" for name, value in zip(model.parameters, point, strict=True))
+        where = f"away from the mean, at {numbers}" if len(point) <= MANY else "away from the mean"
+        away = contradicted(model, point, scale, where)
+        if away:
+            return away
+    return ()
+
+
+def _unsteady(
+    outputs: tuple[str, ...], first: FloatArray, again: FloatArray, spread: FloatArray | None
+) -> tuple[Finding, ...]:
+    """Find answers (m,) that differ by more than values are rough: an error where that is visible in the spread."""
+    off = np.abs(again - first)
+    wrong = np.flatnonzero(off > ROUGHNESS * np.maximum(np.abs(first), np.abs(again)))
+    if not wrong.size:
+        return ()
+    share = np.divide(off, spread, out=np.full(len(off), np.inf), where=spread > 0) if spread is not None else None
+    listed = "; ".join(
+        f"{outputs[i]} was {first[i]:.9g} and then {again[i]:.9g}"
+        + (f", {share[i]:.2g} of its standard deviation" if share is not None and np.isfinite(share[i]) else "")
+        for i in wrong[:SHOWN]
+    )
+    more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+    text = (
+        f"The model answers differently when it is asked again {AT_MEAN}: {listed}{more}. What it adds by chance, or "
+        "keeps from call to call, counts as an effect of the parameters: fix the seed of its random numbers, or what "
+        "it remembers."
+    )
+    return (Finding("error" if share is None or share[wrong].max() > SLOPE else "warning", text),)
+
+
+def contradicted(
+    model: ForwardModel, point: FloatArray, scale: FloatArray, where: str = AT_MEAN, middle: Solution | None = None
+) -> tuple[Finding, ...]:
     """Compare the derivatives of a model with differences of its values; not collective.
 
     Parameters
@@ -29,6 +108,10 @@ def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> t
         Any model of outputs; one without derivatives is not checked.
     point, scale
         Parameters (d,), and their scales (d,), such as their standard deviations.
+    where
+        The point in words.
+    middle
+        The solution there, if it is known.
 
     Returns
     -------
@@ -39,7 +122,7 @@ def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> t
         return ()
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(point))
     try:
-        middle = model.solve(point)
+        middle = middle or model.solve(point)
         slopes = np.asarray(middle.tangent(np.diag(scale)))  # (d, m)
         whole = _against(model, point, scale * signs, middle.outputs, signs @ slopes, STEP)
         if not whole.any():
@@ -70,8 +153,8 @@ def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> t
     return (
         Finding(
             "error",
-            f"The derivatives that the model states are not those of its values at the mean parameters: {said}{more}. "
-            "What follows from derivatives (expansions, controls, local sensitivities, modes) is wrong: correct the "
+            f"The derivatives that the model states are not those of its values {where}: {said}{more}. What follows "
+            "from derivatives (expansions, controls, local sensitivities, modes) is wrong: correct the "
             "jacobian, or leave it out.",
         ),
     )

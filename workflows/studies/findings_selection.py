@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.external.derivatives import contradicted
 from forward.model import Finding
 from forward.readable import percent
 from forward.words import number, with_error
+from workflows.studies.findings_solves import of_answers
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -292,14 +292,12 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
 
 
 def contradictions(study: Comparison, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
-    """Find that the derivatives which another program states for a candidate are not those of its values; on rank 0."""
+    """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
     specs = getattr(study, "of_candidates", {})  # comparisons by tests of the material have none
     if name not in specs or specs[name].shareable:
         return []
     inputs = study.candidates[name].inputs
-    return [
-        one._replace(text=f"Candidate '{name}': {one.text}") for one in contradicted(make(), inputs.mean, inputs.std)
-    ]
+    return [one._replace(text=f"Candidate '{name}': {one.text}") for one in of_answers(make(), inputs)]
 
 
 def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Dataset:

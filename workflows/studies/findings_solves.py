@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from forward.external.derivatives import mistrusted
 from forward.model import Finding, SolveError
 from forward.words import number, with_unit
+from uq.evaluation.block import merge
 from workflows.config.priors import ranges
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
+    from forward.model import ForwardModel
     from uq.evaluation.request import Evaluations
+    from uq.inputs.random_parameters import Inputs
     from workflows.studies.sampling import Study
 
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
+SHARE, QUICK = 0.05, 1.0  # of all solves, and s: what asking a model again may take, the larger of both
+TINY = 1e-9  # s, that a solve takes at least
+EACH = 3  # solves where derivatives are compared
+AWAY = (0.35, -0.35)  # of the probability of each parameter, from its median: one standard deviation to both sides
 
 
 def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
@@ -40,6 +51,32 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     form = "quadratic cells and pressures" if better.mixed else "quadratic cells"
     text = f"At the mean of the inputs, against {form} on the same mesh, which lock less: {'; '.join(said)}."
     return [Finding("warning", text)]
+
+
+def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations] = ()) -> tuple[Finding, ...]:
+    """Ask a model from outside again at the mean, and compare its derivatives there and elsewhere; on rank 0.
+
+    That is nearly free: methods begin with a solve at the mean. Of slow models, only as many solves are added as are a
+    small share of those of the study.
+
+    Parameters
+    ----------
+    solved
+        What was solved before, where that is known: first at the mean.
+    """
+    spare, known, spread = math.inf, None, None
+    if solved:
+        first, every = solved[0], merge(solved)
+        spare = max(SHARE * len(every.points), QUICK / max(float(every.seconds.mean()), TINY))
+        known = first.outputs[0] if np.array_equal(first.points[0], inputs.mean) and first.ok[0] else None
+        spread = every.outputs[every.ok].std(axis=0) if every.ok.sum() > 1 else None
+    if spare < 1:
+        return ()
+    each = EACH if model.differentiable else math.inf
+    away = AWAY[: int(min(len(AWAY), max(spare - each, 0) // each))]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(inputs.mean))
+    others = [inputs.points(0.5 + share * signs[None])[0] for share in away]
+    return mistrusted(model, np.array([inputs.mean, *others]), inputs.std, known, spread)
 
 
 def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:

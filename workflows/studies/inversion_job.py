@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
@@ -24,6 +23,7 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
+from workflows.studies.findings_solves import of_answers
 from workflows.studies.finer import FINER, finer_meshes, solved_by
 from workflows.studies.inversion import PREDICTED, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
@@ -185,7 +185,7 @@ def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset
     """Add what is to be said of the results; on rank 0."""
     found = judged(found, study)
     if isinstance(made, _Outputs) and not has_mesh(study.model):
-        add(found, *contradicted(made.model, study.inputs.mean, study.inputs.std))
+        add(found, *of_answers(made.model, study.inputs))
     return found
 
 

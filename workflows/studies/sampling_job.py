@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from forward.external.derivatives import contradicted
 from forward.model import SolveError, Stability
 from forward.registry import named
 from uq.accuracy.budget import spare_for
@@ -23,7 +22,7 @@ from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
-from workflows.studies.findings_solves import measured
+from workflows.studies.findings_solves import measured, of_answers
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
 from workflows.studies.stresses import stressed, with_stresses
@@ -76,7 +75,10 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
 
         def described(found: xr.Dataset) -> xr.Dataset:
             found = label(_without_nodes(found), units, None, None, 0)
-            add(found, *contradicted(function, inputs.mean, inputs.std))
+            if not study.spec.shareable:
+                log, models = recorders["/"].log, recorders["/"].models
+                own = [one for one, name in zip(log, models, strict=True) if name == OWN]
+                add(found, *of_answers(function, inputs, own))
             return found
 
         return MethodJob(function, others, task, recorders, described)

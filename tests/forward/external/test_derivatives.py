@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.external.derivatives import contradicted
+from forward.external.derivatives import contradicted, mistrusted
 from forward.model import FunctionModel, SolveError
 
 pytestmark = pytest.mark.unit
@@ -87,3 +87,64 @@ def test_many_parameters_are_looked_at_together():
     )
     (found,) = contradicted(many, ones, ones)
     assert "of y by all parameters" in found.text
+
+
+FAR = np.array([POINT, POINT + SCALE, POINT - SCALE])
+
+
+def everywhere(p):
+    """Slopes that are right on both sides of the kink."""
+    found = slopes(p)
+    found[2, 0] = 1.0 if p[0] >= 1 else -1.0
+    return found
+
+
+def mistrust(jacobian, function, points=FAR, **known):
+    return mistrusted(model(jacobian, function), points, SCALE, **known)
+
+
+def test_a_model_that_answers_differently_is_found():
+    """By chance or by what it remembers; differences far below the spread of the outputs are a warning."""
+    rng, calls = np.random.default_rng(0), []
+
+    def noisy(p):
+        return values(p) + np.array([0.01 * rng.standard_normal(), 0.0, 0.0])
+
+    def remembering(p):
+        calls.append(p)
+        return values(p) * (1 + 0.01 * len(calls))
+
+    for function in (noisy, remembering):
+        for jacobian in (None, everywhere):
+            (found,) = mistrust(jacobian, function)
+            assert found.severity == "error"
+            assert "answers differently when it is asked again at the mean parameters: u was" in found.text
+    (found,) = mistrust(None, lambda p: values(p) * (1 + 1e-5 * rng.standard_normal()), spread=np.ones(3))
+    assert found.severity == "warning"
+    (found,) = mistrust(None, values, known=values(POINT) + np.array([0.0, 0.1, 0.0]))  # as it was answered before
+    assert "v was 1.74872127 and then 1.64872127" in found.text
+    assert mistrust(None, values) == mistrust(everywhere, values) == ()
+    assert mistrust(None, lambda p: values(p) * (1 + 1e-9 * rng.standard_normal())) == ()
+
+
+def test_derivatives_that_are_right_at_the_mean_alone_are_found():
+    (found,) = mistrust(lambda p: slopes(POINT), values)
+    assert found.severity == "error"
+    assert "away from the mean, at a = 1.1, b = 2.3, c = 0.7: " in found.text
+    assert "of u by a" in found.text
+    (found,) = mistrust(lambda p: everywhere(np.minimum(p, POINT)), values, FAR[[0, 2, 1]])
+    assert "away from the mean, at a = 1.1" in found.text
+    assert mistrust(lambda p: slopes(POINT), values, FAR[:1]) == ()  # nobody has looked
+
+
+def test_what_asking_again_costs():
+    count = []
+
+    def counted(p):
+        count.append(p)
+        return values(p)
+
+    for jacobian, known, solves in ((None, None, 2), (None, values(POINT), 1), (everywhere, values(POINT), 9)):
+        count.clear()
+        assert mistrust(jacobian, counted, known=known) == ()
+        assert len(count) == solves

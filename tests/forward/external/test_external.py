@@ -242,3 +242,30 @@ def test_the_shipped_example(monkeypatch):
     case = load(study)
     data = case.method.run(case.inputs, SerialEvaluate(case.model.build(None, case.inputs.names)))
     assert float(data["mean"].sel(output="tip")) == pytest.approx(MEAN, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("body", "jacobian", "method", "told"),
+    [
+        ("p[0] + 0.1 * rng.standard_normal()", "", "{kind='monte-carlo', samples=32}", "answers differently"),
+        ("p[0] + 0.1 * rng.standard_normal()", "", "{kind='chaos', samples=32}", "answers differently"),
+        ("p[0] ** 2", "[[2 * p[0]]]", "{kind='sensitivity-monte-carlo', samples=32}", ""),
+        ("p[0] ** 2", "[[1.0]]", "{kind='sensitivity-monte-carlo', samples=32}", "away from the mean, at a = "),
+    ],
+)
+def test_a_model_that_contradicts_itself(body, jacobian, method, told, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    lines = ["import numpy as np", "rng = np.random.default_rng()", "def f(p):", f"    return [{body}]"]
+    lines += ["def slopes(p):", f"    return {jacobian}"] if jacobian else []
+    (tmp_path / "contradicting.py").write_text("\n".join(lines))
+    blocks = {
+        "model": {"kind": "python", "function": "contradicting.f", "parameters": {"a": 0.5}, "outputs": ["y"]},
+        "parameters": {"a": {"kind": "uniform", "lower": 0.0, "upper": 1.0}},
+    }
+    if jacobian:
+        blocks["model"]["jacobian"] = "contradicting.slopes"
+    case = parse(blocks, [f"method={method}"])
+    assert run(case, "own", tmp_path / "out", quiet=True, report=False) == (3 if told else 0)
+    errors = [one["text"] for one in read_summary(tmp_path / "out")["findings"] if one["severity"] == "error"]
+    assert any(told in text for text in errors) if told else not errors
+    sys.modules.pop("contradicting")
