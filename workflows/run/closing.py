@@ -31,7 +31,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     before = len(lines)
     lines += [
         f"{model}: ln Z {with_error(found['log_evidence'], found['log_evidence_error'])}, "
-        f"probability {found['probability']:.3g}{_stacking(found)}"
+        f"probability {found['probability']:.3g}{_stacking(found)}{_not_known(dataset, model, found)}"
         for model, found in summary.get("models", {}).items()
     ]
     lines += inverted(summary, meshes_unknown(dataset))
@@ -61,6 +61,13 @@ def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
 
 def _stacking(found: Mapping[str, Any]) -> str:
     return f", stacking {found['stacking']:.3g}" if found.get("stacking") is not None else ""
+
+
+def _not_known(dataset: xr.Dataset, model: str, found: Mapping[str, Any]) -> str:
+    """Say beside an evidence that it is not to be trusted, or that nobody has looked at its mesh."""
+    if "mesh_checked" in dataset and not bool(dataset["mesh_checked"].sel(model=model).all()):
+        return f" ({NOT_KNOWN})"
+    return "" if found["trusted"] else " (not to be trusted)"
 
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

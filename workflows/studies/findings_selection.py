@@ -131,7 +131,7 @@ def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
 
 
 def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> Iterator[Finding]:
-    """Find evidences that cannot be trusted.
+    """Find evidences that cannot be trusted; where no finer mesh was looked at, that is said elsewhere.
 
     Parameters
     ----------
@@ -146,7 +146,8 @@ def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> 
     if doubtful:
         text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."
         yield Finding("error", text)
-    by_mesh = (found["trusted"] & ~judged["trusted"]).any("group")
+    looked = found["mesh_checked"] if "mesh_checked" in found else found["trusted"]
+    by_mesh = (found["trusted"] & ~judged["trusted"] & looked).any("group")
     names = [str(name) for name in found["model"].values[by_mesh.to_numpy()] if name not in wrong]
     if names:
         yield Finding("error", f"Evidences not to be trusted for what meshes do to them: {', '.join(names)}.")

@@ -423,9 +423,14 @@ def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
     )
     small.write_text(text)
     out = small.parent / "out"
-    assert run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode == 0
+    code = run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode
     summary = json.loads((out / "summary.json").read_text())
     assert summary["failed"] == 0 < summary["zero_likelihood"]
+    assert summary["status"] == "complete"
+    # Of these few points hardly one has a weight: that, and no failure, is why the exit code is 3.
+    errors = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert [text.partition(":")[0] for text in errors] == ["Evidences not to be trusted"]
+    assert code == 3
     assert any("no stress in the test" in one["text"] for one in summary["findings"])
 
 
