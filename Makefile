@@ -19,6 +19,8 @@ DEMO := beam
 # Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.
 WORKERS := --numprocesses auto --dist loadfile
 ARGS :=
+# To compile all modules anew takes as long as the unit tests: kept here, whatever the environment says.
+KEPT := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/.venv/compiled
 INSTALL = PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --no-compile --editable
 
 # Open MPI refuses root without these two; one BLAS thread per rank.
@@ -46,7 +48,7 @@ test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
 	@$(PYTHON) -m pytest $(WORKERS) $(ARGS)
 
 test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
-	@$(PYTHON) -m pytest -m unit $(ARGS)
+	@$(KEPT) $(PYTHON) -m pytest -m unit -p no:hypothesispytest $(ARGS)
 
 test-faults: $(READY) ## plant faults in formulas in turn, and say which of them the unit tests see (ARGS="bias" plants one)
 	@$(PYTHON) -m tests.faults $(ARGS)

@@ -4,7 +4,7 @@ import pytest
 
 from tests.faults import FAULTS, ROOT, Fault
 
-pytestmark = pytest.mark.unit
+# No unit test: these are to see faults by what they compute, not by the text.
 
 
 @pytest.mark.parametrize("name", FAULTS)

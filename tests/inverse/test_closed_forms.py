@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from inverse.criticism.comparison import _chance_errors, probabilities, quantiles
+from inverse.criticism.predictive import summary
 from inverse.criticism.weights import (
     effective_sample_size,
     normalised,
@@ -179,3 +181,28 @@ def test_the_size_of_the_noise_is_integrated_out(prior, unit):
     w /= w.sum()
     assert log_std == pytest.approx(math.sqrt(w @ (np.log(s) - w @ np.log(s)) ** 2), rel=1e-4)
     assert best == pytest.approx(s[w.argmax()], rel=0.01)
+
+
+# --- models and predictions ------------------------------------------------------------------------------------------
+
+
+def test_probabilities_of_models():
+    log_evidence, prior = np.array([-1000.0, -1000 + math.log(3), -1002.0]), np.array([0.5, 0.25, 0.25])
+    expected = prior * [1, 3, math.exp(-2)]
+    np.testing.assert_allclose(probabilities(log_evidence, prior), expected / expected.sum())
+    P, errors = np.array([0.2, 0.8]), np.array([0.1, 0.3])
+    # P = 1/(1 + Z_1/Z_0): the error of the logarithm of the ratio times P(1 − P)
+    np.testing.assert_allclose(_chance_errors(P, errors), 0.16 * math.hypot(0.1, 0.3))
+
+
+def test_summaries_of_weighted_points():
+    values, w = np.array([[1.0, 5.0], [2.0, 5.0], [4.0, 5.0]]), np.array([0.5, 0.25, 0.25])
+    found = summary(values, w)
+    np.testing.assert_allclose(found.mean, [2, 5])
+    np.testing.assert_allclose(found.std, [math.sqrt(1.5), 0])
+    grid = np.arange(1000) / 1000 + 0.0005
+    np.testing.assert_allclose(quantiles(grid[::-1], np.full(1000, 1e-3), (0.025, 0.5, 0.975)), [0.025, 0.5, 0.975])
+    # twice the weight is twice the point
+    np.testing.assert_allclose(
+        quantiles(grid, np.where(grid < 0.5, 2.0, 1.0) / 1500, (1 / 3, 2 / 3)), [0.25, 0.5], atol=1e-3
+    )
