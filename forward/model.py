@@ -23,13 +23,39 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class Work:
-    """What a solution has cost so far, counted in the operations that matter."""
+    """What a solution has cost so far, counted in the operations that matter, and what was looked at besides.
+
+    Attributes
+    ----------
+    residuals, assemblies, factorisations, back_substitutions, load_steps
+        Operations, those of audits among them.
+    screens
+        How often it was looked at whether a state may be one that is not joined to rest.
+    calls
+        How often that called for an audit.
+    audits
+        How often a path was followed to see it.
+    audit_residuals, audit_factorisations, audit_back_substitutions
+        Operations of these audits.
+    others
+        Stable equilibria that were found first and are not the answer, which audits found elsewhere.
+    snaps
+        Answers in which the path of loads from rest has jumped: the branch from rest ends before.
+    """
 
     residuals: int = 0
     assemblies: int = 0
     factorisations: int = 0
     back_substitutions: int = 0
     load_steps: int = 0
+    screens: int = 0
+    calls: int = 0
+    audits: int = 0
+    audit_residuals: int = 0
+    audit_factorisations: int = 0
+    audit_back_substitutions: int = 0
+    others: int = 0
+    snaps: int = 0
 
     def as_array(self) -> NDArray[np.int64]:
         """Return the counts in the order of `WORK`."""
@@ -135,15 +161,19 @@ class ReferenceSolution:
     spread
         How far the parameters vary, if known: standard deviations (d,) of independent parameters, or a few random draws
         (k, d) of their differences from the mean.
+    joined
+        Whether the state is joined to rest: a path of loads leads to it without a jump. If not, nothing near it is
+        known to be the answer either.
     """
 
     parameters: FloatArray
     state: FloatArray
     spread: FloatArray | None = None
+    joined: bool = True
 
     def same(self, other: ReferenceSolution) -> bool:
         """Whether both are at the same place, for the same parameters."""
-        pairs = zip(*([one.parameters, one.state, one.spread] for one in (self, other)), strict=True)
+        pairs = zip(*([one.parameters, one.state, one.spread, one.joined] for one in (self, other)), strict=True)
         return self is other or all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
@@ -165,12 +195,15 @@ class Guess:
     derivatives
         Whether all derivatives of the solution will be asked for: a model that goes on to another state meanwhile may
         find them before.
+    audit
+        Whether the path to the state is followed though no screen calls for it.
     """
 
     state: FloatArray | None = None
     reference: ReferenceSolution | None = None
     iterations: int | None = None
     derivatives: bool = False
+    audit: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.fem import ranks
 from forward.fem.dolfinx import spaces
@@ -26,6 +27,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import moduli
 from forward.materials.material import constants
 from forward.model import FloatArray, SolveError, Work
+from forward.solvers.rotations import rotations
 from forward.solvers.system import Residual
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
@@ -244,6 +246,38 @@ class Discretisation(Linearisation):
         """Smallest J over the quadrature points of all ranks."""
         self.set_state(u)
         return ranks.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
+
+    @cached_property
+    def _planes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Nodes and axes along which planes hold them, apart from nodes that are held along all axes.
+
+        Where a plane holds them across its normal only, they are stretched along that axis by nothing.
+        """
+        nodes, axes = np.divmod(self.fixed, 3)
+        held = np.bincount(nodes, minlength=self.nodes_owned)[nodes] < 3
+        return nodes[held], axes[held]
+
+    def crossed(self, u: FloatArray) -> bool:
+        """Whether n·Fn ≤ 0 at a node that is held along an axis n."""
+        nodes, axes = self._planes
+        if ranks.smallest(self.comm, -float(len(nodes))) == 0:
+            return False
+        self.set_state(u)
+        return not ranks.smallest(self.comm, float(self.gradients()[axes, axes, nodes].min(initial=np.inf))) > 0
+
+    def turned(self, u: FloatArray, v: FloatArray) -> float:
+        """Largest angle (rad) by which a node is turned from a state to another, by polar decompositions."""
+        found = []
+        for state in (u, v):
+            self.set_state(state)
+            found.append(rotations(self.gradients()))
+        traces = np.einsum("abn,abn->n", *found)
+        trace = ranks.smallest(self.comm, float(traces.min(initial=3.0)))
+        return float(np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0)))
+
+    def has_factor(self, u: FloatArray) -> bool:
+        """Whether the factor at hand is that of the stiffness at this very array u."""
+        return self.latest.factorised_at is u
 
     def stiffness_near(self, u: FloatArray, imbalance: FloatArray, rows: FloatArray) -> FloatArray:
         """Products (k, U_local) of the stiffness of the free unknowns at u (U_local,) with rows, to a few digits.

@@ -122,7 +122,8 @@ class HyperelasticModel(OneByOne):
         equations.work = Work()
         equations.set_parameters(parameters)
         with equations.time_limit(self.spec.solver.solve_seconds):
-            found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
+            zero = np.zeros(equations.size)
+            found = solve(equations, self.spec.solver, zero, guess.state, way, guess.iterations, audit=guess.audit)
             stiffer = 1.0
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)

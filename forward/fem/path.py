@@ -102,8 +102,9 @@ class PathModel(OneByOne):
                 spread = None
                 if near.spread is not None:
                     spread = np.concatenate([near.spread, np.zeros((*near.spread.shape[:-1], len(values)))], axis=-1)
-                reference = ReferenceSolution(np.append(near.parameters, values), self.states(near.state)[k], spread)
-                yield Guess(state, reference, guess.iterations)
+                there = np.append(near.parameters, values)
+                reference = ReferenceSolution(there, self.states(near.state)[k], spread, near.joined)
+                yield Guess(state, reference, guess.iterations, audit=guess.audit)
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
         """Split states (…, U) or parts of them into those of the steps, in their order."""

@@ -233,6 +233,8 @@ class WayFromReference:
     ----------
     reference
         Its start.
+    joined
+        Whether the reference is joined to rest.
     state
         Of the reference.
     rotation
@@ -254,7 +256,7 @@ class WayFromReference:
         self.draw = draw(parameters)
         self._equations, self._factor = equations, factor
         self._from, self._to = reference.parameters, parameters
-        self.reference = reference
+        self.reference, self.joined = reference, reference.joined
         self.state = reference.state
         self.rotation: FloatArray | None = None
 

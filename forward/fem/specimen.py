@@ -196,8 +196,8 @@ class SpecimenModel(OneByOne):
                 yield Guess(state, iterations=guess.iterations)
             else:
                 spread = None if near.spread is None else near.spread[..., where]
-                reference = ReferenceSolution(near.parameters[where], self.states(near.state)[k], spread)
-                yield Guess(state, reference, guess.iterations)
+                reference = ReferenceSolution(near.parameters[where], self.states(near.state)[k], spread, near.joined)
+                yield Guess(state, reference, guess.iterations, audit=guess.audit)
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
         """Split this rank's states (…, U_local) into those of the cases."""

@@ -57,7 +57,7 @@ def task(
     system: System, settings: SolverSettings, zero: FloatArray, way: ResumableWay, guess: Guess, work: Work
 ) -> Task[Found]:
     """Return the search for an equilibrium from a prediction, among others; its work is added to `work`."""
-    steps = solving(system, settings, zero, guess.state, way, guess.iterations)
+    steps = solving(system, settings, zero, guess.state, way, guess.iterations, audit=guess.audit)
     return Task(steps, partial(way.resume, work))
 
 

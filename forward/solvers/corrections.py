@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from forward.model import FloatArray
@@ -37,24 +39,28 @@ def predict_correct(
         If the reference is too far away, with the state at the end of the path that came closest, if one did.
     """
     slope = start - way.state
+    flat = system.norm(slope) == 0  # then the first correction is the tangent's prediction
     known: list[tuple[float, FloatArray]] = []
     reached, target = 0.0, 1.0
     closest: FloatArray | None = None
     least, failures = CLOSE, 0
     while True:
         way.at(target)
-        guess = way.state + target * slope + target**2 * _line(known, target)
+        guess = straight(way.state, slope, known, target)
         tolerance = settings.tolerance if target == 1 else ROUGH
         history.append(f"prediction at {target:.6g} of the way from the reference")
         u = system.on_target(guess)
         residual = system.residual(u)
-        close = np.isfinite(residual.size)
+        close, predicted = bool(np.isfinite(residual.size)), u
         if close:
             correct = way.corrector(u)
-            u, residual, close = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
+            mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
+            u, residual, close, first = mixed
+            if flat:
+                predicted = first
         if close and target == 1:
             stability = yield from accepted(system, settings, u, residual, way, history)
-            return Found(u, residual.relative, corrected=True, stability=stability)
+            return Found(u, residual.relative, corrected=True, stability=stability, predicted=predicted)
         if target == 1:
             failures += 1
             if residual.relative < least and system.smallest_jacobian(u) > 0:
@@ -71,6 +77,11 @@ def predict_correct(
             raise Diverged(message, closest)
 
 
+def straight(state: FloatArray, slope: FloatArray, known: list[tuple[float, FloatArray]], t: float) -> FloatArray:
+    """Predict the state (U_local,) after a fraction t of the path from a state, as in `predict_correct`."""
+    return np.asarray(state + t * slope + t**2 * _line(known, t))
+
+
 def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:
     """Value at t of the line through the last two known points, of the constant through one, or zero."""
     if not known:
@@ -82,6 +93,15 @@ def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float
     return np.asarray(p + (t - a) / (b - a) * (q - p))
 
 
+class Mixed(NamedTuple):
+    """The best state of some corrections, its residual, whether it is an equilibrium, and the first correction."""
+
+    state: FloatArray
+    residual: Residual
+    reached: bool
+    first: FloatArray
+
+
 def mix(
     system: System,
     tolerance: float,
@@ -90,10 +110,10 @@ def mix(
     correct: Corrector,
     limit: int,
     history: list[str],
-) -> Steps[tuple[FloatArray, Residual, bool]]:
-    """Correct u with one factor; return the best state, its residual, and whether it is an equilibrium."""
+) -> Steps[Mixed]:
+    """Correct u with one factor."""
     mixing = AndersonMixing(WINDOW, len(u), system.total, system.weights())
-    best, smallest, since, begun = u, residual, 0, residual.size
+    best, smallest, since, begun, first = u, residual, 0, residual.size, u
     sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(limit + 1):
@@ -102,7 +122,7 @@ def mix(
             sizes.clear()  # corrections falter before they are close
         if converged(system, tolerance, u, residual, sizes):
             stable = last is None or convex(system, last, (u, residual))
-            return u, residual, stable and system.smallest_jacobian(u) > 0
+            return Mixed(u, residual, stable and system.smallest_jacobian(u) > 0, first)
         if iteration > 0 and residual.size < smallest.size:
             best, smallest, since = u, residual, 0
         else:
@@ -114,8 +134,9 @@ def mix(
             break
         last = (u, residual)
         u = mixing.next(u, residual.vector, (yield from correct(residual.vector)))
+        first = u if iteration == 0 else first
         residual = system.residual(u)
         if not np.isfinite(residual.size):
             history.append("correction: the state has no finite residual")
             break
-    return best, smallest, False
+    return Mixed(best, smallest, False, first)

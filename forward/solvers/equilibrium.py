@@ -1,8 +1,9 @@
 """Finding the equilibrium of a discretised body: predict and correct with a reference factor, Newton, load steps.
 
 From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
-stiffness; if that is slow it continues with Newton's method, then with adaptive load steps. All of them use the same
-residual test. `solve` can also be told to stop after a few iterations, wherever it is then.
+stiffness; if that is slow it continues with Newton's method, then with adaptive load steps. Without a prediction it
+begins with these. All of them use the same residual test, and the answer is the equilibrium that is joined to rest
+(`joined`), whichever of them finds it. `solve` can also be told to stop after a few iterations, wherever it is then.
 
 Full Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
 the iteration stops when steps grow. A line search on the residual or on the energy, or the natural
@@ -13,13 +14,16 @@ iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.acceptance import Diverged, Unstable, accepted, check_jacobian, converged, convex
 from forward.solvers.anderson import AndersonMixing
 from forward.solvers.corrections import ROUNDED, WINDOW, predict_correct
-from forward.solvers.newton import admissible_step, factorise, load_steps, newton
+from forward.solvers.joined import load_steps, settled
+from forward.solvers.newton import admissible_step, factorise, newton
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Corrector, Steps, finish, plain
 from forward.solvers.system import Found, Residual, System, Way
@@ -34,9 +38,12 @@ def solve(
     start: FloatArray | None = None,
     way: Way | None = None,
     iterations: int | None = None,
+    *,
+    audit: bool = False,
 ) -> Found:
     """Find the equilibrium as `solving` does, with the factor of the reference at hand."""
-    return finish(solving(system, settings, zero, start, way, iterations), system.solve if way is None else way.solve)
+    steps = solving(system, settings, zero, start, way, iterations, audit=audit)
+    return finish(steps, system.solve if way is None else way.solve)
 
 
 def solving(
@@ -46,8 +53,10 @@ def solving(
     start: FloatArray | None = None,
     way: Way | None = None,
     iterations: int | None = None,
+    *,
+    audit: bool = False,
 ) -> Steps[Found]:
-    """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
+    """Find the equilibrium at full load: from `start` if that converges, else by adaptive load steps from `zero`.
 
     Parameters
     ----------
@@ -65,6 +74,8 @@ def solving(
         Stop after this many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
         or, without one, Newton steps. The equilibrium is computed after all if they lead to no admissible state, or if
         they are as many as the settings allow anyway.
+    audit
+        Whether the path from rest is followed though nothing calls for it.
 
     Returns
     -------
@@ -76,57 +87,107 @@ def solving(
     SolveError
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
-    history: list[str] = []
-    refused = Stability.NOT_TESTED  # of equilibria at full load
-
-    def failed(stop: Diverged) -> None:
-        nonlocal refused
-        if isinstance(stop, Unstable):
-            refused = max(refused, stop.stability)
-
-    def known(found: Found) -> Found:
-        # A miss of the screen must be recorded, even if another equilibrium is found instead.
-        return found._replace(stability=refused) if refused == Stability.MISSED else found
-
+    search = _Search(system, settings, zero, way, audit)
     if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
-        system.at_load(1.0)
         try:
-            return (
-                yield from _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
-            )
+            return (yield from search.few(zero if start is None else start, iterations, alone=start is not None))
         except Diverged as stop:
-            history.append(f"{stop}: the equilibrium is looked for after all")
-            failed(stop)
-    from_zero = start is None or (settings.kind == "newton" and iterations is None)
-    if way is not None and start is not None and not from_zero and system.contact:
-        start = _closer(system, start, way.state)
-    guesses = [zero] if start is None or from_zero else [start, zero]
+            search.history.append(f"{stop}: the equilibrium is looked for after all")
+            search.failed(stop)
+    if start is None and settings.kind != "newton" and not system.contact:
+        return search.from_rest()
+    guesses = [zero] if start is None or (settings.kind == "newton" and iterations is None) else [start, zero]
     if way is not None and len(guesses) == 2:
+        if system.contact:
+            guesses[0] = _closer(system, guesses[0], way.state)
         system.at_load(1.0)
         try:
-            return known((yield from predict_correct(system, settings, guesses[0], way, history)))
+            return (yield from search.corrected(guesses[0], way))
         except Unstable as stop:
-            failed(stop)
+            search.failed(stop)
             guesses = []  # at full load Newton would find the same equilibrium, or another unstable one
         except Diverged as stop:
-            failed(stop)
+            search.failed(stop)
             if stop.closest is not None:
                 guesses.insert(0, stop.closest)
     for guess in guesses:
         try:
-            return known(newton(system, settings, guess, history, 1.0)[0])
+            return (yield from search.newton(guess, start))
         except Unstable as stop:
-            failed(stop)
+            search.failed(stop)
             break
         except Diverged as stop:
-            failed(stop)
-    try:
-        return known(load_steps(system, settings, zero, history, unstable=refused != Stability.NOT_TESTED))
-    except SolveError as error:
-        if refused != Stability.NOT_TESTED:
-            message = f"{error.reason}; the equilibrium that was found at full load is unstable"
-            raise SolveError(message, error.history, error.work, refused) from None
-        raise
+            search.failed(stop)
+    return search.from_rest()
+
+
+@dataclass
+class _Search:
+    """Attempts to find an equilibrium at full load, and what they have shown.
+
+    Attributes
+    ----------
+    system, settings, zero, way, audit
+        As of `solving`.
+    history
+        Their iterations.
+    refused
+        What is known of equilibria that were refused.
+    """
+
+    system: System
+    settings: SolverSettings
+    zero: FloatArray
+    way: Way | None
+    audit: bool
+    history: list[str] = field(default_factory=list)
+    refused: Stability = Stability.NOT_TESTED
+
+    def failed(self, stop: Diverged) -> None:
+        """Note that an attempt has failed."""
+        if isinstance(stop, Unstable):
+            self.refused = max(self.refused, stop.stability)
+
+    def few(self, start: FloatArray, iterations: int, *, alone: bool) -> Steps[Found]:
+        """Make a few iterations; what is reached `alone`, without a reference, has no branch."""
+        self.system.at_load(1.0)
+        found = yield from _iterate_few(self.system, self.settings, start, self.way, iterations, self.history)
+        if not found.converged or (self.way is None and alone):
+            return found
+        return (yield from self._settled(found, self.way))
+
+    def corrected(self, start: FloatArray, way: Way) -> Steps[Found]:
+        """Correct a prediction with the factor of the reference."""
+        found = yield from predict_correct(self.system, self.settings, start, way, self.history)
+        return (yield from self._settled(found, way))
+
+    def newton(self, guess: FloatArray, start: FloatArray | None) -> Steps[Found]:
+        """Find it by Newton's method from a guess: the prediction `start` or near it, or zero."""
+        found = newton(self.system, self.settings, guess, self.history, 1.0)[0]
+        if self.way is None or guess is self.zero:
+            return (yield from self._settled(found, None, guess))
+        return (yield from self._settled(found._replace(predicted=start), self.way))
+
+    def from_rest(self) -> Found:
+        """Raise the loads from zero."""
+        self.system.work.audits += not self.system.contact
+        unstable = self.refused != Stability.NOT_TESTED
+        try:
+            return self._known(load_steps(self.system, self.settings, self.zero, self.history, unstable=unstable))
+        except SolveError as error:
+            if unstable:
+                message = f"{error.reason}; the equilibrium that was found at full load is unstable"
+                raise SolveError(message, error.history, error.work, self.refused) from None
+            raise
+
+    def _settled(self, found: Found, way: Way | None, before: FloatArray | None = None) -> Steps[Found]:
+        answer = settled(self.system, self.settings, self.zero, found, self.history, way, before, audit=self.audit)
+        return self._known((yield from answer))
+
+    def _known(self, found: Found) -> Found:
+        """Note what has happened on the way: a miss of the screen counts even if another equilibrium is found."""
+        self.system.work.snaps += found.snapped
+        return found._replace(stability=self.refused) if self.refused == Stability.MISSED else found
 
 
 def _closer(system: System, start: FloatArray, other: FloatArray) -> FloatArray:

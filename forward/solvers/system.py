@@ -79,6 +79,9 @@ class System(Protocol):
             If the stiffness is singular.
         """
 
+    def has_factor(self, u: FloatArray) -> bool:
+        """Whether the factor at hand is that of the stiffness at this very array u."""
+
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right with the factor at hand; prescribed rows are identities."""
 
@@ -96,6 +99,12 @@ class System(Protocol):
 
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J = det F over the quadrature points of all ranks."""
+
+    def crossed(self, u: FloatArray) -> bool:
+        """Whether the body has passed through a plane that holds it along the normal n: n·Fn ≤ 0 somewhere on it."""
+
+    def turned(self, u: FloatArray, v: FloatArray) -> float:
+        """Largest angle (rad) by which a node is turned from one state to another."""
 
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
@@ -119,6 +128,10 @@ class Way(Protocol):
     @property
     def state(self) -> FloatArray:
         """The state (U_local,) of the reference."""
+
+    @property
+    def joined(self) -> bool:
+        """Whether the reference is joined to rest."""
 
     @property
     def draw(self) -> float:
@@ -155,6 +168,10 @@ class Found(NamedTuple):
         Whether it was found with the factor of the reference.
     stability
         How its stability was tested.
+    predicted
+        What a tangent predicted for it (U_local,), from another equilibrium; None if nothing did.
+    snapped
+        Whether the path of loads from rest has jumped to it.
     """
 
     state: FloatArray
@@ -162,3 +179,5 @@ class Found(NamedTuple):
     converged: bool = True
     corrected: bool = False
     stability: Stability = Stability.NOT_TESTED
+    predicted: FloatArray | None = None
+    snapped: bool = False

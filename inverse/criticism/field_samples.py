@@ -35,7 +35,7 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
     state = np.array(mode.solution.state)
     # The screen of stability must know where the samples go.
     draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.whitened))))
-    reference = ReferenceSolution(mode.values, state, mode.posterior.prior.root(draws))
+    reference = ReferenceSolution(mode.values, state, mode.posterior.prior.root(draws), mode.solution.work.snaps == 0)
     strong = pairs.values > STRONG
     vectors, images, stiffness = pairs.vectors[strong], pairs.images[strong], 1 + pairs.values[strong]
     centre = vectors @ mode.whitened

@@ -67,22 +67,26 @@ class Nearby:
         State (U_local,) there, and its derivatives (d, U_local).
     spread
         Standard deviations (d,) of the prior.
+    joined
+        Whether the state is joined to rest.
     """
 
     point: FloatArray
     state: FloatArray
     slopes: FloatArray
     spread: FloatArray
+    joined: bool
 
     @classmethod
     def at(cls, model: ForwardModel, point: FloatArray, spread: FloatArray) -> Nearby:
         """Solve at parameters (d,); collective."""
         solution = model.solve(point)
-        return cls(point, np.array(solution.state), solution.state_tangent(np.eye(len(point))), spread)
+        slopes = solution.state_tangent(np.eye(len(point)))
+        return cls(point, np.array(solution.state), slopes, spread, solution.work.snaps == 0)
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) with its reference."""
-        reference = ReferenceSolution(self.point, self.state, self.spread)
+        reference = ReferenceSolution(self.point, self.state, self.spread, self.joined)
         return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
 
 

@@ -1,4 +1,4 @@
-"""Where the model has no answer: what the samples that failed, or were refused as unstable, have in common.
+"""Where the model has no answer, or several: what samples that failed, were refused, or have jumped have in common.
 
 A perfect column under a dead load has no stable straight state beyond its first buckling load, and its bent state is
 not found from the straight ones. Estimates from the other samples describe the branch on which these are.
@@ -6,7 +6,7 @@ not found from the straight ones. Estimates from the other samples describe the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         else:
             text += "Estimates are of the stable branch only, that is, over the samples that have an answer."
         yield Finding("error" if continued else "warning", text)
+    yield from of_jumps([evaluations], inputs, continued=continued)
     failed = ~ok & ~refused
     count = int(failed.sum())
     if count:
@@ -74,6 +75,51 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
             'Count all of them with model.solver.kind = "newton".'
         )
         yield Finding("error" if screened else "warning", text)
+
+
+def of_jumps(
+    evaluations: Sequence[Evaluations], inputs: Inputs | None = None, *, continued: bool = False
+) -> Iterator[Finding]:
+    """Say at how many solves the body has other stable equilibria, and, with `inputs` of one evaluation, where.
+
+    Parameters
+    ----------
+    evaluations, inputs, continued
+        As of `findings`.
+    """
+    total = sum(len(found.points) for found in evaluations)
+    snapped, others = ([found.ok & (found.counted(name) > 0) for found in evaluations] for name in ("snaps", "others"))
+    count, answered = sum(int(one.sum()) for one in snapped), sum(int(found.ok.sum()) for found in evaluations)
+    what = "solves" if inputs is None else "samples"
+    if count:
+        some = continued and count < answered
+        where = ""
+        if inputs is not None and count < answered:
+            (found,), (jumped,) = evaluations, snapped
+            where = f": {separated(inputs, found.points, jumped, found.ok & ~jumped)}"
+        text = (
+            f"At {_share(count, total, what)} the branch of equilibria from rest ends before the whole load, and the "
+            f"body jumps{where}. The state taken there is stable, but where a body that jumps comes to rest is decided "
+            "by its motion, which no statics know; just before the jump it has both states."
+        )
+        if some:
+            text += (
+                " The expansion is smooth where outputs jump: its moments, quantiles and indices cannot be trusted. "
+                'Take plain samples (method.kind = "quasi-monte-carlo", control = "none").'
+            )
+        yield Finding("error" if some else "warning", text)
+    count = sum(int(one.sum()) for one in others)
+    if count:
+        text = (
+            f"At {_share(count, total, what)} at least, the body has another stable equilibrium, which was found "
+            "first. The answers are those that raising the loads from zero leads to; a body with another history may "
+            "be in the other one."
+        )
+        yield Finding("warning", text)
+
+
+def _share(count: int, total: int, what: str) -> str:
+    return f"{count} of {total} {what} ({100 * count / total:.2g} %)"
 
 
 def separated(inputs: Inputs, points: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> str:
@@ -137,6 +183,30 @@ def counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
     if not known.any():
         return {}
     return {one.name.lower(): int((known == one).sum()) for one in Stability}
+
+
+JOINED = ("not looked at", "screened", "audited", "another equilibrium found too", "beyond a jump")
+
+
+def joined(evaluations: Evaluations) -> NDArray[np.int8]:
+    """Return how each state (n,) is known to be joined to rest, as a number of `JOINED`."""
+    levels = [evaluations.counted(name) > 0 for name in ("screens", "audits", "others", "snaps")]
+    known = np.max([(k + 1) * level for k, level in enumerate(levels)], axis=0)
+    return np.asarray(np.where(evaluations.ok, known, 0), dtype=np.int8)
+
+
+def joined_counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
+    """Number of states by `JOINED`; empty if none was looked at."""
+    known = np.concatenate([np.zeros(0, dtype=np.int8), *(joined(found)[found.ok] for found in evaluations)])
+    return {name: int((known == i).sum()) for i, name in enumerate(JOINED)} if known.any() else {}
+
+
+def joined_by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
+    """Return the number (n,) of `JOINED` at points (n, d): the largest of several solves at a point."""
+    known: dict[bytes, int] = {}
+    for point, one in zip(evaluations.points, joined(evaluations).tolist(), strict=True):
+        known[point.tobytes()] = max(one, known.get(point.tobytes(), 0))
+    return np.array([known.get(np.ascontiguousarray(point).tobytes(), 0) for point in points], dtype=np.int8)
 
 
 def by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:

@@ -19,7 +19,7 @@ from forward.model import (
     SolveError,
     gathered,
 )
-from uq.evaluation.request import CompactSum, Evaluations, Failure, FieldSum, Request
+from uq.evaluation.request import CompactSum, Evaluations, Failure, FieldSum, Request, audited
 
 TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
 
@@ -36,14 +36,16 @@ class BlockSolver:
         self._joint = request.joint.on(model) if request.joint is not None else None
         self._together = 1 if request.joint is None else request.joint.size
         self._guess = None if request.start is None else request.start.on(model)
+        self._audited = audited(request.points)
         self._plain = Guess(iterations=request.iterations, derivatives=request.tangents)
 
     def _guessed(self, point: FloatArray) -> Guess:
         """What is known about the solution at a point (d,)."""
+        plain = replace(self._plain, audit=self._audited(point))
         if self._guess is None:
-            return self._plain
-        plain = self._plain
-        return replace(self._guess(point), iterations=plain.iterations, derivatives=plain.derivatives)
+            return plain
+        guess = self._guess(point)
+        return replace(plain, state=guess.state, reference=guess.reference)
 
     def _keep(self, rows: list[FloatArray], row: FloatArray) -> None:
         """Add a row (k, U_local) to the sum, or to the rows of a compact one."""

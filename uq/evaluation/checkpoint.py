@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, Protocol, TypeVar
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
@@ -264,6 +265,11 @@ def load(path: Path, name: str = "/") -> Evaluations:
     return read(path, name)
 
 
+def _counts(work: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return counts (n, k) of an earlier version, which had fewer of them, with zeros for the others."""
+    return np.pad(work, ((0, 0), (0, max(0, len(WORK) - work.shape[1]))))
+
+
 def read(path: Path, name: str = "/") -> Evaluations:
     """Read evaluations from a file whose checksum was verified."""
     try:
@@ -279,7 +285,7 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 np.asarray(file["tangents"]) if "tangents" in file else None,
                 failures,
                 np.asarray(file["seconds"]),
-                np.asarray(file["work"]),
+                _counts(np.asarray(file["work"])),
                 np.asarray(file["residuals"]),
                 np.asarray(file["converged"]),
                 np.asarray(file["stability"]),

@@ -6,6 +6,7 @@ in order. So the result does not depend on which rank computed which block.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import (
+    WORK,
     FloatArray,
     ForwardModel,
     Guess,
@@ -25,6 +27,7 @@ from uq.inputs.coordinates import Coordinates
 
 OWN = ""  # name of the first model of an evaluation
 COMPANY, FEW = 16, 16  # points in a block that begin from predictions, and blocks that there are before it is so large
+AUDITED, ENOUGH = 0.005, 64  # share of samples whose path is followed; from how many samples on at least one is
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
 
@@ -89,6 +92,16 @@ class Evaluations:
     sketches: FloatArray | None = None
     mesh_errors: FloatArray | None = None
     saturations: FloatArray | None = None
+
+    @property
+    def joined(self) -> NDArray[np.bool_]:
+        """Which states (n,) a path of loads from rest leads to without a jump, as far as is known."""
+        return np.asarray(self.counted("snaps") == 0)
+
+    def counted(self, name: str) -> NDArray[np.int64]:
+        """Return one of the counts (n,) in `work`; zeros where it was not counted."""
+        column = WORK.index(name)
+        return self.work[:, column] if column < self.work.shape[1] else np.zeros(len(self.work), dtype=np.int64)
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -160,6 +173,8 @@ class Prediction:
         The coordinates.
     spread
         Standard deviations (d,) of the parameters, for the screen of stability.
+    joined
+        Whether the state at `point` is joined to rest.
     """
 
     point: FloatArray
@@ -167,11 +182,12 @@ class Prediction:
     slopes: FloatArray
     coordinates: Coordinates
     spread: FloatArray | None = None
+    joined: bool = True
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
         state, slopes = scattered(model, self.state[None, :])[0], scattered(model, self.slopes)
-        reference = ReferenceSolution(self.point, state, self.spread)
+        reference = ReferenceSolution(self.point, state, self.spread, self.joined)
         if len(slopes) == 0:
             return lambda _: Guess(state, reference)
         here = self.coordinates.of(self.point)
@@ -181,6 +197,23 @@ class Prediction:
 def company_of(samples: int, most: int = COMPANY) -> int:
     """How many samples that begin from predictions are in one block, of so many in all and at most."""
     return min(most, max(samples // FEW, 1))
+
+
+def _draw(point: FloatArray) -> float:
+    """Return a pseudo-random number in [0, 1) that depends only on a point (d,)."""
+    digest = hashlib.sha256(b"audit" + np.ascontiguousarray(point, dtype=float).tobytes()).digest()
+    return int.from_bytes(digest[:8], "little") / 2.0**64
+
+
+def audited(points: FloatArray) -> Callable[[FloatArray], bool]:
+    """Return which points (d,) of a request for points (n, d) are audited at random (`Guess.audit`).
+
+    That depends on the points alone, so on no ranks and no blocks.
+    """
+    most = AUDITED
+    if len(points) >= ENOUGH:
+        most = max(most, min(map(_draw, points)))
+    return lambda point: _draw(point) <= most
 
 
 @dataclass(frozen=True)

@@ -249,7 +249,7 @@ def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | 
     if first == "tangent" and centre.prediction is not None:
         return centre.prediction
     none = np.zeros((len(centre.point), centre.state.size))
-    return Prediction(centre.point, centre.state, none, centre.coordinates, centre.spread)
+    return Prediction(centre.point, centre.state, none, centre.coordinates, centre.spread, centre.joined)
 
 
 def _of_tangent(centre: Linearisation, count: int) -> _Known:

@@ -183,6 +183,8 @@ class StateExpansion:
         Parameters (d,) of the factor, and the state (U,) there.
     spread
         Standard deviations (d,) of the parameters.
+    joined
+        Whether the state at `point` is joined to rest.
     """
 
     basis: Basis
@@ -190,18 +192,19 @@ class StateExpansion:
     point: FloatArray
     state: FloatArray
     spread: FloatArray
+    joined: bool = True
 
     @classmethod
     def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
         """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
         coefficients = solved(fit, fields[fit.chosen.which])
         coefficients[(basis.indices == 0).all(axis=1)] += centre.state
-        return cls(basis, coefficients, centre.point, centre.state, centre.spread)
+        return cls(basis, coefficients, centre.point, centre.state, centre.spread, centre.joined)
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
         coefficients, state = scattered(model, self.coefficients), scattered(model, self.state[None, :])[0]
-        reference = ReferenceSolution(self.point, state, self.spread)
+        reference = ReferenceSolution(self.point, state, self.spread, self.joined)
         return lambda parameters: Guess(self.basis.at(parameters) @ coefficients, reference)
 
 

@@ -39,6 +39,8 @@ class Linearisation:
         In which predictions are linear.
     spread
         Standard deviations (d,) of the parameters.
+    joined
+        Whether the state is joined to rest.
     """
 
     point: FloatArray
@@ -48,13 +50,14 @@ class Linearisation:
     slopes: FloatArray
     coordinates: Coordinates
     spread: FloatArray
+    joined: bool = True
 
     @property
     def prediction(self) -> Prediction | None:
         """The prediction of the state, linear if there are slopes; None for a model without derivatives."""
         if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
-        return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread)
+        return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread, self.joined)
 
     @property
     def output_slopes(self) -> FloatArray:
@@ -125,7 +128,16 @@ def linearised(
     m, d = len(evaluate.outputs), len(evaluate.parameters)
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
-    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates, inputs.std)
+    return Linearisation(
+        centre,
+        found.outputs[0],
+        tangents,
+        fields[0],
+        fields[1:],
+        inputs.coordinates,
+        inputs.std,
+        bool(found.joined[0]),
+    )
 
 
 def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> xr.Dataset:

@@ -23,6 +23,28 @@ def stability(counts: dict[str, int]) -> str:
     return f"stability of the states: {', '.join(parts)}"
 
 
+def joined(counts: Mapping[str, int], work: Mapping[str, int]) -> str:
+    """Say how states were seen to be joined to rest, and what that took, from `joined` and `work` in summary.json."""
+    audited = sum(counts.values()) - counts["not looked at"] - counts["screened"]
+    found = [
+        *([f"{counts['beyond a jump']:,} beyond a jump"] if counts["beyond a jump"] else []),
+        *(
+            [f"{counts['another equilibrium found too']:,} with another equilibrium"]
+            if counts["another equilibrium found too"]
+            else []
+        ),
+    ]
+    cost = [
+        f"{100 * work[f'audit_{name}'] / work[name]:.2g} % of the {name.replace('_', '-')}"
+        for name in ("residuals", "factorisations", "back_substitutions")
+        if work[name]
+    ]
+    return (
+        f"joined to rest: {audited:,} by following the path, {counts['screened']:,} by the screens only"
+        f"{''.join(f', {one}' for one in found)}; audits took {', '.join(cost)}"
+    )
+
+
 def solves(summary: Mapping[str, Any]) -> int:
     """Return the number of solves, also if several data sets were inverted in parallel."""
     return int(max(summary["evaluations"], summary.get("solves", 0)))

@@ -50,6 +50,8 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
     if "stability" in summary:
         lines.append(words.stability(summary["stability"]))
+    if "joined" in summary:
+        lines.append(words.joined(summary["joined"], summary["work"]))
     if "note" in summary:
         lines.append(summary["note"])
     return "\n".join([*lines, *_said(notes)]) + "\n"

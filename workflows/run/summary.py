@@ -43,7 +43,7 @@ def summarised(
     done = _of_tasks(outcomes, every) if outcomes else _of_solves(study, evaluations)
     seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
-    stability = branch.counts(every)
+    stability, joined = branch.counts(every), branch.joined_counts(every)
     none = np.zeros(len(WORK), dtype=np.int64)
     return {
         "study": name,
@@ -54,6 +54,7 @@ def summarised(
         "findings": [one._asdict() for one in findings(dataset)],
         **done,
         **({"stability": stability} if stability else {}),
+        **({"joined": joined} if joined else {}),
         "wall_seconds": wall,
         "cpu_seconds": seconds * study.parallel.ranks_per_model,
         "work": dict(zip(WORK, sum((found.work.sum(axis=0) for found in every), none).tolist(), strict=True)),

@@ -91,4 +91,5 @@ def at_mean(inputs: Inputs, first: Evaluations | None) -> Prediction | None:
         return None
     if first.tangents is None or first.fields.size == 0:
         return None
-    return Prediction(inputs.mean, first.fields[0], first.fields[:0], inputs.coordinates, inputs.std)
+    joined = bool(first.joined[0])
+    return Prediction(inputs.mean, first.fields[0], first.fields[:0], inputs.coordinates, inputs.std, joined)

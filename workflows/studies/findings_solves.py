@@ -11,6 +11,7 @@ import numpy as np
 from forward.external.derivatives import mistrusted
 from forward.model import Finding, SolveError
 from forward.words import number, with_unit
+from uq.estimators.branch import of_jumps
 from uq.evaluation.block import merge
 from workflows.config.priors import ranges
 
@@ -39,10 +40,12 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
         return []
     mean = study.inputs.mean
     try:
-        found = model.solve(mean).outputs
-        right = better.build(model.equations.comm, model.parameters).solve(mean).outputs
+        solutions = model.solve(mean), better.build(model.equations.comm, model.parameters).solve(mean)
     except SolveError:
         return []
+    if any(solution.work.snaps for solution in solutions):  # not the same branch, so nothing about the form
+        return []
+    found, right = (solution.outputs for solution in solutions)
     units = {output.name: output.unit for output in spec.returned}
     said = [
         f"{name} = {with_unit(number(float(value)), units[name])}, there {with_unit(number(float(other)), units[name])}"
@@ -80,14 +83,18 @@ def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations
 
 
 def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
-    """Say how many solves had parameters without a model: their likelihood is zero, but they did not fail."""
+    """Say how many solves had parameters without a model, and at how many a body has several states.
+
+    The likelihood of parameters without a model is zero, but they did not fail.
+    """
     every = list(evaluations)
+    jumps = list(of_jumps(every))
     lost = [failure for found in every for failure in found.failures if failure.inadmissible]
     if not lost:
-        return []
+        return jumps
     solves = sum(len(found.points) for found in every)
     text = (
         f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
         f"({lost[0].reason}): their likelihood is zero, and they count as answered."
     )
-    return [Finding("note", text)]
+    return [Finding("note", text), *jumps]

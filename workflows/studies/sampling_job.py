@@ -211,6 +211,9 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
         known = branch.by_sample(dataset.points.to_numpy(), evaluations)
         meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
         dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
+        meanings = ", ".join(f"{number}: {name}" for number, name in enumerate(branch.JOINED))
+        joined = branch.joined_by_sample(dataset.points.to_numpy(), evaluations)
+        dataset = dataset.assign(joined=("sample", joined, {"meanings": meanings}))
     return dataset
 
 

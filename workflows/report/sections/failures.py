@@ -9,7 +9,7 @@ from forward.readable import size
 from forward.words import NONE
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import counted, stability
+from workflows.report.words import counted, joined, stability
 
 
 class Failures(Section):
@@ -25,6 +25,9 @@ class Failures(Section):
         yield Heading("Failed solves")
         if "stability" in results.summary:
             yield Text(f"{stability(results.summary['stability']).capitalize()}.")
+        if "joined" in results.summary:
+            said = joined(results.summary["joined"], results.summary["work"])
+            yield Text(f"{said[0].upper()}{said[1:]}.")
         if not listed:
             yield Text("None failed.")
             return

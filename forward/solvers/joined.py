@@ -1,0 +1,263 @@
+"""Whether an equilibrium is joined to rest: whether raising the loads from zero leads to it.
+
+A body may have several stable equilibria under the same loads: an arch that is up or has snapped, a block that is
+turned by 180 degrees through the planes that hold it. Only the path tells which of them it takes. Two paths do: that of
+the loads from zero (`load_steps`), and, from a reference that is joined to rest, the straight line in parameters. Along
+both, a step is taken only if it ends where the tangent predicts it, in a stable state; where no step is short enough
+for that, the branch ends, and what is found beyond is a jump.
+
+Every equilibrium is screened (`strayed`), which costs next to nothing; what a screen calls for, and what is drawn at
+random, is audited (`settled`): the path is followed, and the state that it leads to is the answer
+(docs/decisions/0044-joined-to-rest.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from forward.model import FloatArray, SolveError, Stability
+from forward.solvers.acceptance import Diverged, Unstable
+from forward.solvers.corrections import mix, straight
+from forward.solvers.newton import newton
+from forward.solvers.settings import SolverSettings
+from forward.solvers.steps import Steps
+from forward.solvers.system import Found, System, Way
+
+NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved
+TURNED = np.pi / 4  # angle (rad) by which a node is turned against the prediction
+SAME = 1e-5  # distance of two states that are one, over their size: tolerances of residuals allow for less
+ROUNDING = 1e-7  # distance from a prediction that the solver's tolerance may make, over the size of the state
+STEPS = 4  # in which the way from a reference is followed
+ROUGH = 1e-3  # relative residual of the states on that way
+QUICK = 5  # after a load step with at most this many iterations, the next one is twice as long
+SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
+SHORTEST = 1 / 256  # of the load: a step that is no longer than this and still leaves the prediction is a jump
+LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
+REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
+LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
+
+
+def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatArray) -> str:
+    """Say why a state u may lie on another branch than the one before, from which a tangent predicted it; or nothing.
+
+    Where tools touch the body the tangent predicts little, and only planes are looked at.
+    """
+    system.work.screens += 1
+    if system.crossed(u):
+        return "the body has passed through a plane that holds it"
+    if system.contact:
+        return ""
+    moved, apart = system.norm(u - before), system.norm(u - predicted)
+    if apart > NEAR * moved + ROUNDING * system.norm(u):
+        share = apart / moved if moved > 0 else np.inf
+        return f"its distance from the tangent's prediction is {share:.2g} of the way"
+    angle = system.turned(predicted, u)
+    if angle > TURNED:
+        return f"a node is turned by {np.degrees(angle):.0f}° against the prediction"
+    return ""
+
+
+def same(system: System, u: FloatArray, v: FloatArray) -> bool:
+    """Whether two states are one, to the solver's tolerance."""
+    return system.norm(u - v) <= SAME * max(system.norm(u), system.norm(v))
+
+
+def load_steps(
+    system: System,
+    settings: SolverSettings,
+    zero: FloatArray,
+    history: list[str],
+    *,
+    unstable: bool = False,
+    beyond: FloatArray | None = None,
+) -> Found:
+    """Raise the load from zero along the branch of equilibria from rest; where that ends, jump.
+
+    The whole load is tried first; a step is halved where Newton's method fails or the state is not where the tangent
+    predicts it, and doubled where that is quick. The branch has ended where a step of `SHORTEST` of the load is still
+    too long, or the shortest that settings allow. Beyond, steps are taken wherever Newton's method leads; at most
+    `REFUSALS` of them may fail.
+
+    The load at which an equilibrium was unstable is not tried again until the stable branch has been followed to within
+    `LOCATED` of it: from further away Newton would only find the same state. Once an equilibrium was unstable (at full
+    load, if `unstable` says so), the branch is expected to end: only `REFUSALS` more attempts may fail, and each after
+    the first has `LATE` iterations.
+
+    Parameters
+    ----------
+    beyond
+        A stable equilibrium at full load, which is the answer if the branch from rest ends before.
+
+    Raises
+    ------
+    SolveError
+        With the load fraction where the branch from rest ends and why.
+    """
+    reached, step, refusals = 0.0, 1.0, 0
+    barrier = 1.0 if unstable else np.inf
+    found, near = Found(zero, 0.0), not system.contact
+    refused = Stability.NOT_TESTED
+    ended: tuple[float, FloatArray, Diverged] | None = None  # where the branch from rest does
+    if unstable or system.contact:
+        step = 0.5
+    while reached < 1:
+        load = min(1.0, reached + step)
+        if load >= barrier:
+            load = barrier if barrier - reached <= LOCATED else (reached + barrier) / 2
+        limit = LATE if unstable and reached else None
+        try:
+            there, iterations = _step(system, settings, found.state, history, load, limit, near=near)
+        except Diverged as stop:
+            step = (load - reached) / 2
+            if isinstance(stop, Unstable):
+                barrier, unstable, refused = load, True, max(refused, stop.stability)
+            refusals += unstable or not near
+            smallest = settings.minimum_load_step
+            if unstable:
+                smallest = max(smallest, LOCATED)
+            if near and (step < smallest or 2 * step <= SHORTEST * load):
+                history.append(f"the branch from rest ends at {100 * reached:.4g} % of the load")
+                if beyond is not None:
+                    system.at_load(1.0)
+                    return Found(beyond, 0.0, snapped=True)
+                near, ended, step = False, ended or (reached, found.state, stop), 1.0 - reached
+            if step < smallest or refusals > REFUSALS:
+                last, state, why = ended or (reached, found.state, stop)
+                message = f"stopped at {100 * last:.4g} % of the load{system.in_words(last)}: {why}"
+                jacobian = system.smallest_jacobian(state)
+                if jacobian < SQUEEZED:
+                    message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
+                raise SolveError(message, history, system.work, refused) from None
+            continue
+        found, reached = there, load
+        if reached >= barrier:
+            barrier = np.inf
+        system.work.load_steps += reached < 1 or system.work.load_steps > 0
+        near = not system.contact
+        if iterations <= QUICK:
+            step *= 2
+    return found._replace(snapped=ended is not None)
+
+
+def _step(
+    system: System,
+    settings: SolverSettings,
+    u: FloatArray,
+    history: list[str],
+    load: float,
+    limit: int | None,
+    *,
+    near: bool,
+) -> tuple[Found, int]:
+    """Go from an equilibrium to one at another load, if `near` to where a tangent predicts it; or raise `Diverged`."""
+    there, iterations = newton(system, settings, u, history, load, limit, near=near)
+    why = strayed(system, u, there.predicted if near and there.predicted is not None else there.state, there.state)
+    if why:
+        history.append(f"load {load:.6g}: {why}")
+        raise Diverged(why)
+    return there, iterations
+
+
+def settled(
+    system: System,
+    settings: SolverSettings,
+    zero: FloatArray,
+    found: Found,
+    history: list[str],
+    way: Way | None = None,
+    before: FloatArray | None = None,
+    *,
+    audit: bool = False,
+) -> Steps[Found]:
+    """Return the equilibrium that is joined to rest: the one found, unless an audit ends elsewhere.
+
+    Parameters
+    ----------
+    found
+        A stable equilibrium at full load, with what a tangent predicted for it.
+    way
+        The path from a reference on which it was found.
+    before
+        The state (U_local,) from which it was predicted, if not that of the reference.
+    audit
+        Whether it was drawn at random.
+
+    Raises
+    ------
+    SolveError
+        If the loads cannot be raised, and the state found cannot be the answer.
+    """
+    start = way.state if way is not None else zero if before is None else before
+    if settings.accept_unstable:
+        return found
+    why = strayed(system, start, found.predicted if found.predicted is not None else start, found.state)
+    if way is not None and not way.joined:
+        why = why or "the reference is not joined to rest"
+    if not why and not audit:
+        return found
+    work = system.work
+    spent = replace(work)
+    work.calls += bool(why)
+    work.audits += 1
+    history.append(f"audit: {why or 'drawn at random'}")
+    if way is not None and way.joined and (yield from _leads(system, settings, found, way, history, counted=bool(why))):
+        answer = found
+    else:
+        answer = _from_rest(system, settings, zero, found, history)
+    work.audit_residuals += work.residuals - spent.residuals
+    work.audit_factorisations += work.factorisations - spent.factorisations
+    work.audit_back_substitutions += work.back_substitutions - spent.back_substitutions
+    return answer
+
+
+def _from_rest(system: System, settings: SolverSettings, zero: FloatArray, found: Found, history: list[str]) -> Found:
+    """Follow the loads from rest; return the state there, which is the one found unless both are stable."""
+    beyond = None if system.crossed(found.state) else found.state
+    rest = load_steps(system, settings, zero, history, beyond=beyond)
+    if same(system, rest.state, found.state):
+        return found._replace(snapped=rest.snapped)
+    history.append("audit: the state that is joined to rest is another one")
+    system.work.others += 1
+    return rest
+
+
+def _leads(
+    system: System, settings: SolverSettings, found: Found, way: Way, history: list[str], *, counted: bool
+) -> Steps[bool]:
+    """Whether the straight line in parameters from a reference leads to a state, without loss of stability.
+
+    In `STEPS` steps, corrected with the factor of the reference. Where Lanczos' process does not tell that a state is
+    stable, negative eigenvalues are counted if `counted`; if not, at the end only, as they were for the state found.
+    """
+    slope = (found.state if found.predicted is None else found.predicted) - way.state
+    known: list[tuple[float, FloatArray]] = []
+    try:
+        for k in range(1, STEPS + 1):
+            t = k / STEPS
+            way.at(t)
+            u = system.on_target(straight(way.state, slope, known, t))
+            residual = system.residual(u)
+            if not np.isfinite(residual.size):
+                return False
+            correct = way.corrector(u)
+            tolerance = settings.tolerance if k == STEPS else ROUGH
+            predicted = u
+            mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
+            u, residual = mixed.state, mixed.residual
+            if not mixed.reached or strayed(system, way.state, predicted, u):
+                return False
+            known.append((t, ((u - way.state) / t - slope) / t))
+            last = k == STEPS
+            if last and not same(system, u, found.state):
+                return False
+            if (last and found.stability == Stability.COUNTED) or (yield from way.definite(u, residual)):
+                continue
+            if (counted or last) and system.negative_eigenvalues(u) != 0:
+                return False
+    except SolveError:
+        return False
+    finally:
+        way.at(1.0)
+    return True
