@@ -231,7 +231,7 @@ def _leads(
     In `STEPS` steps, corrected with the factor of the reference. Where Lanczos' process does not tell that a state is
     stable, negative eigenvalues are counted if `counted`; if not, at the end only, as they were for the state found.
     """
-    slope = (found.state if found.predicted is None else found.predicted) - way.state
+    slope = found.state - way.state
     known: list[tuple[float, FloatArray]] = []
     try:
         for k in range(1, STEPS + 1):
