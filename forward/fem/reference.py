@@ -21,6 +21,7 @@ from forward.solvers.steps import Corrector, Steps, finished, through
 from forward.solvers.system import Residual
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
+MANY = 16  # parameters, beyond which no derivatives by all of them are found
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
 
 
@@ -33,6 +34,7 @@ class ReferenceFactor:
         self._rotations = np.empty((3, 3, 0))
         self._reference: ReferenceSolution | None = None
         self._slopes: FloatArray | None = None
+        self._lengths: FloatArray | None = None
         self._vectors: FloatArray | None = None
         self._random: FloatArray | None = None  # forces that Lanczos' process begins with
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
@@ -44,7 +46,7 @@ class ReferenceFactor:
         """
         if self._reference is not None and self._reference.same(reference):
             return False
-        self._reference = self._slopes = self._vectors = None
+        self._reference = self._slopes = self._lengths = self._vectors = None
         equations = self._set(reference)
         self._solver.factorise()
         self._rotations = rotations(equations.gradients())
@@ -55,7 +57,7 @@ class ReferenceFactor:
         """Free the factor, if there is one."""
         if self._reference is not None:
             self._solver.release()
-            self._reference = self._slopes = self._vectors = None
+            self._reference = self._slopes = self._lengths = self._vectors = None
 
     def _set(self, reference: ReferenceSolution) -> Discretisation:
         equations = self._equations
@@ -73,6 +75,14 @@ class ReferenceFactor:
             self._slopes = self._solver.solve(equations.right_sides_of_all())
             equations.work = kept
         return self._slopes
+
+    def lengths(self) -> FloatArray:
+        """Norms (d,) of the derivatives of the state by parameters; zeros where these are more than `MANY`."""
+        assert self._reference is not None
+        if self._lengths is None:
+            d = len(self._reference.parameters)
+            self._lengths = np.zeros(d) if d > MANY else self._equations.norms(self.slopes())
+        return self._lengths
 
     def prepare_screen(self) -> bool:
         """Compute the vectors that show instabilities, unless they exist; this may change parameters and state.
@@ -235,6 +245,8 @@ class WayFromReference:
         Its start.
     joined
         Whether the reference is joined to rest.
+    length
+        What the parameters move the state by, one by one; 0 if that is not known.
     state
         Of the reference.
     rotation
@@ -253,6 +265,7 @@ class WayFromReference:
         screen: bool,
     ) -> None:
         self._screen, self._fraction = screen, 1.0
+        self.length = float(np.linalg.norm((parameters - reference.parameters) * factor.lengths())) if screen else 0.0
         self.draw = draw(parameters)
         self._equations, self._factor = equations, factor
         self._from, self._to = reference.parameters, parameters

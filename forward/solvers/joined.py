@@ -28,7 +28,7 @@ from forward.solvers.system import Found, System, Way
 NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved
 TURNED = np.pi / 4  # angle (rad) by which a node is turned against the prediction
 SAME = 1e-5  # distance of two states that are one, over their size: tolerances of residuals allow for less
-ROUNDING = 1e-7  # distance from a prediction that the solver's tolerance may make, over the size of the state
+FEW = 0.01  # the same over the size of the state, below which no two branches are told apart
 STEPS = 4  # in which the way from a reference is followed
 ROUGH = 1e-3  # relative residual of the states on that way
 QUICK = 5  # after a load step with at most this many iterations, the next one is twice as long
@@ -39,10 +39,13 @@ REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been f
 LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
 
 
-def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatArray) -> str:
+def strayed(
+    system: System, before: FloatArray, predicted: FloatArray, u: FloatArray, length: float | None = None
+) -> str:
     """Say why a state u may lie on another branch than the one before, from which a tangent predicted it; or nothing.
 
-    Where tools touch the body the tangent predicts little, and only planes are looked at.
+    Where tools touch the body the tangent predicts little, and only planes are looked at. Distances from the prediction
+    are compared with the `length` of the way, if that is known to be more than the state has moved.
     """
     system.work.screens += 1
     if system.crossed(u):
@@ -50,7 +53,7 @@ def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatA
     if system.contact:
         return ""
     moved, apart = system.norm(u - before), system.norm(u - predicted)
-    if apart > NEAR * moved + ROUNDING * system.norm(u):
+    if apart > max(NEAR * moved, NEAR * (length or 0.0), FEW * system.norm(u)):
         share = apart / moved if moved > 0 else np.inf
         return f"its distance from the tangent's prediction is {share:.2g} of the way"
     angle = system.turned(predicted, u)
@@ -192,7 +195,8 @@ def settled(
     start = way.state if way is not None else zero if before is None else before
     if settings.accept_unstable:
         return found
-    why = strayed(system, start, found.predicted if found.predicted is not None else start, found.state)
+    predicted = start if found.predicted is None else found.predicted
+    why = strayed(system, start, predicted, found.state, None if way is None else way.length)
     if way is not None and not way.joined:
         why = why or "the reference is not joined to rest"
     if not why and not audit:
@@ -246,7 +250,7 @@ def _leads(
             predicted = u
             mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
             u, residual = mixed.state, mixed.residual
-            if not mixed.reached or strayed(system, way.state, predicted, u):
+            if not mixed.reached or strayed(system, way.state, predicted, u, way.length):
                 return False
             known.append((t, ((u - way.state) / t - slope) / t))
             last = k == STEPS

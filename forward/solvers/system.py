@@ -134,6 +134,10 @@ class Way(Protocol):
         """Whether the reference is joined to rest."""
 
     @property
+    def length(self) -> float:
+        """What the parameters move the state by, one by one: the norm of the norms; 0 if that is not known."""
+
+    @property
     def draw(self) -> float:
         """A number in [0, 1) that depends only on the parameters: eigenvalues are counted if it is small."""
 
