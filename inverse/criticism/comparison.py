@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.criticism.answer import answer, quantiles
 from inverse.criticism.stacking import stacking
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
 from inverse.data.neighbours import Neighbours, neighbours
@@ -304,7 +305,7 @@ def _predictions(
         outputs[:, :m] = evidence.density.outputs[used]  # corrected for the mesh, where that was done
         mean[k] = w @ outputs
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
-        bands[:, k] = np.array([quantiles(column, w) for column in outputs.T]).T
+        bands[:, k] = np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T
     average = P @ mean
     missing = np.full(M - m, np.nan)
     sigma = next(posteriors[name, group].sigma for name in names)
@@ -338,12 +339,10 @@ def _constants(
         for g, group in enumerate(data_groups):
             posterior, assessment = posteriors[name, group], stated[name, group]
             columns = [parameters.index(p) for p in posterior.names]
-            w = assessment.evidence.weights
-            points = posterior.physical(assessment.evidence.density.x)
+            known = answer(posterior, assessment.gaussian, assessment.evidence)
             mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
-            mean[k, g, columns] = w @ points
-            std[k, g, columns] = np.sqrt(w @ (points - w @ points) ** 2)
-            bands[:, k, g, columns] = np.array([quantiles(column, w) for column in points.T]).T
+            mean[k, g, columns], std[k, g, columns] = known.mean, known.std
+            bands[:, k, g, columns] = known.quantiles(QUANTILES).T
     count = max(assessment.evidence.weights.size for assessment in stated.values())
     places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
     for k, name in enumerate(names):
@@ -408,10 +407,3 @@ def _meshes(
         "mesh_shift": ((*dims, "parameter"), shift),
         "mesh_left": ((*dims, "parameter"), left),
     }
-
-
-def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:
-    """Return quantiles of values (n,) at points with weights (n,) of sum 1."""
-    order = np.argsort(values)
-    reached = np.cumsum(weights[order]) - weights[order] / 2
-    return np.interp(levels, reached, values[order])

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.comparison import DRAWS, agreement, quantiles
+from inverse.criticism.answer import quantiles
+from inverse.criticism.comparison import DRAWS, agreement
 from inverse.data.neighbours import Neighbours
 from inverse.fields.field_posterior import Point
 from inverse.fields.low_rank import LowRankPosterior, Spectrum

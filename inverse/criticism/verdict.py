@@ -8,16 +8,18 @@ from typing import Literal
 import numpy as np
 
 from forward.model import FloatArray
+from inverse.criticism.answer import counts
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights
 from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.weights import enough, worth
+from inverse.criticism.weights import enough, fewest, worth
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode
 from inverse.low_dimensional.evidence import Evidence
-from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.laplace import NEAR, Laplace
 
 SHIFT = 0.25  # distance of the mean from the mode, in standard deviations, tolerated for Laplace's Gaussian
+SOME = 3.0  # what weights must be worth for their share to say how many points would be enough
 WIDTH = 0.2  # relative difference of standard deviations tolerated
 
 
@@ -48,14 +50,18 @@ class Verdict:
 
 def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chains: Chains | None = None) -> Verdict:
     """Judge the Gaussian of few parameters by weighted points, the residuals, and chains if there are any."""
-    objection = _objection(gaussian.converged, test)
+    objection = _objection(gaussian.converged, test, gaussian.left)
     if objection is not None:
         return objection
     if found.route == "closed form":
         return Verdict("laplace", found.why)
-    said = worth(found.pareto_k, found.ess, len(found.log_weights))
-    if not found.trusted:
-        return _by_chains(said, chains, enough(found.ess, len(found.log_weights)))
+    n, c = found.density.x.shape
+    said = worth(found.pareto_k, found.ess, n)
+    if not counts(found):
+        needed = fewest(c)
+        if found.trusted:
+            said = f"{said}, fewer than the {needed:.0f} that stand in place of a Gaussian of {c} unknowns"
+        return _by_chains(said, chains, enough(found.ess, n, needed) if found.ess >= SOME else 0)
     w, x = found.weights, found.density.x
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())
@@ -120,9 +126,10 @@ def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, ess
     return Verdict("laplace" if agrees else "corrected", far)
 
 
-def _objection(converged: bool, test: ResidualTest) -> Verdict | None:
+def _objection(converged: bool, test: ResidualTest, left: float = 0.0) -> Verdict | None:
     if not converged:
-        return Verdict("neither", "the search for the mode did not converge")
+        far = f": its next step would move an unknown by up to {left:.2g} standard deviations" if left > np.sqrt(NEAR) else ""
+        return Verdict("neither", f"the search for the mode did not converge{far}")
     if test.probability < 0.01:
         why = f"the model does not explain the data: |r|² = {test.square:.4g} where {test.degrees:.4g} is expected"
         return Verdict("neither", f"{why} (probability {test.probability:.1g})")
@@ -134,7 +141,8 @@ def _objection(converged: bool, test: ResidualTest) -> Verdict | None:
 
 def _by_chains(worth: str, chains: Chains | None, samples: int) -> Verdict:
     if chains is None:
-        return Verdict("neither", f"{worth}; take method.samples = {samples}, or run chains (method.chains)")
+        more = f"take method.samples = {samples}, or run chains" if samples else "more of them will not do: run chains"
+        return Verdict("neither", f"{worth}; {more} (method.chains)")
     said = _said(chains)
     if chains.mixed:
         return Verdict("corrected", f"{worth}, but chains agree: {said}")

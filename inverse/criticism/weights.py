@@ -15,6 +15,7 @@ from forward.model import FloatArray
 TRUSTED = 0.7  # k̂ up to which weights can be trusted
 ALIKE = 0.8  # effective share above which weights are practically equal
 FEWEST = 20.0  # effective sample size below which weights say nothing
+PER_UNKNOWN = 2.0  # points that weights must be worth for each unknown, to stand in place of a Gaussian
 MORE = 4.0  # times the points
 RULE = (
     f"Weights are to be trusted where they are worth {FEWEST:.0f} points or more, and k̂ is {TRUSTED:g} or less or more "
@@ -26,6 +27,35 @@ def normalised(log_weights: FloatArray) -> FloatArray:
     """Return weights (n,) of sum 1 from their logarithms up to a constant."""
     w = np.exp(log_weights - log_weights.max())
     return np.asarray(w / w.sum())
+
+
+def distinct(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the weights (k,) of the k different ones among points (n, c), those of copies added.
+
+    Points that were drawn several times from a cloud of others have told the posterior once only.
+    """
+    _, which = np.unique(points, axis=0, return_inverse=True)
+    return np.asarray(np.bincount(which.ravel(), weights), dtype=float)
+
+
+def quality(points: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    """Return what weights (n,) of points (n, c) are worth, and k̂: those of the distinct points.
+
+    Where copies cost less than a fifth of the worth, k̂ is that of the points as they were drawn: a few pairs among
+    even weights look like a tail that is not there.
+    """
+    counted = distinct(points, weights)
+    ess = effective_sample_size(counted)
+    few = ess >= ALIKE * effective_sample_size(weights)
+    return ess, pareto_shape(weights if few else counted)
+
+
+def fewest(size: int) -> float:
+    """Return how many points weighted ones must be worth to stand in place of a Gaussian of as many unknowns.
+
+    A covariance of fewer points than unknowns is singular, and of twice as many still off by a third.
+    """
+    return max(FEWEST, PER_UNKNOWN * size)
 
 
 def effective_sample_size(weights: FloatArray) -> float:
@@ -45,13 +75,13 @@ def worth(pareto_k: float, ess: float, count: int) -> str:
     return f"weights worth {ess:.0f} of {count} points, k̂ = {shape}"
 
 
-def enough(ess: float, count: int) -> int:
+def enough(ess: float, count: int, needed: float = FEWEST) -> int:
     """Return how many points to try where the weights of `count` points cannot be trusted, a multiple of 32.
 
     Four times as many, since points that are drawn from what the others have told become better too, or as many as
-    would be worth enough if they did not.
+    would be worth the number that is needed if they did not.
     """
-    return int(32 * np.ceil(count * max(MORE, FEWEST / max(ess, 1.0)) / 32))
+    return int(32 * np.ceil(count * max(MORE, needed / max(ess, 1.0)) / 32))
 
 
 def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:

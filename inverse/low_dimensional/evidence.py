@@ -10,27 +10,38 @@ weight of a scramble is an unbiased estimate of Z; their scatter gives the error
 measured by the effective sample size (Σw)²/Σw² and the shape k̂ of their tail (A. Vehtari et al., J. Mach. Learn. Res.
 25 (2024) 72): above 0.7 they cannot be trusted.
 
-The first quarter of the points decides. If the posterior is a Gaussian up to rounding, Laplace's formula is the answer.
-If the weights are even, the other points are drawn from the same mixture. Otherwise a polynomial is fitted to the
-points (`inverse.low_dimensional.surrogate`), the next quarter is drawn from the posterior of the polynomial, and so on.
-Then all points are weighted by the mixture of all the densities they were drawn from (adaptive multiple importance
-sampling: J.-M. Cornuet et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the polynomials are right,
-and none is large where they are wrong and the first mixture was not.
+The first quarter of the points decides. In so many unknowns that few points of the mixture would count it is drawn from
+Student's t about the mode instead (`inverse.low_dimensional.proposals`). If the posterior is a Gaussian up to rounding,
+Laplace's formula is the answer, and half of the points are draws of it. If the weights are even, the other points are
+drawn from the same density, or, in many unknowns, from Laplace's Gaussian if the weights of the first points tell that
+its points are worth more. Otherwise a polynomial is fitted to the points (`inverse.low_dimensional.surrogate`), the
+next quarter is drawn from the posterior of the polynomial, and so on, unless that quarter turns out to be worth less
+than the better one. All points are weighted by the mixture of all the densities they were drawn from (adaptive multiple
+importance sampling: J.-M. Cornuet et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the proposals are
+right, and none is large where they are wrong and the first one was not. Points that were drawn several times count
+once, with the weights of all (`inverse.criticism.weights.quality`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from inverse.criticism.weights import TRUSTED, normalised, pareto_shape, trustworthy
+from inverse.criticism.weights import (
+    FEWEST,
+    TRUSTED,
+    normalised,
+    quality,
+    trustworthy,
+)
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.low_dimensional.surrogate import SCRAMBLES, Mixture, fit, sample
+from inverse.low_dimensional.proposals import Mixture, Proposal, about, first, joint
+from inverse.low_dimensional.surrogate import SCRAMBLES, affordable, fit, sample, terms
 from uq.inputs.sampling import sobol_points
 
 EVEN = 0.6  # effective share of the first points from which the Gaussian is good enough for the others
@@ -52,9 +63,9 @@ class Evidence:
     route
         How it was found, and `why`.
     ess
-        Effective sample size of the points.
+        Effective sample size of the distinct points.
     pareto_k
-        k̂ of the largest weights; infinite if there are too few points.
+        k̂ of their largest weights; infinite if there are too few points.
     density
         The posterior at the points.
     log_weights
@@ -73,7 +84,8 @@ class Evidence:
     @property
     def trusted(self) -> bool:
         """Whether the estimate can be trusted."""
-        return self.route == "closed form" or trustworthy(self.pareto_k, self.ess, len(self.log_weights))
+        different = len(np.unique(self.density.x, axis=0))
+        return self.route == "closed form" or trustworthy(self.pareto_k, self.ess, different)
 
     @property
     def weights(self) -> FloatArray:
@@ -112,27 +124,54 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         message = f"{samples} samples, expected at least {LEAST}"
         raise ValueError(message)
     quarter = samples // LEAST * SCRAMBLES
-    mixture = Mixture.of(gaussian)
-    first = _drawn(posterior, mixture, seed, 0, quarter, derivatives=True)
-    pilot = weighed(*first, "importance", "")
-    misfit = np.abs(_from_gaussian(gaussian, pilot.density))
-    even = pilot.ess / quarter
-    share = f"the first {quarter} points are worth {pilot.ess:.0f}"
-    # Where the model is not defined the likelihood is zero, and the posterior not Gaussian; ∞ − ∞ must not pass.
-    everywhere = np.isfinite(pilot.density.log_posterior).all()
-    if everywhere and (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
-        near = misfit[pilot.weights > 1e-6 / quarter]
-        whole = _continued(posterior, mixture, first, seed, quarter)
-        why = "the posterior is Gaussian at every point that was tried"
-        return replace(whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why)
-    if even >= EVEN and pilot.pareto_k <= TRUSTED:
-        whole = _continued(posterior, mixture, first, seed, quarter)
-        return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights")
+    opening = first(gaussian)
+    derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
+    pilot = [_drawn(posterior, opening, seed, 0, quarter, derivatives=derivatives)]
+    drawn = _weighted(pilot, "importance", "")
+    share = f"the first {quarter} points are worth {drawn.ess:.0f}"
+    _, student, normal = about(gaussian)
+    if _is_gaussian(gaussian, drawn.density):
+        pilot.append(_drawn(posterior, opening, seed, quarter, 2 * quarter, derivatives=False))
+        whole = _continued(posterior, pilot, normal, seed, quarter, "")
+        if _is_gaussian(gaussian, whole.density):
+            misfit = np.abs(_from_gaussian(gaussian, whole.density))
+            near = float(misfit[whole.weights > 1e-6 / len(misfit)].max())
+            why = "the posterior is Gaussian at every point that was tried"
+            return replace(whole, log_evidence=gaussian.log_evidence, error=near, route="closed form", why=why)
+        return replace(whole, why=f"{share}: nearly Gaussian")
+    expected = {one: _expected(drawn, opening, one) for one in (opening, student, normal)}
+    best = max(expected, key=lambda one: expected[one])
+    if isinstance(opening, Mixture):
+        # The others would see no more of what is far from the mode; polynomials do, and are right in few unknowns.
+        if drawn.ess >= EVEN * quarter and drawn.pareto_k <= TRUSTED:
+            return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights")
+    elif expected[best] >= EVEN:
+        name = "Laplace's Gaussian" if best is normal else "Student's t about the mode"
+        share += f", and all, with others from {name}, would be worth {100 * expected[best]:.0f} % of their number"
+        return _continued(posterior, pilot, best, seed, quarter, share)
     try:
-        return _by_surrogate(posterior, mixture, first[0], gaussian, seed, quarter, f"{share}: uneven weights")
+        return _by_surrogate(posterior, pilot, gaussian, seed, quarter, f"{share}: uneven weights", expected[best])
     except SolveError as error:
-        whole = _continued(posterior, mixture, first, seed, quarter)
-        return weighed(whole.density, whole.log_weights, "importance", f"{share}; {error}")
+        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Solved points, and the density they were drawn from: ln of it over that of the prior, at points (n, c)."""
+
+    density: Density
+    log_over_prior: Callable[[FloatArray], FloatArray]
+
+
+def _weighted(parts: Sequence[_Part], route: Route, why: str) -> Evidence:
+    """Weight all points by the mixture of the densities they were drawn from, eight replicates in order."""
+    replicate = np.concatenate([np.arange(n) // (n // SCRAMBLES) for n in (len(part.density.x) for part in parts)])
+    density = Density.joined([part.density for part in parts], np.argsort(replicate, kind="stable"))
+    counts: dict[Callable[[FloatArray], FloatArray], int] = {}
+    for part in parts:
+        counts[part.log_over_prior] = counts.get(part.log_over_prior, 0) + len(part.density.x)
+    log_over = joint(list(counts), [n / len(density.x) for n in counts.values()], density.x)
+    return weighed(density, density.log_likelihood - log_over, route, why)
 
 
 def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -> Evidence:
@@ -145,31 +184,26 @@ def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -
     means = w.reshape(SCRAMBLES, -1).mean(axis=1)
     total = float(means.mean())
     error = float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / total)
-    ess = float(w.sum() ** 2 / (w**2).sum())
     log_evidence = float(shift + np.log(total))
-    return Evidence(log_evidence, error, route, why, ess, pareto_shape(w), density, log_weights)
+    ess, pareto_k = quality(density.x, normalised(log_weights))
+    return Evidence(log_evidence, error, route, why, ess, pareto_k, density, log_weights)
 
 
-def _drawn(
-    posterior: Posterior, mixture: Mixture, seed: int, start: int, stop: int, *, derivatives: bool
-) -> tuple[Density, FloatArray]:
-    """Solve at points number `start` to `stop` of a mixture, for all scrambles together; return ln w too."""
-    c = mixture.centres.shape[1]
+def _drawn(posterior: Posterior, proposal: Proposal, seed: int, start: int, stop: int, *, derivatives: bool) -> _Part:
+    """Solve at points number `start` to `stop` of a proposal, for all scrambles together."""
+    c = len(posterior.names)
     ends = (start // SCRAMBLES, stop // SCRAMBLES)
-    x = mixture.draw(np.concatenate([sobol_points(seed, r, *ends, c + 1) for r in range(SCRAMBLES)]))
-    density = posterior.at(x, derivatives=derivatives)
-    return density, density.log_likelihood - mixture.log_over_prior(x)
+    x = proposal.draw(np.concatenate([sobol_points(seed, r, *ends, c + 1) for r in range(SCRAMBLES)]))
+    return _Part(posterior.at(x, derivatives=derivatives), proposal.log_over_prior)
 
 
 def _continued(
-    posterior: Posterior, mixture: Mixture, first: tuple[Density, FloatArray], seed: int, quarter: int
+    posterior: Posterior, parts: Sequence[_Part], proposal: Proposal, seed: int, quarter: int, why: str
 ) -> Evidence:
-    """Draw the other three quarters."""
-    rest = _drawn(posterior, mixture, seed, quarter, 4 * quarter, derivatives=False)
-    replicate = np.concatenate([np.arange(n) // (n // SCRAMBLES) for n in (quarter, 3 * quarter)])
-    order = np.argsort(replicate, kind="stable")
-    density = Density.joined([first[0], rest[0]], order)
-    return weighed(density, np.concatenate([first[1], rest[1]])[order], "importance", "")
+    """Draw all quarters that are left from a proposal."""
+    done = sum(len(part.density.x) for part in parts)
+    rest = _drawn(posterior, proposal, seed, done, QUARTERS * quarter, derivatives=False)
+    return _weighted([*parts, rest], "importance", why)
 
 
 def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
@@ -179,25 +213,59 @@ def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
     return np.asarray(density.log_posterior - quadratic)
 
 
+def _is_gaussian(gaussian: Laplace, density: Density) -> bool:
+    """Whether the posterior is the Gaussian at all points, up to rounding."""
+    # Where the model is not defined the likelihood is zero, and the posterior not Gaussian; ∞ − ∞ must not pass.
+    if not np.isfinite(density.log_posterior).all():
+        return False
+    return bool((np.abs(_from_gaussian(gaussian, density)) <= ROUNDED * (1 + np.abs(density.log_posterior))).all())
+
+
+def _expected(drawn: Evidence, opening: Proposal, proposal: Proposal) -> float:
+    """Share that all points would be worth if the other quarters were drawn from a proposal; 0 if too few tell.
+
+    Of points of a density q with weights w = p/q, the share is (Σw)²/(n Σ w w'), w' = p/q' the weights in the mixture
+    q' of a quarter of q and three of the proposal.
+    """
+    if drawn.ess < FEWEST:
+        return 0.0
+    densities = (opening.log_over_prior, proposal.log_over_prior)
+    over = joint(densities, (1 / QUARTERS, 1 - 1 / QUARTERS), drawn.density.x)
+    top = drawn.log_weights.max()
+    plain, mixed = np.exp(drawn.log_weights - top), np.exp(drawn.density.log_likelihood - over - top)
+    return float(plain.mean() ** 2 / (plain * mixed).mean())
+
+
 def _by_surrogate(
-    posterior: Posterior, mixture: Mixture, first: Density, gaussian: Laplace, seed: int, quarter: int, why: str
+    posterior: Posterior,
+    pilot: Sequence[_Part],
+    gaussian: Laplace,
+    seed: int,
+    quarter: int,
+    why: str,
+    otherwise: float,
 ) -> Evidence:
-    """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones."""
-    parts = [first]
-    over: list[Callable[[FloatArray], FloatArray]] = [mixture.log_over_prior]
-    errors = []
+    """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones.
+
+    Raises
+    ------
+    SolveError
+        If polynomials are not affordable, or what they say is worth less than the share expected otherwise.
+    """
+    d, parts, errors = len(posterior.inputs.names), list(pilot), []
+    if not affordable(d):
+        message = f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted"
+        raise SolveError(message)
     for k in range(1, QUARTERS):
-        cloud = sample(fit(posterior, Density.joined(parts)), gaussian, seed + 100 * k)
-        parts.append(posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1))
-        over.append(cloud.log_over_prior)
+        cloud = sample(fit(posterior, Density.joined([part.density for part in parts])), gaussian, seed + 100 * k)
+        picked = posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1)
+        parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)
-    replicate = np.concatenate([np.arange(quarter) // (quarter // SCRAMBLES)] * QUARTERS)
-    density = Density.joined(parts, np.argsort(replicate, kind="stable"))
-    densities = np.array([log_over_prior(density.x) for log_over_prior in over])
-    top = densities.max(axis=0)
-    log_over = top + np.log(np.exp(densities - top).mean(axis=0))
-    found = weighed(density, density.log_likelihood - log_over, "surrogate", why)
+        found = _weighted(parts, "surrogate", why)
+        if k == 1 and found.ess < otherwise * len(found.log_weights):
+            message = f"a polynomial makes them worth {found.ess:.0f} of {len(found.log_weights)}"
+            raise SolveError(message)
     # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density with a
     # wrong factor makes its share of the mixture wrong by that factor.
-    scatter = max(found.error, np.sqrt(1 / found.ess - 1 / len(density.x)))
+    scatter = max(found.error, np.sqrt(max(1 / found.ess - 1 / len(found.log_weights), 0.0)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))

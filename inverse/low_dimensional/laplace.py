@@ -1,7 +1,11 @@
 """The mode of a posterior and Laplace's Gaussian there: few parameters, in standard normal coordinates.
 
 The mode is found by Gauss–Newton steps of limited length (K. Levenberg, Quart. Appl. Math. 2 (1944) 164–168; D. W.
-Marquardt, J. SIAM 11 (1963) 431–441), from several starts. There −ln p(y | x) + ½|x|² ≈ Φ̂ + ½ δᵀH δ, so that
+Marquardt, J. SIAM 11 (1963) 431–441), from several starts. Near a mode where residuals are large and outputs are curved
+these steps only crawl: each leaves a share of the distance that does not fall. The best end is therefore reached by
+Newton's steps, with the second derivatives that are needed there anyway. A search has converged if its next step would
+move no unknown, nor any combination of them, by more than a thousandth of its standard deviation. There
+−ln p(y | x) + ½|x|² ≈ Φ̂ + ½ δᵀH δ, so that
 
     x ~ N(x̂, H⁻¹),   ln Z ≈ −Φ̂ − ½ ln det H,
 
@@ -15,13 +19,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.posterior import Density, Posterior
 from uq.inputs.sampling import sobol_points
 
 STEPS = 50
+NEWTON = 8  # steps with second derivatives from the best end
 CLOSE = 1e-13  # squared Newton decrement that ends the search: twice the error of the log density
+NEAR = 1e-6  # of a search that has converged: its root is the largest move of any unknown, in standard deviations
+CRAWLING, CRAWLED = 0.25, 1e-4  # share of the decrement that a step leaves, and decrement, from which on Newton's go on
 FARTHEST = 3.0  # length of a step, in standard deviations of the prior
 STIFFER, SOFTER = 8.0, 3.0
+HALVED = 20  # times that a step of Newton is halved
+ROUNDED = 1e-12  # gain over the log posterior that is rounding
 DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
 
 
@@ -51,6 +60,8 @@ class Laplace:
         ψ (m,) at the mode.
     converged
         Whether the search ended at a stationary point.
+    left
+        How far, in standard deviations, the next step would move the combination of unknowns that it moves most.
     steps
         The iterations of all starts.
     modes
@@ -65,6 +76,7 @@ class Laplace:
     steps: tuple[Step, ...]
     modes: FloatArray
     ends: FloatArray
+    left: float
 
     @property
     def log_evidence(self) -> float:
@@ -112,7 +124,7 @@ def laplace(
     c = len(posterior.names)
     # Every coordinate of a start is within a standard deviation or two: in the far tails models have no answer.
     others = ndtri(0.05 + 0.9 * sobol_points(seed, 0, 0, starts - 1, c)) if starts > 1 else np.zeros((0, c))
-    ends: list[tuple[FloatArray, float, bool]] = []
+    ends: list[Density] = []
     steps: list[Step] = []
     for number, x in enumerate(np.vstack([np.zeros(c) if first is None else first, others])):
         found = _climb(posterior, x, number, steps)
@@ -121,37 +133,64 @@ def laplace(
     if not ends:
         message = f"the model has no answer at any of the {starts} starts of the search for the mode"
         raise SolveError(message)
-    best, value, converged = max(ends, key=lambda end: end[1])
-    here = posterior.at(best[None, :], derivatives=True)
-    hessian = here.curvature[0]
+    values = np.array([float(end.log_posterior[0]) for end in ends])
+    best = int(values.argmax())
+    here = ends[best]
+    hessian = _positive(here.curvature[0])
     if exact:
-        hessian = _differences(posterior, best, hessian)
+        here, hessian = _newton(posterior, here, best, steps)
+    gradient = here.gradient[0]
+    left = float(np.sqrt(gradient @ np.linalg.solve(hessian, gradient)))
+    values[best] = here.log_posterior[0]
     return Laplace(
-        best,
-        value,
-        hessian,
+        here.x[0],
+        float(here.log_posterior[0]),
+        hessian if exact else here.curvature[0],
         here.outputs[0],
-        converged,
+        left <= np.sqrt(NEAR) or left**2 <= ROUNDED * abs(values[best]),
         tuple(steps),
-        np.array([end[0] for end in ends]),
-        np.array([end[1] for end in ends]),
+        np.array([(here if k == best else end).x[0] for k, end in enumerate(ends)]),
+        values,
+        left,
     )
 
 
-def _climb(
-    posterior: Posterior, x: FloatArray, number: int, steps: list[Step]
-) -> tuple[FloatArray, float, bool] | None:
+def _newton(posterior: Posterior, here: Density, number: int, steps: list[Step]) -> tuple[Density, FloatArray]:
+    """Go on with Newton's steps, shortened until they climb; return where they end, and second derivatives there."""
+    for _ in range(NEWTON):
+        hessian = _differences(posterior, here.x[0], here.curvature[0])
+        gradient, value = here.gradient[0], float(here.log_posterior[0])
+        step = -np.linalg.solve(hessian, gradient)
+        decrement = float(-gradient @ step)
+        if decrement < max(CLOSE, ROUNDED * abs(value)):
+            break
+        step *= min(1.0, FARTHEST / float(np.linalg.norm(step)))
+        for _ in range(HALVED):
+            there = posterior.at(here.x + step, derivatives=True)
+            if float(there.log_posterior[0]) > value:
+                break
+            step /= 2
+        else:
+            break
+        here = there
+        steps.append(Step(number, float(here.log_posterior[0]), decrement, 0.0))
+    return here, hessian
+
+
+def _climb(posterior: Posterior, x: FloatArray, number: int, steps: list[Step]) -> Density | None:
+    """Climb from x (c,) by Gauss–Newton steps until they end or crawl; None where the model has no answer at x."""
     here = posterior.at(x[None, :], derivatives=True)
     if not np.isfinite(here.log_likelihood[0]):
         return None
-    damping = 0.0
+    damping, before = 0.0, np.inf
     for _ in range(STEPS):
         gradient, curvature = here.gradient[0], _positive(here.curvature[0])
         decrement = float(gradient @ np.linalg.solve(curvature, gradient))
         value = float(here.log_posterior[0])
         steps.append(Step(number, value, decrement, damping))
-        if decrement < CLOSE:
-            return here.x[0], value, True
+        if decrement < CLOSE or CRAWLING * before < decrement < CRAWLED:
+            return here
+        before = decrement
         for _ in range(STEPS):
             step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
             step *= min(1.0, FARTHEST / float(np.linalg.norm(step)))
@@ -160,15 +199,15 @@ def _climb(
             expected = float(-gradient @ step - step @ curvature @ step / 2)
             if gain > 1e-4 * expected:
                 break
-            if abs(expected) < 1e-12 * abs(value):  # rounding
-                return here.x[0], value, True
+            if abs(expected) < ROUNDED * abs(value):
+                return here
             damping = max(STIFFER * damping, 1e-2)
         else:
-            return here.x[0], value, False
+            return here
         if gain > 0.5 * expected:
             damping = damping / SOFTER if damping > 1e-3 else 0.0
         here = there
-    return here.x[0], float(here.log_posterior[0]), False
+    return here
 
 
 def _positive(matrix: FloatArray) -> FloatArray:

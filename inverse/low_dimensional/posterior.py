@@ -157,6 +157,15 @@ class Posterior:
             return values
         return np.column_stack([values, self.noise.from_normal(x[:, d])[0]])
 
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """Return the derivatives (n, c, c) of the parameters, and of s if it is unknown, by x (n, c)."""
+        d, (n, c) = len(self.inputs.names), x.shape
+        found = np.zeros((n, c, c))
+        found[:, :d, :d] = self.inputs.from_normals(x[:, :d])[1]
+        if self.noise is not None:
+            found[:, d, d] = self.noise.from_normal(x[:, d])[1]
+        return found
+
     @cached_property
     def whitening(self) -> Whitening:
         """What makes the errors independent."""
@@ -171,15 +180,18 @@ class Posterior:
         """Return independent residuals (n, m) of corrected outputs (n, m) at x (n, c)."""
         return self.whitening((outputs - self.data) / self.scale(x))
 
-    def sensitivities(self, at: Density) -> FloatArray:
-        """Return derivatives (n, m, d) of these residuals by the normal coordinates of the parameters."""
+    def output_slopes(self, at: Density) -> FloatArray:
+        """Return derivatives (n, m, d) of the corrected outputs by the normal coordinates of the parameters."""
         assert at.tangents is not None
         which = slice(None) if self.which is None else list(self.which)
         tangents = at.tangents[:, which]
         if self.mesh is not None and self.mesh.slopes.size:
             tangents = tangents + self.mesh.slopes
-        slopes = self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1]
-        A = tangents @ slopes / self.scale(at.x)[:, :, None]
+        return np.asarray(tangents @ self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1])
+
+    def sensitivities(self, at: Density) -> FloatArray:
+        """Return derivatives (n, m, d) of these residuals by the normal coordinates of the parameters."""
+        A = self.output_slopes(at) / self.scale(at.x)[:, :, None]
         return np.swapaxes(self.whitening(np.swapaxes(A, 1, 2)), 1, 2)
 
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:

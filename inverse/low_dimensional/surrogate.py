@@ -11,6 +11,7 @@ et al., Stat. Comput. 18 (2008) 447–459).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from forward.model import WORK, FloatArray, SolveError
 from inverse.criticism.weights import effective_sample_size, normalised
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
+from inverse.low_dimensional.proposals import WIDER, Mixture
 from uq.evaluation.request import Evaluations, Failure, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Normal
@@ -32,13 +34,12 @@ NEAR = 0.5  # effective sample size of the weights of the fit, over the number o
 COUNTED = 1e-3  # weight, over the largest, from which a point counts as within the range of the polynomial
 MARGIN = 0.3  # added on either side of the box of these points, over its size
 BEYOND = "outside the range of the polynomial"
-WIDER = 1.3  # τ: standard deviations of the first proposal over those of Laplace
-SHARE = 0.7  # α: share of the points from the Gaussians; the others are from the prior
 CENTRES = 64
 REACH = 0.4  # largest width of a Gaussian in the mixture, in standard deviations of the prior
 SCRAMBLES = 8
 FIRST, LAST = 2**11, 2**13  # points in the first clouds and in the last one
 ROUNDS = 4
+MOST_TERMS = 500  # of degree 2: beyond 30 unknowns a cloud is worth few of its points, and a fit takes minutes
 ENOUGH = 0.2  # effective share of a cloud from which no better proposal is needed
 
 
@@ -99,6 +100,16 @@ class Surrogate:
             np.zeros(n, dtype=np.int8),
             np.zeros((0, 0)),
         )
+
+
+def terms(size: int, degree: int) -> int:
+    """Return the number of polynomials of at most a degree in `size` variables."""
+    return comb(size + degree, degree)
+
+
+def affordable(size: int) -> bool:
+    """Whether outputs are fitted by polynomials of as many unknowns, of degree 2 at least."""
+    return terms(size, 2) <= MOST_TERMS
 
 
 def fit(posterior: Posterior, solved: Density) -> Posterior:
@@ -189,47 +200,6 @@ def _tempered(log_density: FloatArray, least: float) -> FloatArray:
         power = (low + high) / 2
         low, high = (power, high) if 1 / (weights(power) ** 2).sum() >= least else (low, power)
     return weights(low)
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """Gaussians of equal weight and the prior: a proposal.
-
-    Attributes
-    ----------
-    centres
-        (k, c).
-    roots
-        L (k, c, c), with L Lᵀ the covariances.
-    """
-
-    centres: FloatArray
-    roots: FloatArray
-
-    @classmethod
-    def of(cls, gaussian: Laplace) -> Mixture:
-        """Return the mixture of Laplace's Gaussian, widened, and the prior."""
-        return cls(gaussian.mode[None, :], WIDER * gaussian.root[None, :, :])
-
-    def draw(self, cubes: FloatArray) -> FloatArray:
-        """Map points (n, c + 1) of the unit cube to points (n, c): the first number chooses the component."""
-        from scipy.special import ndtri
-
-        z = ndtri(cubes[:, 1:])
-        which = np.minimum((cubes[:, 0] / SHARE * len(self.centres)).astype(int), len(self.centres) - 1)
-        x = self.centres[which] + np.einsum("zij,zj->zi", self.roots[which], z)
-        return np.where((cubes[:, 0] < SHARE)[:, None], x, z)
-
-    def log_over_prior(self, x: FloatArray) -> FloatArray:
-        """Ln of the density at x (n, c) over that of the prior, (n,)."""
-        log_prior = -(x**2).sum(axis=1) / 2
-        parts = []
-        for centre, root in zip(self.centres, self.roots, strict=True):
-            deviation = (x - centre) @ np.linalg.inv(root).T
-            parts.append(-(deviation**2).sum(axis=1) / 2 - np.linalg.slogdet(root)[1])
-        top = np.max(parts, axis=0)
-        gaussians = top + np.log(np.exp(np.array(parts) - top).mean(axis=0))
-        return np.asarray(np.logaddexp(np.log(SHARE) + gaussians - log_prior, np.log(1 - SHARE)))
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, assert_never
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
+from inverse.criticism.answer import Answer, answer, by_gaussian, gaussian_points
 from inverse.criticism.chains import Chains, chains_of_few, ensemble
-from inverse.criticism.comparison import quantiles
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
@@ -26,11 +26,12 @@ from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
-from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import before_few, corrected_few
 from inverse.methods.record import (
     ENDS,
+    SOURCES,
     TRUST,
     Data,
     Record,
@@ -45,13 +46,11 @@ from inverse.methods.record import (
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Request, Start
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import linearise
 
 if TYPE_CHECKING:
     import xarray as xr
 
-DRAWS = 4096  # of Laplace's Gaussian, to map it to physical parameters
 Look = Callable[[FloatArray], FloatArray]  # parameters (n, d) → ln of the stiffness factor (n, N) at the vertices
 
 
@@ -195,7 +194,7 @@ def inverted(
         treatment = method.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, finer, data.spread, treatment)
     best = posterior.physical(gaussian.mode[None])[0]
-    found = evidence(posterior, gaussian, method.solves(field=False) or LEAST, seed=method.seed)
+    found = evidence(posterior, gaussian, method.solves(len(best), field=False) or LEAST, seed=method.seed)
     at = posterior.at(gaussian.mode[None], derivatives=True)
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
@@ -204,19 +203,9 @@ def inverted(
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
     chains = _chains(posterior, gaussian, found, method)
     verdict = verdict_on_few(gaussian, found, test, chains)
-    if chains is not None and chains.mixed:
-        which = slice(None) if data.which is None else list(data.which)
-        points = chains.flat
-        weights = np.full(len(points), 1 / len(points))
-        draws = _thinned(chains, method.draws)
-        outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs[:, which]
-        if posterior.mesh is not None:
-            outputs = outputs + posterior.mesh.at(draws[:, :d])
-    else:
-        weights, points = found.weights, posterior.physical(found.density.x)
-        chosen = resampled(weights, method.draws, method.seed)
-        draws, outputs = points[chosen], found.density.outputs[chosen]
-    moments = _moments(posterior, gaussian, weights, points, look)
+    known = answer(posterior, gaussian, found, chains)
+    drawn = _drawn(posterior, gaussian, found, known, chains, at, method)
+    moments = _moments(posterior, gaussian, known, drawn, look)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),
@@ -225,9 +214,11 @@ def inverted(
         **of_motions(spectrum, posterior.whitening, posterior.shared, root),
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
-        **_draws(posterior, draws, outputs),
-        **_points(points, weights, draws, chains),
-        **of_chains(chains),
+        **_draws(posterior, drawn.draws, drawn.outputs),
+        "point": drawn.points,
+        "point_weight": drawn.weights,
+        "source": np.array(SOURCES.index(known.source)),
+        **of_chains(chains, used=known.source == "chains"),
         "mode": best,
         "log_evidence": np.array(found.log_evidence),
         "log_evidence_error": np.array(found.error),
@@ -261,41 +252,73 @@ def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: In
             assert_never(method.chains)
 
 
-def _moments(
-    posterior: Posterior, gaussian: Laplace, weights: FloatArray, points: FloatArray, look: Look | None
-) -> Record:
-    """Moments and quantiles of the parameters and of the stiffness, by weighted points; widths of the Gaussian."""
-    used = weights > 0
-    w, points = weights[used], points[used]
-    mean = w @ points
-    gaps = points - mean
-    ends = np.array([quantiles(column, w, ENDS) for column in points.T])
-    z = _normals(0, DRAWS, len(gaussian.mode))
-    drawn = posterior.physical(gaussian.mode + z @ gaussian.root.T)
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Draws (n, c) of a posterior with their outputs (n, m), and points (N, c) with weights (N,) that stand for it."""
+
+    draws: FloatArray
+    outputs: FloatArray
+    points: FloatArray
+    weights: FloatArray
+    spread: FloatArray  # points that the stiffness is looked at, with weights
+    shares: FloatArray
+
+
+def _drawn(
+    posterior: Posterior,
+    gaussian: Laplace,
+    found: Evidence,
+    known: Answer,
+    chains: Chains | None,
+    at: Density,
+    method: Invert,
+) -> _Drawn:
+    """Draw from what is printed; solves at draws of chains, whose outputs were not kept."""
+    if known.source == "points":
+        weights, points = found.weights, posterior.physical(found.density.x)
+        chosen, used = resampled(weights, method.draws, method.seed), weights > 0
+        return _Drawn(points[chosen], found.density.outputs[chosen], points, weights, points[used], weights[used])
     d = len(posterior.inputs.names)
+    if known.source == "chains":
+        assert chains is not None
+        draws = _thinned(chains, method.draws)
+        which = slice(None) if posterior.which is None else list(posterior.which)
+        outputs = posterior.evaluate(Request(draws[:, :d], start=posterior.start)).outputs[:, which]
+        if posterior.mesh is not None:
+            outputs = outputs + posterior.mesh.at(draws[:, :d])
+        return _Drawn(draws, outputs, draws, _even(draws), chains.flat, _even(chains.flat))
+    x = gaussian_points(gaussian, max(method.draws, len(found.log_weights)))
+    points, moved = posterior.physical(x), (x - gaussian.mode)[: method.draws, :d]
+    # By the model linearised at the mode: exact where the posterior is Gaussian.
+    outputs = at.outputs + moved @ posterior.output_slopes(at)[0].T
+    return _Drawn(points[: method.draws], outputs, points, _even(points), points, _even(points))
+
+
+def _even(points: FloatArray) -> FloatArray:
+    return np.full(len(points), 1 / len(points))
+
+
+def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Drawn, look: Look | None) -> Record:
+    """Moments and quantiles of the parameters, of the stiffness by weighted points; widths of the Gaussian."""
+    ends = known.quantiles(ENDS)
     record: Record = {
-        "mean": mean,
-        "std": np.sqrt(w @ gaps**2),
+        "mean": known.mean,
+        "std": known.std,
         "lower": ends[:, 0],
         "upper": ends[:, 1],
-        "covariance": (w[:, None] * gaps).T @ gaps,
-        "laplace_std": drawn.std(axis=0),
+        "covariance": known.covariance,
+        "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, gaussian).std,
     }
     if look is None:
         return record
-    stiffness = look(points[:, :d])
-    average = w @ stiffness
+    d = len(posterior.inputs.names)
+    stiffness = look(drawn.spread[:, :d])
+    average = drawn.shares @ stiffness
     return record | {
         "stiffness_mode": look(posterior.physical(gaussian.mode[None])[:, :d])[0],
         "stiffness_mean": average,
-        "stiffness_std": np.sqrt(np.maximum(w @ (stiffness - average) ** 2, 0)),
+        "stiffness_std": np.sqrt(np.maximum(drawn.shares @ (stiffness - average) ** 2, 0)),
     }
-
-
-def _normals(seed: int, count: int, dimension: int) -> FloatArray:
-    from scipy.special import ndtri
-
-    return np.asarray(ndtri(sobol_points(seed, 0, 0, count, dimension)))
 
 
 def _thinned(chains: Chains, count: int) -> FloatArray:
@@ -317,13 +340,6 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Da
 
     cases = range(int(data.cases.max()) + 1)
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
-
-
-def _points(points: FloatArray, weights: FloatArray, draws: FloatArray, chains: Chains | None) -> Record:
-    """Weighted points of the posterior: those that were solved, or draws of chains that have mixed."""
-    if chains is not None and chains.mixed:
-        return {"point": draws, "point_weight": np.full(len(draws), 1 / len(draws))}
-    return {"point": points, "point_weight": weights}
 
 
 def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.criticism.answer import quantiles
 from inverse.criticism.chains import Chains
-from inverse.criticism.comparison import quantiles
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine
@@ -125,7 +125,7 @@ def invert_field(
     errors, root = posterior.errors, mode.point.root
     residual = errors.normal_scores(mode.point.gaps)
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
-    samples = method.solves(field=True)
+    samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
     chains = whole = None
     if method.chains is not None:

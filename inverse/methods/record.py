@@ -30,6 +30,7 @@ ENDS = (0.025, 0.975)  # of credible intervals
 SHOWN = 4  # directions of a field that are stored from each end of the spectrum
 STEPS = 256  # rows of the table of iterations, or more if there are more
 TRUST = ("laplace", "corrected", "neither")
+SOURCES = ("laplace", "points", "chains")  # of moments, intervals and draws of few parameters
 COLUMNS = {
     "parameters": ("start", "log_posterior", "decrement", "damping"),
     "field": ("misfit", "penalty", "gradient", "pairs", "products", "length", "solves"),
@@ -54,6 +55,7 @@ DIMS: dict[str, tuple[str, ...]] = {
     "chain_effective": (),
     "converged": (),
     "trust": (),
+    "source": (),
     "why": (),
     "solves": (),
     "eigenvalue": ("direction",),
@@ -289,12 +291,12 @@ def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
     }
 
 
-def of_chains(chains: Chains | None) -> Record:
-    """The diagnostics of chains, and how many have mixed; zero if there are none."""
+def of_chains(chains: Chains | None, *, used: bool = True) -> Record:
+    """The diagnostics of chains, and how many have mixed and are used; zero if there are none."""
     if chains is None:
         return {"chains": np.array(0.0), "chain_rhat": np.array(np.nan), "chain_effective": np.array(np.nan)}
     return {
-        "chains": np.array(float(len(chains.draws) if chains.mixed else 0)),
+        "chains": np.array(float(len(chains.draws) if chains.mixed and used else 0)),
         "chain_rhat": np.array(chains.rhat.max()),
         "chain_effective": np.array(chains.ess),
     }

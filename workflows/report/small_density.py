@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
 
 CURVE = 48  # points
+ALIKE = 1e-12  # standard deviation over the mean up to which values are the same
 
 
 def curve_of(
@@ -23,7 +24,7 @@ def curve_of(
     if (low, high) != (float(at[0]), float(at[-1])):  # draws of weighted points may reach less far than their interval
         lattice = np.linspace(low, high, CURVE)
         at, curve = lattice, np.interp(lattice, at, curve, left=0.0, right=0.0)
-    a, b = (float(np.clip((x - low) / (high - low), 0, 1)) for x in inside)
+    a, b = (float(np.clip((x - low) / ((high - low) or 1.0), 0, 1)) for x in inside)
     words = interval(low, high, unit, value)
     cut = " to " if " to " in words else "–"
     left, _, right = words.partition(cut)
@@ -35,7 +36,9 @@ def smooth(values: FloatArray, weights: FloatArray | None = None) -> tuple[Float
     weights = np.ones(len(values)) if weights is None else weights
     weights = weights / weights.sum()
     mean = weights @ values
-    std = float(np.sqrt(weights @ (values - mean) ** 2)) or 1.0
+    std = float(np.sqrt(weights @ (values - mean) ** 2))
+    if std <= ALIKE * abs(mean):  # one value, but for rounding: it has a place, and no density
+        std = abs(mean) or 1.0
     width = 1.06 * std * float(1 / (weights**2).sum()) ** -0.2
     low, high = max(values.min(), mean - 5 * std), min(values.max(), mean + 5 * std)
     at = np.linspace(low - width, high + width, CURVE)

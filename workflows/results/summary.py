@@ -51,7 +51,8 @@ def inverted(summary: Mapping[str, Any], unknown: Collection[str]) -> list[str]:
             lines.append(f"{name}: failed: {found['failed']}")
             continue
         values = [f"{path} {with_error(at['mode'], at['std'])}" for path, at in found["posterior"].items()]
-        lines.append(f"{name}: {', '.join(values)}")
+        by = "by Laplace, " if (found.get("source"), found.get("trust")) == ("laplace", "neither") else ""
+        lines.append(f"{name}: {by}{', '.join(values)}")
         lines += [
             _predicted(f"{name}: {goal}", at, known=goal not in unknown)
             for goal, at in found.get("predictions", {}).items()

@@ -109,7 +109,7 @@ class InversionStudy(StudyKind):
             return method.expansion
         if method.reduced is not None:  # at the mode, and draws
             return (1 + method.reduced.solves) * sum(measurement is not None for measurement in self.measurements)
-        each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
+        each = method.solves(len(self.names), field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
         more = 0 if self.predict is None else 1 + self.predict.solves(field=field)
         count = sum(measurement is not None for measurement in self.measurements)

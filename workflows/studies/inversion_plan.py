@@ -34,11 +34,11 @@ def plan(study: Inversion) -> list[str]:
     if study.field:
         unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
         seconds = (
-            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(field=True) * each
+            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(0, field=True) * each
         )
     else:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
-        seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
+        seconds = textbook * 15 * study.method.starts + each * study.method.solves(len(study.names), field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
     once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
     seconds += once + _seconds_of_predictions(study)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from forward.bodies.inclusions import derived, log_factor
 from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
+from inverse.methods.record import COLUMNS, ENDS, SOURCES, TRUST, stacked, usual_sizes
 from workflows.studies.findings_inversion import judged
 from workflows.studies.specimen_inversion import Inversion
 
@@ -224,6 +224,8 @@ def _one(found: xr.Dataset) -> dict[str, Any]:
         **{key: _number(found[key]) for key in numbers},
         **({"mesh": _mesh(found)} if "mesh_checked" in found else {}),
         **({"predictions": of_predictions(found)} if "goal" in found.coords else {}),
+        **({"source": SOURCES[int(found["source"])]} if "source" in found else {}),
+        "trust": (*TRUST, "doubtful")[int(found["trust"])],
         "verdict": str(found["why"].item()),
     }
 

@@ -107,6 +107,16 @@ def test_small_densities_of_one_sign_end_at_zero():
     np.testing.assert_allclose(scaled, stats.lognorm(0.7, scale=70).pdf(-at), atol=0.15 * scaled.max())
 
 
+@pytest.mark.parametrize("value", [3.0, 0.0, 0.1, -1e5 / 3])
+def test_a_small_density_of_one_value_is_drawn(value):
+    """One point copied, the last digit of whose mean is rounding; and a lattice without length."""
+    at, curve = small_density.smooth(np.full(400, value))
+    _, inside, _ = small_density.curve_of(at, curve, (value, value), "m", value)
+    assert np.isfinite(curve).all()
+    assert inside == pytest.approx((0.5, 0.5))
+    assert small_density.curve_of(np.full(48, value), curve, (value, value), "m", value)[1] == (0.0, 0.0)
+
+
 def test_a_small_density_holds_an_interval_that_reaches_beyond_its_samples():
     at, curve = np.linspace(2.0, 4.0, 5), np.array([0.0, 1.0, 2.0, 1.0, 0.0])
     drawn, inside, ends = small_density.curve_of(at, curve, (1.0, 3.5), "m", 3.0)

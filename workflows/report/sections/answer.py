@@ -20,6 +20,7 @@ from workflows.report.sections.population import card as population
 from workflows.report.sections.posterior import measured_kind
 from workflows.report.sections.reduced import card as reduced
 from workflows.report.small_density import CURVE, curve_of, smooth
+from workflows.studies.findings_inversion import NEITHER
 from workflows.studies.findings_selection import bayes_factor, by_probability, grade
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ SAID = 0.02  # share of the variance that is worth a word
 NAMED = 4  # names in a question
 MODES = 2  # of a field, from which on they are named together
 GOALS = 4  # predictions on the card
+LAPLACE = 0  # value of `source`, see docs/results.md
 
 
 class AnswerFirst(Section):
@@ -320,7 +322,10 @@ def _over_sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
 
 
 def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
-    mean, std, lower, upper = (float(one[which]) for which in ("mean", "std", "lower", "upper"))
+    by_laplace = "source" in one and int(one["source"]) == LAPLACE and int(one["trust"]) == NEITHER
+    which_first = "mode" if by_laplace else "mean"
+    mean, std, lower, upper = (float(one[which]) for which in (which_first, "std", "lower", "upper"))
+    label = f"{spoken(name)}, by Laplace" if by_laplace else spoken(name)
     before, wide = float(one["prior_mean"]), float(one["prior_std"])
     narrower = wide / std if std > 0 else np.inf
     lines = [
@@ -333,8 +338,8 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
-        return Answer(spoken(name), quantity(mean, std, unit), lines, *curve_of(at, curve, (lower, upper), unit, mean))
-    return Answer(spoken(name), quantity(mean, std, unit), lines)
+        return Answer(label, quantity(mean, std, unit), lines, *curve_of(at, curve, (lower, upper), unit, mean))
+    return Answer(label, quantity(mean, std, unit), lines)
 
 
 def _stiffness(one: xr.Dataset) -> Answer:
