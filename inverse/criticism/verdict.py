@@ -128,8 +128,9 @@ def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, ess
 
 def _objection(converged: bool, test: ResidualTest, left: float = 0.0) -> Verdict | None:
     if not converged:
-        far = f": its next step would move an unknown by up to {left:.2g} standard deviations" if left > np.sqrt(NEAR) else ""
-        return Verdict("neither", f"the search for the mode did not converge{far}")
+        why = "the search for the mode did not converge"
+        far = f"{why}: its next step would move an unknown by up to {left:.2g} standard deviations"
+        return Verdict("neither", far if left > np.sqrt(NEAR) else why)
     if test.probability < 0.01:
         why = f"the model does not explain the data: |r|² = {test.square:.4g} where {test.degrees:.4g} is expected"
         return Verdict("neither", f"{why} (probability {test.probability:.1g})")
