@@ -130,11 +130,12 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     drawn = _weighted(pilot, "importance", "")
     share = f"the first {quarter} points are worth {drawn.ess:.0f}"
     _, student, normal = about(gaussian)
-    if _is_gaussian(gaussian, drawn.density):
+    # Of the first points all must have an answer: where many have none, the Gaussian is not what the prior allows.
+    if np.isfinite(drawn.density.log_posterior).all() and _is_gaussian(gaussian, drawn.density):
         pilot.append(_drawn(posterior, opening, seed, quarter, 2 * quarter, derivatives=False))
         whole = _continued(posterior, pilot, normal, seed, quarter, "")
         if _is_gaussian(gaussian, whole.density):
-            misfit = np.abs(_from_gaussian(gaussian, whole.density))
+            misfit = np.abs(_from_gaussian(gaussian, whole.density))  # of points that count
             near = float(misfit[whole.weights > 1e-6 / len(misfit)].max())
             why = "the posterior is Gaussian at every point that was tried"
             return replace(whole, log_evidence=gaussian.log_evidence, error=near, route="closed form", why=why)
@@ -214,11 +215,14 @@ def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
 
 
 def _is_gaussian(gaussian: Laplace, density: Density) -> bool:
-    """Whether the posterior is the Gaussian at all points, up to rounding."""
-    # Where the model is not defined the likelihood is zero, and the posterior not Gaussian; ∞ − ∞ must not pass.
-    if not np.isfinite(density.log_posterior).all():
+    """Whether the posterior is the Gaussian at all points, up to rounding; it is zero where the model has no answer."""
+    here = density.log_posterior
+    misfit = _from_gaussian(gaussian, density)
+    lost = ~np.isfinite(here)
+    if not (np.abs(misfit[~lost]) <= ROUNDED * (1 + np.abs(here[~lost]))).all():
         return False
-    return bool((np.abs(_from_gaussian(gaussian, density)) <= ROUNDED * (1 + np.abs(density.log_posterior))).all())
+    deviation = density.x[lost] - gaussian.mode
+    return bool((np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) > -2 * np.log(ROUNDED)).all())
 
 
 def _expected(drawn: Evidence, opening: Proposal, proposal: Proposal) -> float:
