@@ -1,5 +1,6 @@
 """How long methods go on: samples, tolerance, budget."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -66,3 +67,18 @@ def test_other_models_are_evaluated_and_charged() -> None:
     np.testing.assert_array_equal(two.outputs, 2 * one.outputs)
     assert recorder.solves == 10
     assert recorder.seconds > 0
+
+
+@pytest.mark.unit
+def test_a_budget_pays_for_what_is_left_of_it():
+    """Of 25 s, 10 solves have taken 10: the other 15 s pay for 15."""
+    budget = MonteCarlo(budget_seconds=25.0)
+    assert budget.affordable(10, 10.0) == pytest.approx(15)
+    assert budget.affordable(10, 25.0) == 0
+    assert budget.affordable(10, 50.0) == 0
+    assert budget.affordable(10, 0.0) == math.inf
+    assert MonteCarlo(samples=10).affordable(10, 10.0) == math.inf
+    accurate = MonteCarlo(tolerance=1e-3)
+    assert accurate.met(1e-3)
+    assert not accurate.met(1.001e-3)
+    assert not budget.met(0.0)
