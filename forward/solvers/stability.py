@@ -168,6 +168,8 @@ def screen(vectors: FloatArray, multiply: Rows, solve: Corrector, free: FloatArr
     free, total
         As in `screening_vectors`.
     """
+    if len(vectors) == 0:  # every displacement is held
+        return Screened(1.0, 1.0)
     images = multiply(vectors)
     projected = _symmetric(total(vectors @ images.T))
     if not np.isfinite(projected).all():

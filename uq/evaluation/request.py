@@ -110,6 +110,11 @@ class Evaluations:
         good[[failure.index for failure in self.failures]] = False
         return good
 
+    @property
+    def why(self) -> str:
+        """Why some points have no answer, the first three reasons; empty if all have one."""
+        return "; ".join(sorted({failure.reason for failure in self.failures})[:3])
+
 
 class FieldSum(Protocol):
     """A quantity of each realisation's state that is summed while realisations are computed."""

@@ -226,8 +226,7 @@ def _scalar_moments(
     ok = evaluations.ok
     n = int(ok.sum())
     if n < 2:
-        reasons = sorted({failure.reason for failure in evaluations.failures})
-        message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {'; '.join(reasons[:3])}"
+        message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {evaluations.why}"
         raise SolveError(message)
     values = evaluations.outputs[ok]
     if control is None:

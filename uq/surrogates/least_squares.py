@@ -38,13 +38,14 @@ PATIENCE = 30  # functions selected without a gain before the selection ends
 class Data:
     """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) along the coordinates or None.
 
-    `weights` (n,) are those of the samples in sums of squares.
+    `weights` (n,) are those of the samples in sums of squares; `why` says why others have no answer, if there are any.
     """
 
     points: FloatArray
     values: FloatArray
     slopes: FloatArray | None
     weights: FloatArray
+    why: str = ""
 
     @classmethod
     def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
@@ -52,7 +53,8 @@ class Data:
         ok = evaluations.ok
         tangents = None if evaluations.tangents is None else evaluations.tangents[ok]
         counted = None if weights is None else weights[ok]
-        return cls.at(evaluations.points[ok], evaluations.outputs[ok], tangents, inputs, counted)
+        found = cls.at(evaluations.points[ok], evaluations.outputs[ok], tangents, inputs, counted)
+        return replace(found, why=evaluations.why)
 
     @classmethod
     def at(
@@ -72,7 +74,7 @@ class Data:
     def some(self, which: slice | IntArray) -> Data:
         """Return some of the samples, in the given order."""
         slopes = None if self.slopes is None else self.slopes[which]
-        return Data(self.points[which], self.values[which], slopes, self.weights[which])
+        return Data(self.points[which], self.values[which], slopes, self.weights[which], self.why)
 
     @property
     def right(self) -> FloatArray:
@@ -175,7 +177,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     """
     # Samples that are left out together are next to each other.
     n = len(data.points)
-    too_few = f"{n} samples have an answer, too few for an expansion of order 1"
+    too_few = f"{n} samples have an answer, too few for an expansion of order 1" + (f": {data.why}" if data.why else "")
     if not n:
         raise SolveError(too_few)
     held = np.arange(n) % min(n, FOLDS)

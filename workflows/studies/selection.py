@@ -23,7 +23,7 @@ from inverse.methods.selection import Select
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import refused
+from workflows.config.mistakes import StudyError, refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
@@ -255,6 +255,9 @@ class Comparison(StudyKind):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
         """Check the blocks of a comparison on a specimen, on another model, or without one on material points."""
+        if not isinstance(blocks.get("model", {}), Mapping):
+            message = f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}"
+            raise StudyError(message)
         if measures_outputs(blocks.get("model")):
             other: type[Comparison] = named("workflows.studies.output_selection:OutputSelection")
             return other.made(blocks, folder)

@@ -312,7 +312,7 @@ class DirectSolver:
             self._right.array[:] = self._unknowns.reorder(right)
             (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
             return self._unknowns.take(self._solution.array_r)
-        if transpose or len(right) == 1:
+        if transpose or len(right) <= 1:
             return np.array([self.solve(row, transpose=transpose) for row in right]).reshape(right.shape)
         # The factor is read once for all of them.
         ordered = np.asfortranarray(self._unknowns.reorder(right).T)

@@ -14,6 +14,7 @@ from forward.model import FunctionModel
 from forward.reduced.data import load as load_model
 from forward.reduced.model import ReducedModel
 from tests import launch
+from tests.launch import ROOT
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
@@ -359,3 +360,14 @@ def test_a_column_that_buckles(tmp_path):
     for density in (6.0, 12.0, 16.0, 20.0, 24.0):
         model.solve(np.array([density]))
     assert asked == [20.0, 24.0]
+
+
+@pytest.mark.fem
+def test_without_unseen_samples_there_is_a_report(tmp_path):
+    few = ("snapshots=4", "modes=3", "rounds=0", "derivatives=false", "unseen=0")
+    sets = [word for one in few for word in ("--set", f"method.{one}")]
+    tiny = ROOT / "configs" / "tiny.toml"
+    cells = ("--set", "model.body.cells=[2, 1, 1]")
+    places = ("--output", str(tmp_path / "r.npz"), "--out", str(tmp_path / "D"))
+    assert main(["reduce", str(tiny), *places, *sets, *cells]) == 0
+    assert "Nobody has measured how well it follows the body" in (tmp_path / "D" / "report.html").read_text()

@@ -8,8 +8,11 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
+from forward.model import SolveError
+from tests.launch import ROOT
+from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
-from workflows.config.study import parse
+from workflows.config.study import load, parse
 from workflows.run.run import run
 
 STUDY = """
@@ -65,3 +68,45 @@ def test_what_was_solved_on_each_mesh_is_in_the_summary(tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [one["unknowns"] for one in summary["meshes"]] == [3 * 27, 3 * 125]
     assert summary["evaluations"] == sum(one["solves"] for one in summary["meshes"]) == study.planned
+
+
+def own(tmp_path, monkeypatch, *changes):
+    """A study of a model that answers at the mean alone."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    lines = [
+        "def f(p):",
+        "    if abs(p[0] - 0.5) > 1e-9:",
+        "        raise ValueError('too stiff')",
+        "    return [p[0]]",
+    ]
+    (tmp_path / "answers_once.py").write_text("\n".join(lines))
+    blocks = {
+        "model": {"kind": "python", "function": "answers_once.f", "parameters": {"a": 0.5}, "outputs": ["y"]},
+        "parameters": {"a": {"kind": "uniform", "lower": 0.0, "upper": 1.0}},
+    }
+    return parse(blocks, changes)
+
+
+@pytest.mark.parametrize("method", ["{kind='chaos', samples=16}", "{kind='sobol', samples=16}"])
+def test_expansions_say_why_no_sample_has_an_answer(method, tmp_path, monkeypatch):
+    study = own(tmp_path, monkeypatch, f"method={method}")
+    with pytest.raises(SolveError, match=r"0 samples have an answer.*raised ValueError: too stiff"):
+        study.run()
+
+
+@pytest.mark.parametrize("config", ["inclusion-material", "treloar", "tiny"])
+def test_a_model_that_is_no_table_is_one_line(config, capsys):
+    assert main(["check", str(ROOT / "configs" / f"{config}.toml"), "--set", "model=3"]) == 2
+    assert capsys.readouterr().err == "model: expected a table, { key = value }; given 3\n"
+
+
+@pytest.mark.fem
+def test_a_body_of_which_everything_is_held():
+    """One linear cell between two held faces has no unknown: F is known, and so is the energy."""
+    held = "model.displacements=[{on='x-max', x=0.028, y=0, z=0}]"
+    cell = ("model.body.cells=[1, 1, 1]", "model.body.degree=1", "model.loads=[]", "mesh_error=false", held)
+    output = "model.outputs=[{name='energy', kind='strain-energy'}]"
+    constants = "parameters={'material.C1'={kind='uniform', lower=1e4, upper=2e4}}"
+    found = load(ROOT / "configs" / "tiny.toml", [*cell, output, constants, "method.samples=4"]).run()
+    assert found["ok"].all()
+    assert (found["values"] > 0).all()

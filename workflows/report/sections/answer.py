@@ -57,7 +57,7 @@ class AnswerFirst(Section):
             ("estimator", compared),
             ("clean", made),
             ("chosen", design),
-            ("reduced_error", reduced),
+            ("mode_energy", reduced),
             ("nominal", forward),
             ("candidate_mean", forward),
         ):

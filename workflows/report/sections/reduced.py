@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from forward.readable import percent, size
 from forward.words import duration, number
@@ -22,23 +23,16 @@ class ReducedModelOfBody(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """A table and pictures of the errors, then sizes."""
         told, found = results.summary["reduced"], results.dataset
-        yield Heading("How well it follows the body")
-        yield Text(
-            f"Errors on {told['unseen']} samples that the model has not seen: their root mean square over the spread "
-            "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
-            "over the true error; where it is 1, estimates can be taken for the errors."
-        )
-        left = {name: percent(error) for name, error in told.get("errors after correction", {}).items()}
-        shares = {name: f"{share:.2f}" for name, share in told.get("effectivity", {}).items()}
-        rows = [
-            (name, percent(error), left.get(name, "–"), shares.get(name, "–"))
-            for name, error in told.get("errors", {}).items()
-        ]
-        yield Table(("output", "error", "after the correction", "effectivity"), rows)
         drawn = []
-        if told["unseen"] > 1:
-            caption = "Estimated against true errors at the unseen samples, over the root mean square of each output."
-            drawn.append(Picture.drawn(plots.estimates(found), caption))
+        if told.get("errors"):
+            yield from _errors(told)
+            if told["unseen"] > 1:
+                caption = (
+                    "Estimated against true errors at the unseen samples, over the root mean square of each output."
+                )
+                drawn.append(Picture.drawn(plots.estimates(found), caption))
+        else:
+            yield Text("Nobody has measured how well it follows the body, with no unseen samples (method.unseen).")
         drawn.append(
             Picture.drawn(
                 plots.energies(found, told["modes"]), "The part of the snapshots that so many modes leave out."
@@ -65,6 +59,23 @@ class ReducedModelOfBody(Section):
                 ),
             ]
         )
+
+
+def _errors(told: Mapping[str, Any]) -> Iterator[Block]:
+    """A table of the errors on unseen samples."""
+    yield Heading("How well it follows the body")
+    yield Text(
+        f"Errors on {told['unseen']} samples that the model has not seen: their root mean square over the spread "
+        "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
+        "over the true error; where it is 1, estimates can be taken for the errors."
+    )
+    left = {name: percent(error) for name, error in told.get("errors after correction", {}).items()}
+    shares = {name: f"{share:.2f}" for name, share in told.get("effectivity", {}).items()}
+    rows = [
+        (name, percent(error), left.get(name, "–"), shares.get(name, "–"))
+        for name, error in told.get("errors", {}).items()
+    ]
+    yield Table(("output", "error", "after the correction", "effectivity"), rows)
 
 
 def card(results: Results) -> Card:
