@@ -82,6 +82,12 @@ class Chains:
         β; NaN for an ensemble.
     solves
         How often ℓ was evaluated.
+    needed
+        Effective draws from which on R̂ and quantiles are meaningful.
+    evidence
+        ln Z and its standard error, where the chains tell.
+    apart
+        Of the solves, those that no evaluation has counted.
     """
 
     names: tuple[str, ...]
@@ -90,6 +96,9 @@ class Chains:
     accepted: FloatArray
     step: float
     solves: int
+    needed: float = INDEPENDENT
+    evidence: tuple[float, float] | None = None
+    apart: int = 0
 
     @cached_property
     def rhat(self) -> FloatArray:
@@ -115,7 +124,22 @@ class Chains:
     @property
     def mixed(self) -> bool:
         """Whether all chains agree, with enough draws."""
-        return bool(self.rhat.max() <= MIXED and self.ess >= INDEPENDENT)
+        return bool(self.rhat.max() <= self.agreeing and self.ess >= self.needed)
+
+    @property
+    def agreeing(self) -> float:
+        """R̂ up to which chains agree.
+
+        Where fewer draws are needed than usual, means of half chains scatter by more, by χ² with one degree of freedom
+        less than there are halves: the largest R̂ of all quantities that one run in a hundred has by chance.
+        """
+        if self.needed >= INDEPENDENT:
+            return MIXED
+        from scipy.special import chdtri
+
+        halves, ess = 2 * len(self.draws), self.ess
+        chance = float(chdtri(halves - 1, 0.01 / self.draws.shape[2]))
+        return max(MIXED, float(np.sqrt(1 + chance / (halves - 1) * halves / ess)))
 
     @property
     def ess(self) -> float:

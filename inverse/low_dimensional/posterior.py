@@ -29,7 +29,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray
+from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from uq.evaluation.request import Evaluate, Request, Start
@@ -194,6 +194,42 @@ class Posterior:
         A = self.output_slopes(at) / self.scale(at.x)[:, :, None]
         return np.swapaxes(self.whitening(np.swapaxes(A, 1, 2)), 1, 2)
 
+    def _misfit(self, residual: FloatArray, x: FloatArray) -> FloatArray:
+        """−ln of the likelihood (n,) of independent residuals (n, m) at x (n, c)."""
+        logs = np.log(self.scale(x)).sum(axis=1) + self.whitening.log_determinant
+        return np.asarray(self.errors.misfit(residual, logs) + np.log(self.inputs.admitted))
+
+    def potential(self, x: FloatArray, model: ForwardModel) -> tuple[float, FloatArray]:
+        """Return −ln p(y | x) + ½|x|² at x (c,), and its gradient (c,), by one solve of the model and one adjoint.
+
+        Where the model has no answer that is infinite, and the gradient zero. Collective over the ranks of the model.
+        """
+        d, m, here = len(self.inputs.names), self.data.size, x[None]
+        point, slopes = self.inputs.from_normals(here[:, :d])
+        guess = None if self.start is None else self.start.on(model)(point[0])
+        try:
+            solution = model.solve(point[0], guess)
+        except SolveError:
+            return np.inf, np.zeros(len(x))
+        which = np.arange(m) if self.which is None else np.array(self.which)
+        outputs = np.asarray(solution.outputs)[None, which]
+        if self.mesh is not None:
+            outputs = outputs + self.mesh.at(point)
+        residual = self.residuals(outputs, here)
+        score = self.errors.score(residual)
+        pull = (self.whitening(score) / self.scale(here))[0]  # W is symmetric
+        weights = np.zeros(len(model.outputs))
+        np.add.at(weights, which, pull)
+        by_parameters = solution.adjoint(weights)
+        if self.mesh is not None and self.mesh.slopes.size:
+            by_parameters = by_parameters + pull @ self.mesh.slopes
+        gradient = x.copy()
+        gradient[:d] += by_parameters @ slopes[0]
+        if self.noise is not None:
+            s, s_slope = self.noise.from_normal(here[:, d])
+            gradient[d] += float(((m - (residual * score).sum(axis=1)) * s_slope / s)[0])
+        return float(self._misfit(residual, here)[0] + x @ x / 2), gradient
+
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
         """Solve at the points x (n, c)."""
         d, m = len(self.inputs.names), self.data.size
@@ -206,9 +242,7 @@ class Posterior:
         if self.mesh is not None:
             outputs = outputs + self.mesh.at(points)
         residual = self.residuals(outputs, x)
-        logs = np.log(self.scale(x)).sum(axis=1) + self.whitening.log_determinant
-        misfit = errors.misfit(residual, logs) + np.log(self.inputs.admitted)
-        log_likelihood = np.where(found.ok, -misfit, -np.inf)
+        log_likelihood = np.where(found.ok, -self._misfit(residual, x), -np.inf)
         empty = np.zeros((n, 0))
         plain = Density(x, points, outputs, log_likelihood, found.outputs, None, empty, empty[:, :, None])
         if not derivatives:

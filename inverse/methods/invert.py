@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from forward.settings import Settings
 from inverse.criticism.chains import FEW, FIELD, walkers
+from inverse.criticism.gradient_chains import BUDGET
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
@@ -55,8 +56,9 @@ class Invert(MeshTreatment, Settings):
         Prior of the factor on all standard deviations of the errors; by default these are as stated.
     chains
         Run Markov chains too: "pcn", with proposals from a Gaussian of the posterior (5 204 solves; for a field 4 804),
-        or, for few parameters, "emcee" (35 208 solves, or more). If they have mixed, moments and draws of few
-        parameters are theirs; for a field, only if Laplace's cannot be trusted.
+        or, for few parameters, "emcee" (35 208 solves, or more) or "hmc", which follows gradients and mixes in tens of
+        unknowns too (60 000 solves with an adjoint at most, one after another; by mici). If they have mixed, moments
+        and draws of few parameters are theirs; for a field, only if Laplace's cannot be trusted.
     starts
         Starts of the search for the mode of few parameters.
     cutoff, rank
@@ -84,7 +86,7 @@ class Invert(MeshTreatment, Settings):
     kind: Literal["invert"] = "invert"
     samples: Annotated[int, Field(ge=0)] | None = None
     noise: Distribution | None = None
-    chains: Literal["pcn", "emcee"] | None = None
+    chains: Literal["pcn", "emcee", "hmc"] | None = None
     starts: Annotated[int, Field(ge=1)] = 4
     cutoff: Annotated[float, Field(gt=0)] = CUTOFF
     rank: Annotated[int, Field(ge=1)] = 256
@@ -119,6 +121,8 @@ class Invert(MeshTreatment, Settings):
             return 0
         if field:
             return 2 * FIELD.evaluations  # the map of fields takes two
+        if self.chains == "hmc":
+            return BUDGET
         return (FEW if self.chains == "pcn" else walkers(size)).evaluations
 
 

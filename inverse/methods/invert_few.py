@@ -18,6 +18,7 @@ from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, So
 from inverse.criticism.answer import Answer, answer, by_gaussian, gaussian_points
 from inverse.criticism.chains import Chains, chains_of_few, ensemble
 from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.criticism.gradient_chains import gradient_chains
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import FEWEST, resampled
@@ -134,12 +135,13 @@ def invert_by_group(
     """
     solve = evaluate or SerialEvaluate(model)
     near = partial(Nearby.at, model, spread=inputs.std)
-    return inverted(inputs, solve, data, method, look, errors, finer, near, say, shared).dataset
+    return inverted(inputs, solve, data, method, look, errors, finer, near, say, shared, model).dataset
 
 
 def invert_by_all(
     inputs: Inputs,
     evaluate: Evaluate,
+    model: ForwardModel,
     data: Data,
     method: Invert,
     look: Look | None,
@@ -160,6 +162,7 @@ def invert_by_all(
         lambda point: linearise(inputs, evaluate, point).prediction,
         say,
         shared,
+        model,
     ).dataset
 
 
@@ -174,6 +177,7 @@ def inverted(
     start: Callable[[FloatArray], Start | None],
     say: Callable[[str], None],
     shared: Shared | None,
+    model: ForwardModel,
 ) -> Inverted:
     """Invert a data set, as `invert_by_group`; `start` predicts states from a solution at parameters (d,)."""
     counted = Recorder(evaluate)
@@ -201,9 +205,12 @@ def inverted(
     raw = posterior.residuals(at.outputs, at.x)[0]
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
-    chains = _chains(posterior, gaussian, found, method)
+    chains = _chains(posterior, gaussian, found, method, model)
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, gaussian, found, chains)
+    log_evidence, error = found.log_evidence, found.error
+    if known.source == "chains" and chains is not None and chains.evidence is not None and not found.trusted:
+        log_evidence, error = chains.evidence
     drawn = _drawn(posterior, gaussian, found, known, chains, at, method)
     moments = _moments(posterior, gaussian, known, drawn, look)
     record: Record = {
@@ -220,15 +227,15 @@ def inverted(
         "source": np.array(SOURCES.index(known.source)),
         **of_chains(chains, used=known.source == "chains"),
         "mode": best,
-        "log_evidence": np.array(found.log_evidence),
-        "log_evidence_error": np.array(found.error),
+        "log_evidence": np.array(log_evidence),
+        "log_evidence_error": np.array(error),
         "laplace_log_evidence": np.array(gaussian.log_evidence),
         "effective": np.array(found.ess),
         "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),
         "trust": np.array(TRUST.index(verdict.trust)),
         "why": str(verdict),
-        "solves": np.array(counted.solves),
+        "solves": np.array(counted.solves + (0 if chains is None else chains.apart)),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
         "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in searched.steps]).reshape(-1, 4),
         "start_mode": posterior.physical(searched.modes),
@@ -238,10 +245,14 @@ def inverted(
     return Inverted(as_dataset(record), posterior, found)
 
 
-def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert) -> Chains | None:
+def _chains(
+    posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert, model: ForwardModel
+) -> Chains | None:
     match method.chains:
         case None:
             return None
+        case "hmc":
+            return gradient_chains(posterior, gaussian, model, seed=method.seed)
         case "emcee":
             return ensemble(posterior, gaussian, seed=method.seed)
         case "pcn":

@@ -229,7 +229,9 @@ class InversionStudy(StudyKind):
 
     def _mistakes(self) -> Iterator[Mistake]:
         """Find mistakes common to all inversions."""
-        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
+        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee"), "hmc": ("arviz", "mici")}.get(
+            self.method.chains or "", ()
+        ):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
                 yield ("method", "chains"), message, self.method.chains

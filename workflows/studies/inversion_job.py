@@ -418,7 +418,9 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
             found = by_reduced(study.inputs, recorders["/"], cheap, data, study.method, errors, finer, say)
         else:
             full = recorders["/"]
-            found = invert_by_all(study.inputs, full, data, study.method, made.look, errors, finer, say, shared)
+            found = invert_by_all(
+                study.inputs, full, observed, data, study.method, made.look, errors, finer, say, shared
+            )
         if study.predict is not None:
             recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
             before = partial(named("workflows.studies.predicted:prior_band"), study, recorders[PREDICTED])

@@ -182,8 +182,8 @@ class Inversion(InversionStudy):
             yield ("model", "fields", nodal[0], "basis"), message, "nodes"
         if nodal and self.model.fields[nodal[0]].of != "stiffness":
             yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
-        if nodal and self.method.chains == "emcee":
-            yield ("method", "chains"), "expected 'pcn', the chains for fields", "emcee"
+        if nodal and self.method.chains in {"emcee", "hmc"}:
+            yield ("method", "chains"), "expected 'pcn', the chains for fields", self.method.chains
         if nodal and self.method.noise is not None and self.data.errors.kind != "normal":
             message = "the size of such errors is not inferred with a field, expected { kind = 'normal' } or no noise"
             yield ("data", "errors"), message, self.data.errors.kind

@@ -8,6 +8,7 @@ from scipy.optimize import minimize_scalar
 
 from forward.model import FunctionModel
 from inverse.criticism.answer import answer, by_gaussian, counts, gaussian_points
+from inverse.criticism.gradient_chains import BUDGET, gradient_chains
 from inverse.criticism.predictive import examine_few
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality
@@ -207,6 +208,30 @@ def test_the_mode_is_found_where_gauss_newton_crawls(short):
         width = np.sqrt(found.covariance[k, k])
         assert abs(found.mode[k] - cost.x) < 1e-3 * width
         assert width == pytest.approx((short * np.cos(cost.x - start) / sigma**2 + 1) ** -0.5, rel=0.01)
+
+
+def test_chains_that_follow_gradients():
+    """Bent posteriors of 12 unknowns: moments and ln Z of weighted points; gradients are those of the density."""
+    pytest.importorskip("mici")
+    posterior, A = bent(12, 0.25)
+    gaussian = laplace(posterior, starts=1)
+    model = posterior.evaluate.model
+    x = gaussian.mode + 0.3
+    value, gradient = posterior.potential(x, model)
+    there = posterior.at(x[None], derivatives=True)
+    assert value == pytest.approx(-there.log_posterior[0], rel=1e-12)
+    np.testing.assert_allclose(gradient, there.gradient[0], rtol=1e-9, atol=1e-9)
+    found = gradient_chains(posterior, gaussian, model)
+    assert found.mixed
+    assert found.apart <= BUDGET
+    mean, std, log_evidence = reference(posterior, A, 0.25, gaussian)
+    assert np.abs((found.flat.mean(axis=0) - mean) / std).max() < 0.2
+    assert np.abs(found.flat.std(axis=0) / std - 1).max() < 0.2
+    assert abs(found.evidence[0] - log_evidence) < 4 * found.evidence[1] < 0.5
+    alike = replace(evidence(posterior, gaussian, 64), pareto_k=2.0, ess=5.0)
+    judged = verdict_on_few(gaussian, alike, examine_few(posterior, gaussian), found)
+    assert judged.trust == "corrected"  # fewer points do not overrule chains
+    assert answer(posterior, gaussian, alike, found).source == "chains"
 
 
 @pytest.mark.unit
