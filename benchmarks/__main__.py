@@ -20,6 +20,7 @@ NAMES = (
     "kernels",
     "throughput",
     "tolerance",
+    "promises",
     "variance",
     "levels",
     "fields",

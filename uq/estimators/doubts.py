@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray
 from uq.estimators.tails import concentration, influences, missed, shown, spread
@@ -150,14 +151,24 @@ def of_differences(
 def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
     """Find the outputs whose samples (n, m) are all equal: what none of n has met has a share below 1 − 0.05^(1/n)."""
     n = len(values)
-    missed = 1 - 0.05 ** (1 / n)
-    for name, low, high in zip(names, values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True):
-        if n > 1 and high - low <= LAST_DIGITS * max(abs(low), abs(high)):
+    for name, value, alike in zip(names, values[0].tolist(), equal(values).tolist(), strict=True):
+        if alike:
             yield Finding(
                 "warning",
-                f"All {n} samples of {name} are {_short(low)}. If it is no constant, its mean and standard deviation "
-                f"leave out what happens in up to {missed:.2g} of all cases, and so do their errors.",
+                f"All {n} samples of {name} are {_short(value)}. If it is no constant, its mean and standard deviation "
+                f"leave out what happens in up to {unmet(n):.2g} of all cases, and so do their errors.",
             )
+
+
+def equal(values: FloatArray) -> NDArray[np.bool_]:
+    """Of which outputs (m,) all samples (n, m) are the same, two at least: what they have not met is in no error."""
+    low, high = values.min(axis=0), values.max(axis=0)
+    return np.asarray((len(values) > 1) & (high - low <= LAST_DIGITS * np.maximum(np.abs(low), np.abs(high))))
+
+
+def unmet(n: int) -> float:
+    """Share of all cases that none of n independent samples may have met, at 95 %."""
+    return float(1 - 0.05 ** (1 / n))
 
 
 def of_field_tails(
@@ -210,7 +221,8 @@ def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator
         if dropped and found.relative_std_error[i] > MATTERS:
             yield Finding(
                 "note",
-                f"The {control} control of {name} increases the scatter: its {' and '.join(dropped)} "
+                f"The {control} control of {name} increases the scatter, or hides more than it explains: its "
+                f"{' and '.join(dropped)} "
                 f"{'are' if len(dropped) > 1 else 'is'} estimated without it.",
             )
 

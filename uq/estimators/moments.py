@@ -22,7 +22,7 @@ Scalars and fields, with and without controls, use the same sums: one file, so t
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -392,6 +392,12 @@ def error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:
     with np.errstate(over="ignore"):
         upper = std / 2 * np.expm1(np.minimum(ratio(variance_error, std**2), 100.0))
     return np.asarray(np.where(std > 0, np.minimum(upper, np.sqrt(variance_error)), np.sqrt(variance_error)))
+
+
+def either(which: NDArray[np.bool_], first: Estimates, second: Estimates) -> Estimates:
+    """Return the first of two estimates where `which` says so, the second elsewhere."""
+    names = [one.name for one in fields(Estimates)]
+    return Estimates(*(np.where(which, getattr(first, name), getattr(second, name)) for name in names))
 
 
 def _scatter(values: FloatArray) -> FloatArray:

@@ -33,7 +33,6 @@ from uq.methods.method import Method
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
 from uq.methods.stopping import UNASKED
 from uq.surrogates.field_regression import Deviations, deviations
-from uq.surrogates.regression import beyond
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,8 +150,9 @@ class Automatic(Method):
             return trail[-1][0] + ENOUGH * _further(trail)
 
         try:
-            for found in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT, wanted):
-                trail.append((found.count, goal.reached(found.regression.estimates())))
+            for one in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT, wanted):
+                found, reached = one.held_to(goal)
+                trail.append((found.count, reached))
                 if trail[-1][1] <= 1:
                     break
                 other = _Outlook.of(found, goal, gradients=gradients)
@@ -268,7 +268,7 @@ class _Outlook:
             missed["tangent"] = data.values - linear
             left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
         points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
-        outside = beyond(inputs, regression.basis.values, fit.coefficients, points).share
+        outside = regression.beyond(points).share
         ways = []
         for way, of in left.items():
             missing = regression.rest() if way == "chaos" else None

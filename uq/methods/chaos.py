@@ -38,6 +38,7 @@ from uq.surrogates.field_regression import (
     relative_of_field,
     solved,
 )
+from uq.surrogates.gate import repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import TRUSTED, Regression
@@ -151,8 +152,9 @@ class Chaos(Amount):
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
         """Solve until the claimed errors are those of a goal, or there are no more solves; errors as in `run`."""
-        for found in self.rounds(inputs, evaluate, self.most(goal)):
-            if goal.reached(found.regression.estimates()) <= 1:
+        for one in self.rounds(inputs, evaluate, self.most(goal)):
+            found, reached = one.held_to(goal)
+            if reached <= 1:
                 break
         return self.reported(evaluate, found, f"{found.amount}: {found.error}")
 
@@ -236,12 +238,36 @@ def first_samples(inputs: Inputs, *, gradients: bool) -> int:
 
 @dataclass(frozen=True)
 class Expanded:
-    """An expansion with the evaluations from which it was made, and why they were enough."""
+    """An expansion with the evaluations from which it was made, and why they were enough.
+
+    `unseen` are further errors (2, m) of mean and standard deviation, if it was held to a goal.
+    """
 
     centre: Linearisation
     evaluations: Evaluations
     regression: Regression
     stopped: str = ""
+    unseen: FloatArray | None = None
+
+    def held_to(self, goal: Goal) -> tuple[Expanded, float]:
+        """Return it, and the largest error over what the goal leaves.
+
+        What errors are by its samples is believed only if the whole fit, repeated with fewer of them, says so too.
+        """
+        reached = goal.reached(self.estimates())
+        if reached > 1:
+            return self, reached
+        spread = np.where(self.regression.controlled, 0.0, repeated(self.regression).spread)
+        found = replace(self, unseen=spread)
+        return found, goal.reached(found.estimates())
+
+    def estimates(self) -> dict[str, FloatArray]:
+        """Return estimates by output with their errors, as `Regression.estimates` does."""
+        found = self.regression.estimates()
+        if self.unseen is not None:
+            for name, error in zip(("mean_error", "std_error"), self.unseen, strict=True):
+                found[name] = np.hypot(found[name], error)
+        return found
 
     @property
     def count(self) -> int:
@@ -291,7 +317,7 @@ def expansion_dataset(
     centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
     inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = regression.estimates()
+    estimates = expanded.estimates()
     for name, error in (further or {}).items():
         estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
     lower, upper = (

@@ -12,14 +12,27 @@ from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated, gains
 from uq.estimators.fidelity_quantiles import quantiles_of_groups
-from uq.estimators.moments import Estimates, Z, combine, controlled, ratio, student, term
+from uq.estimators.moments import (
+    Estimates,
+    Z,
+    combine,
+    controlled,
+    either,
+    estimate,
+    monomials,
+    ratio,
+    student,
+    term,
+)
 from uq.estimators.quantiles import Quantiles, quantiles
-from uq.estimators.tails import of_influences, unseen
+from uq.estimators.tails import influences, of_influences, unseen
 from uq.evaluation.request import Evaluations
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
-from uq.surrogates.regression import Regression
+from uq.surrogates.gate import agree, wrong
+from uq.surrogates.reach import beyond
+from uq.surrogates.regression import Regression, tails_of
 from uq.surrogates.taylor import Control, expansion
 
 FEWEST = 8  # samples of a group that gets any
@@ -146,13 +159,14 @@ class ByExpansion:
     Attributes
     ----------
     left
-        Its leave-one-out errors (m,).
+        What it leaves (m,), by the whole fit repeated without each part of its samples.
     """
 
     def __init__(self, team: Team, fitted: Deviations, scale: Estimates) -> None:
         self._team, self._fitted, self._scale = team, fitted, scale
         self._control: Control = expansion(fitted)
-        self.left: FloatArray = fitted.relative * scale.std
+        self._repeats = [expansion(one) for one in fitted.repeats]
+        self.left: FloatArray = np.maximum(fitted.relative, fitted.trial.relative) * scale.std
         self.estimates, self._moved = scale, np.zeros((0, 0))
 
     @classmethod
@@ -222,23 +236,56 @@ class ByExpansion:
         if not count:
             return
         team.take(self._own, count)
-        offset = team.offsets[0]
+        found, moved = self._controlled()
+        # Without the control, the samples that it was fitted to count as well.
+        own = own_values(team)
+        plain: Estimates = estimate(monomials(own - team.offsets[0], None).sum(axis=1), len(own), team.offsets[0])
+        plain = with_tails(team, plain, (influences(own - team.offsets[0], (own - team.offsets[0]) ** 2),))
+        claims, without = (np.hypot(one.mean_error, one.std_error) for one in (found, plain))
+        stands = agree(found, plain) & (claims <= without)
+        self.estimates = either(stands, found, plain)
+        values = self._values()[1]
+        self._moved = np.where(stands, moved, influences(values - team.offsets[0], (values - team.offsets[0]) ** 2))
+
+    def _controlled(self) -> tuple[Estimates, FloatArray]:
+        """Estimates with the expansion as control, and the influences (n, m) of the samples on the variance."""
+        team, offset = self._team, self._team.offsets[0]
         points, values = self._values()
         values = values - offset
-        # The expansion is one of deviations from the solution at the mean parameters.
-        centre = team.members[0].centre.outputs
-        L, _ = self._control.predict(self._control.features(points), self._fitted.outputs)
-        expected, second = self._control.expected(self._fitted.outputs)
-        shift = offset - centre
-        L, expected, second = L - shift, expected - shift, second - 2 * shift * expected + shift**2
-        one = term(values, values**2, (L - expected, L**2 - second))
-        found = combine(offset, [one])
-        first, squares = controlled(values, values**2, (L - expected, L**2 - second))
+        shift = offset - team.members[0].centre.outputs  # the expansion is one of deviations from these
+
+        def centred(control: Control) -> tuple[FloatArray, FloatArray]:
+            """Controls of both moments, of expectation zero."""
+            L, _ = control.predict(control.features(points), control.outputs)
+            expected, second = control.expected(control.outputs)
+            L, expected, second = L - shift, expected - shift, second - 2 * shift * expected + shift**2
+            return L - expected, L**2 - second
+
+        controls = centred(self._control)
+        found = combine(offset, [term(values, values**2, controls)])
+        first, squares = controlled(values, values**2, controls)
         moved = squares - 2 * first.mean(axis=0) * first
-        self._moved = moved - moved.mean(axis=0)
+        moved = moved - moved.mean(axis=0)
         factor = student(max(len(values) - 1, 1)) / Z
-        found = replace(found, mean_error=found.mean_error * factor, std_error=found.std_error * factor)
-        self.estimates = with_tails(team, found, (self._moved,))
+        others = [centred(one) for one in self._repeats]
+        C, D = (np.array([one[i] - controls[i] for one in others]) for i in range(2))
+        of_std = ratio(wrong(D - 2 * first.mean(axis=0) * C), 2 * found.std)
+        found = replace(
+            found,
+            mean_error=np.hypot(found.mean_error * factor, wrong(C)),
+            std_error=np.linalg.norm(
+                np.broadcast_arrays(found.std_error * factor, of_std, self._unseen(points, first)), axis=0
+            ),
+        )
+        return with_tails(team, found, (moved,)), moved
+
+    def _unseen(self, points: FloatArray, left: FloatArray) -> FloatArray:
+        """Error (m,) of the standard deviation from beyond all samples, which leaves so much of them (n, m)."""
+        inputs, fitted = self._team.inputs, self._fitted
+        points = np.concatenate([points, fitted.trial.points])
+        share = beyond(inputs, fitted.basis, fitted.outputs, points, tails_of(inputs)).share
+        norm = left.std(axis=0) / np.maximum(1 - share, 1 / len(points))
+        return np.asarray(np.sqrt(share) * (norm if fitted.rest is None else np.maximum(norm, fitted.rest)))
 
     def doubts(self) -> Iterator[Finding]:
         """Find what a few samples decide."""

@@ -187,9 +187,7 @@ class QuasiMonteCarlo(MonteCarlo):
         growing: Evaluate = evaluate
         if self.fields and fitted is None:
             growing = grown(inputs, evaluate, centre, self.limit)
-        samples = Scrambles(
-            self, inputs, growing, centre, control, held, start, None if fitted is None else fitted.rest
-        )
+        samples = Scrambles(self, inputs, growing, centre, control, held, start, fitted)
         most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
         last = power_of_two(most // self.scrambles)
         open_ended = self.open_ended or goal is not None

@@ -14,16 +14,21 @@ from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, ForwardModel, Solution, SolveError, scattered
 from uq.estimators.doubts import of_field_tails
-from uq.estimators.moments import Coefficient, Estimates, estimate_from_replicates, student
+from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
 from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed
 from uq.evaluation.request import Evaluate, Evaluations, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
+from uq.surrogates.basis import Basis
+from uq.surrogates.field_regression import Deviations
+from uq.surrogates.gate import agree, wrong
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.regression import beyond
-from uq.surrogates.taylor import Control
+from uq.surrogates.reach import Beyond, beyond, drawn_beyond
+from uq.surrogates.regression import tails_of
+from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 
 Pair = tuple[FloatArray, FloatArray]
+MOSTLY = 0.5  # of the variance of an expansion: beyond all samples it is a guess
 LITTLE = 1e-3  # of the standard deviation: errors of means that may be claimed too large
 
 
@@ -101,10 +106,12 @@ class Scrambles:
         control: Control | None,
         held: Control | None,
         start: Start | None,
-        rest: FloatArray | None,
+        fitted: Deviations | None,
     ) -> None:
         self._asked, self._inputs, self._evaluate = asked, inputs, evaluate
-        self._centre, self._control, self._held, self._start, self._rest = centre, control, held, start, rest
+        self._centre, self._control, self._held, self._start, self._fitted = centre, control, held, start, fitted
+        repeats = () if fitted is None else fitted.repeats
+        self._repeats = [(expansion(one), held_expansion(inputs, one)) for one in repeats]
         d, m = len(inputs.names), len(evaluate.outputs)
         self._field_control = control if control is not None and len(control.state) else None
         self.each = 0
@@ -208,62 +215,115 @@ class Scrambles:
             reasons = "; ".join(sorted(self._reasons)[:3])
             message = f"{answers} of {self.scrambles} scrambles have an answer, expected more: {reasons}"
             raise SolveError(message)
-        centre = self._centre
-        ok = self.ok[:, :each]
+        found, hidden = self._estimated(each, self._controls(each))
+        if self._fitted is None:  # Taylor polynomials of a low order have little far out
+            return found
+        plain, _ = self._estimated(each, None)
+        stands = agree(found, plain) & (hidden <= np.hypot(plain.mean_error, plain.std_error))
+        return either(stands, found, plain)
+
+    def _estimated(self, each: int, known: tuple[Pair, Pair] | None) -> tuple[Estimates, FloatArray]:
+        """Estimate the moments from the first points of every scramble, with controls and their expectations or not.
+
+        Also what a control hides (m,): the part of the errors that is in no scatter.
+        """
+        centre, ok = self._centre, self.ok[:, :each]
+        controls, expected = known or (None, None)
         some = ok.any(axis=1)
         deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
-        controls, expected = self._controls(each) or (None, None)
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._asked.coefficient)
-        values, controlled = self.outputs[:, :each][ok], self.controlled(found, each)
+        values, controlled = self.outputs[:, :each][ok], self._left(found, each, controls)
         plain = values - values.mean(axis=0)
         found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(some.sum()))
-        # A tangent grows no faster than a normal quantity; controls that grow faster tell what lies beyond the samples.
         tails = counted(found, self._inputs, values, controlled)
         if controlled is None or self._asked.control == "tangent":
-            return tails
-        of_mean, of_std = self._unseen(each)
-        moved = influences(*controlled)
-        further = np.maximum(of_std, of_influences(found, self._inputs, moved))
-        known = np.hypot(found.std_error * skewed(moved), further)
+            return tails, np.zeros_like(tails.std)
+        first, moved = controlled[0] - controlled[0].mean(axis=0), influences(*controlled)
+        assert known is not None
+        wrong_mean, wrong_std = self._wrong(each, known, found)
+        of_mean, of_std = self._unseen(each, first)
+        of_mean = np.hypot(of_mean, wrong_mean)
+        further = np.hypot(np.maximum(of_std, of_influences(found, self._inputs, moved)), wrong_std)
+        hidden = np.linalg.norm(np.broadcast_arrays(of_mean, of_std, wrong_std), axis=0)
+        known_error = np.hypot(found.std_error * skewed(moved), further)
         # What a polynomial leaves rises too steeply at its outermost samples to say much of its mean beyond them.
         most = np.hypot(found.mean_error, np.maximum(found.mean_error, LITTLE * found.std))
         within = np.minimum(tails.mean_error, most)
-        return replace(
+        claimed = replace(
             found,
             mean_error=np.where(found.coefficient == 0, tails.mean_error, np.hypot(within, of_mean)),
-            std_error=np.where(found.second_coefficient == 0, tails.std_error, known),
+            std_error=np.where(found.second_coefficient == 0, tails.std_error, known_error),
         )
+        return claimed, hidden
 
-    def _unseen(self, each: int) -> Pair:
+    def _unseen(self, each: int, left: FloatArray) -> Pair:
         """Errors (m,) of mean and standard deviation from regions without samples, where a polynomial is the control.
 
-        With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
-        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there, or less where there are many
-        parameters (`Beyond`). λ is in proportion to that at the samples, which have 1 − b of the variance; for the
-        second moment, to which tails matter more, it is at least the norm of what an expansion misses, by the samples
-        of its fit. A tangent does not grow faster than what it stands for.
+        It leaves `left` (n, m) of samples. With the share b of its variance σ² from there, and the norm λ of what it
+        leaves, ∫(f² − C²) over it is at most about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of
+        being there, or less where there are many parameters (`Beyond`). λ is in proportion to that at the samples,
+        which have 1 − b of the variance; for the second moment, to which tails matter more, it is at least the norm of
+        what an expansion misses, by the samples of its fit. A tangent does not grow faster than what it stands for.
         """
-        control = self._control
-        controls = self._controls(each)
+        control, held = self._control, self._which_held(each)
         assert control is not None
-        assert controls is not None
-        ok = self.ok[:, :each]
-        outside, of_mean = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
-        left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
-        norm = left.std(axis=0) / np.maximum(1 - outside, 1 / ok.sum())
-        most = norm if self._rest is None else np.maximum(norm, self._rest)
-        return norm * of_mean, most * np.sqrt(outside)
+        points = self._all_points(each)
+        share, of_mean = self._beyond(control, points)
+        if self._held is not None and held.any():
+            share, of_mean = (
+                np.where(held, *pair) for pair in zip(self._beyond(self._held, points), (share, of_mean), strict=True)
+            )
+        norm = np.sqrt((left**2).mean(axis=0)) / np.maximum(1 - share, 1 / len(points))
+        rest = None if self._fitted is None else self._fitted.rest
+        # What the next powers would be grows without limit, and what is held does not.
+        most = norm if rest is None else np.where(held, norm, np.maximum(norm, rest))
+        return norm * of_mean, most * np.sqrt(share)
+
+    def _all_points(self, each: int) -> FloatArray:
+        """Points (n, d) that have an answer, those of the fit too."""
+        points = self.points[:, :each][self.ok[:, :each]]
+        return points if self._fitted is None else np.concatenate([points, self._fitted.trial.points])
+
+    def _wrong(self, each: int, known: tuple[Pair, Pair], found: Estimates) -> Pair:
+        """Errors (m,) of mean and standard deviation, as differences of the control and its repeated fits show."""
+        ok = self.ok[:, :each, None]
+        some, count = ok.any(axis=(1, 2)), np.maximum(ok.sum(axis=1), 1)
+
+        def means(of: tuple[Pair, Pair]) -> tuple[FloatArray, FloatArray]:
+            C, D = (np.where(ok, one - mean, 0.0).sum(axis=1) / count for one, mean in zip(*of, strict=True))
+            return C[some], D[some]
+
+        if self._fitted is None:
+            return np.zeros_like(found.mean), np.zeros_like(found.std)
+        C, D = means(known)
+        others = [means(self._mixed(*one, each)) for one in self._repeats]
+        first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
+        middle = found.mean - self._centre.outputs
+        return wrong(first), ratio(wrong(second - 2 * middle * first), 2 * found.std)
+
+    def _beyond(self, control: Control, points: FloatArray) -> Beyond:
+        """Return what a control has in tails beyond points (n, d)."""
+        tails = tails_of(self._inputs)
+        match control.polynomials:
+            case Held(basis, lower, upper):
+                return beyond(self._inputs, basis, control.outputs, points, tails, (lower, upper))
+            case Basis() as basis:
+                return beyond(self._inputs, basis, control.outputs, points, tails)
+            case polynomials:
+                return drawn_beyond(self._inputs, polynomials.values, control.outputs, points, tails)
 
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
-        if self._control is None:
-            return None
-        controls, expected = self._of(self._control, each)
+        return None if self._control is None else self._mixed(self._control, self._held, each)
+
+    def _mixed(self, control: Control, held_one: Control | None, each: int) -> tuple[Pair, Pair]:
+        """Return the same of a control, and of one that is held in place of it where this is to be."""
+        controls, expected = self._of(control, each)
         held = self._which_held(each)
-        if self._held is not None and held.any():
-            (C, D), (C_mean, D_mean) = self._of(self._held, each)
+        if held_one is not None and held.any():
+            (C, D), (C_mean, D_mean) = self._of(held_one, each)
             controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
             expected = np.where(held, C_mean, expected[0]), np.where(held, D_mean, expected[1])
         return controls, expected
@@ -277,7 +337,7 @@ class Scrambles:
         """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own.
 
         By samples that tell the two apart: one hardly beyond says nothing, and what is held wrongly errs where no
-        sample is.
+        sample is. And those that have most of their variance beyond all samples.
         """
         if self._control is None or self._held is None:
             return np.zeros(self.outputs.shape[2], dtype=bool)
@@ -288,15 +348,19 @@ class Scrambles:
             for control in (self._control, self._held)
         )
         told = 2 * np.abs(whole - held) > np.maximum(np.abs(whole), np.abs(held))
-        return np.asarray(np.where(told, whole**2 - held**2, 0.0).sum(axis=0) > 0)
+        guessed = self._beyond(self._control, self._all_points(each)).share > MOSTLY
+        return np.asarray(guessed | (np.where(told, whole**2 - held**2, 0.0).sum(axis=0) > 0))
 
     def controlled(self, found: Estimates, each: int) -> Pair | None:
         """Samples (n, m) of both moments, the first of them that have an answer, with controls."""
         known = self._controls(each)
-        if known is None:
+        return None if known is None else self._left(found, each, known[0])
+
+    def _left(self, found: Estimates, each: int, controls: Pair | None) -> Pair | None:
+        if controls is None:
             return None
         ok = self.ok[:, :each]
-        C, D = (control[ok] for control in known[0])
+        C, D = (control[ok] for control in controls)
         first = self.outputs[:, :each][ok] - self._centre.outputs
         return first - found.coefficient * C, first**2 - found.second_coefficient * D
 
@@ -316,7 +380,9 @@ class Scrambles:
             return None
         expected = None if self._field_control is None else self._field_control.expected(self._field_control.state)
         replicates = np.stack(means, axis=1)
-        if self._which_held(self.each).any():
+        found = self.scalars(self.each)
+        refused = (found.coefficient == 0) & (found.second_coefficient == 0) & (self._fitted is not None)
+        if self._which_held(self.each).any() or refused.any():
             # What is known of the field is where the samples of the expansion are not: it controls nothing.
             replicates, expected = replicates[:2], None
         return estimate_from_replicates(replicates, self._centre.state, expected, self._asked.coefficient)

@@ -67,6 +67,14 @@ class Joint:
         inverse[np.ix_(told, told)] = np.linalg.inv(part) * np.sign(np.diag(part))
         return cls(members, indices, inverse)
 
+    def values(self, t: FloatArray) -> FloatArray:
+        """Return the functions (n, Q) at coordinates (n, k)."""
+        return self.made([hermite(column, int(self.indices.max(initial=1))) for column in t.T])
+
+    def made(self, tables: list[FloatArray]) -> FloatArray:
+        """Return the functions (n, Q), or derivatives of them, from tables (n, N + 1) of single coordinates."""
+        return np.asarray(_products(tables, self.indices) @ self.inverse)
+
     def number(self, indices: IntArray) -> IntArray:
         """Return which functions (P,) have the degrees of multi-indices (P, d) of all parameters."""
         numbers = {index.tobytes(): i for i, index in enumerate(self.indices)}
@@ -159,15 +167,12 @@ class Basis:
         start, joint = int(self.joint.members[0]), self.joint
         own, together = values[:start], values[start:]
 
-        def orthonormal_of(tables: list[FloatArray]) -> FloatArray:
-            return np.asarray(_products(tables, joint.indices) @ joint.inverse)
-
         for i, table in enumerate(slopes[start:]):
             derived = np.zeros((len(t), len(joint.indices)))
             varying = np.flatnonzero(joint.indices[:, i])
             derived[:, varying] = _products([*together[:i], table, *together[i + 1 :]], joint.indices[varying])
             slopes[start + i] = derived @ joint.inverse
-        return [*own, orthonormal_of(together)], slopes
+        return [*own, joint.made(together)], slopes
 
     @property
     def _degrees(self) -> list[int]:

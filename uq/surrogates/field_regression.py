@@ -24,6 +24,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
 from uq.surrogates.candidates import candidates_of, rows_of
+from uq.surrogates.gate import Trial, repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.regression import Regression
@@ -123,6 +124,10 @@ class Deviations:
         Lowest and highest coordinates (2, d) of the samples that were fitted.
     rest
         Norms (m,) of what the functions miss in the outputs, see `Regression.missing`; None if no parameter has a tail.
+    trial
+        Fits to parts of the samples.
+    repeats
+        These in place of this one, of the outputs alone.
     """
 
     basis: Basis
@@ -133,6 +138,13 @@ class Deviations:
     prediction: StateExpansion | None
     reach: FloatArray
     rest: FloatArray | None
+    trial: Trial
+    repeats: tuple[Deviations, ...] = ()
+
+    def of(self, basis: Basis, coefficients: FloatArray, outputs: FloatArray) -> Deviations:
+        """Return another fit (P, m) to some of the samples in place of this one, without a state."""
+        coefficients = _deviating(basis, coefficients, outputs)
+        return replace(self, basis=basis, outputs=coefficients, state=np.zeros((len(coefficients), 0)), prediction=None)
 
 
 def fit_deviations(
@@ -155,10 +167,15 @@ def fit_deviations(
     )
 
 
+def _deviating(basis: Basis, coefficients: FloatArray, outputs: FloatArray) -> FloatArray:
+    """Coefficients (P, m) of deviations from outputs (m,)."""
+    return coefficients - np.outer((basis.indices == 0).all(axis=1), outputs)
+
+
 def deviations(regression: Regression, evaluations: Evaluations, centre: Linearisation) -> Deviations:
     """Return an expansion as one of deviations, with the state where `Projections` of it were summed."""
     fit, basis, data = regression.fit, regression.basis, regression.data
-    outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
+    outputs = _deviating(basis, fit.coefficients, centre.outputs)
     state, prediction = np.zeros((len(outputs), 0)), None
     if evaluations.fields.size:
         state = solved(fit, evaluations.fields[fit.chosen.which])
@@ -166,7 +183,9 @@ def deviations(regression: Regression, evaluations: Evaluations, centre: Lineari
     t = regression.inputs.coordinates.of(data.points)
     reach = np.array([t.min(axis=0), t.max(axis=0)])
     rest = regression.missing()
-    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest)
+    trial = repeated(regression)
+    found = Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest, trial)
+    return replace(found, repeats=tuple(found.of(*one, centre.outputs) for one in trial.fits))
 
 
 @dataclass(frozen=True)
@@ -263,7 +282,7 @@ def relative_of_field(regression: Regression) -> float:
 def beyond_of_field(regression: Regression) -> float:
     """Return the share of the variance of the fit to the field from where no samples are, as `Regression.beyond`."""
     variances = _variances(regression.fit)
-    return float(shares(variances @ regression.beyond, variances.sum()))
+    return float(shares(variances @ regression.beyond().share, variances.sum()))
 
 
 def _variances(fit: Fit) -> FloatArray:

@@ -6,9 +6,8 @@ and what distributions with tails hide.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from uq.surrogates.basis import Basis, IntArray, orthonormal, recurrence
 from uq.surrogates.candidates import DICTIONARY, FULL, Candidates, candidates_of, rows_of
 from uq.surrogates.hidden import of_std
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
+from uq.surrogates.reach import Beyond, beyond
 
 BoolArray = NDArray[np.bool_]
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
@@ -32,43 +32,6 @@ CLOSE = 0.03  # relative leave-one-out error above which the tails of the sample
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
 SYMMETRIC = 0.01  # share of even powers up to which a function is odd, and the reverse
-COMMON = 2  # parameters of which what is missed in their tails adds up
-
-
-class Beyond(NamedTuple):
-    """What an expansion has where no samples are.
-
-    Attributes
-    ----------
-    share
-        Of its variance (m,).
-    mean
-        √(b p) (m,), with the share b of the variance and the probability p of these places: a bound of the mean over
-        them, over the norms. It adds up what is missed of all parameters as if it had one sign; where these are many,
-        of `COMMON` of them, and no sign is common to the others.
-    """
-
-    share: FloatArray
-    mean: FloatArray
-
-
-def beyond(
-    inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
-) -> Beyond:
-    """Return what an expansion (P, m) has in tails beyond all points (n, d)."""
-    m = coefficients.shape[1]
-    tails = _tails(inputs)
-    if not tails.any():
-        return Beyond(np.zeros(m), np.zeros(m))
-    drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(tails)))
-    each = ((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails
-    outside = each.any(axis=1)
-    values = functions(drawn) @ coefficients
-    squares = (values - values.mean(axis=0)) ** 2
-    total = squares.sum(axis=0)
-    share = shares(squares[outside].sum(axis=0), total)
-    apart = COMMON * each.mean(axis=0) @ shares(each.T.astype(float) @ squares, total)
-    return Beyond(share, np.sqrt(np.minimum(share * outside.mean(), apart)))
 
 
 @dataclass(frozen=True)
@@ -158,7 +121,7 @@ class Regression:
         samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
         then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
         """
-        tails = _tails(self.inputs)
+        tails = tails_of(self.inputs)
         if not tails.any():
             return None
         basis, data = self.basis, self.data
@@ -173,7 +136,7 @@ class Regression:
 
     def _hidden(self, missing: FloatArray) -> FloatArray:
         """Return errors (m,) of standard deviations by what is `missing` (m,): that itself of many parameters."""
-        tails = _tails(self.inputs)
+        tails = tails_of(self.inputs)
         if tails.size > FULL or self.inputs.draws is not None:
             return missing
         return of_std(self.inputs, tails, self.basis, self.data, self.fit, missing)
@@ -196,10 +159,10 @@ class Regression:
         lacks = alike <= SYMMETRIC * ((degrees > 1).T @ squares)
         return np.asarray(np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0))
 
-    @property
-    def beyond(self) -> FloatArray:
-        """Share (m,) of the variance of the fit that comes from where there are no samples."""
-        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points).share
+    def beyond(self, points: FloatArray | None = None) -> Beyond:
+        """Return what the fit has in tails beyond its samples, or beyond points (n, d)."""
+        points = self.data.points if points is None else points
+        return beyond(self.inputs, self.basis, self.fit.coefficients, points, tails_of(self.inputs))
 
     @property
     def controlled(self) -> BoolArray:
@@ -213,7 +176,7 @@ class Regression:
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
         rest = self.rest()
         whole = self.fit.relative if rest is None else shares(rest, self.data.values.std(axis=0))
-        yield from of_reach(names, self.beyond, self.fit.relative, whole, n)
+        yield from of_reach(names, self.beyond().share, self.fit.relative, whole, n)
         trusted = np.flatnonzero(self.fit.relative <= TRUSTED)
         drawn = self.inputs.points(sobol_points(0, 0, 0, POINTS, len(self.inputs.names)))
         values = self.basis.values(drawn) @ self.fit.coefficients[:, trusted]
@@ -230,7 +193,7 @@ class Regression:
             )
 
 
-def _tails(inputs: Inputs) -> BoolArray:
+def tails_of(inputs: Inputs) -> BoolArray:
     """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
     bounded = [marginal.support is not None for marginal in inputs.marginals.values()]
     return ~np.array(bounded, dtype=bool) | np.isin(np.arange(len(bounded)), inputs.joint)

@@ -18,16 +18,14 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
 from uq.evaluation.request import Evaluate, Request
 from uq.inputs.coordinates import Coordinates
-from uq.inputs.distributions import Distribution
-from uq.inputs.quadrature import panels
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, gauss_rule
 from uq.surrogates.field_regression import Deviations
 from uq.surrogates.linearisation import Linearisation
+from uq.surrogates.reach import normal_rule
 
 STEP = 0.5  # of the difference quotients, in standard deviations: wide, to capture the curvature where the samples lie
 MARGIN = 0.25  # of the range of its samples, by which an expansion is used beyond them on either side
-FAR = 9.0  # standard deviations beyond which a normal density is negligible
 EDGE = 1e-9  # probability of the quantile that replaces the end of an unbounded range
 
 
@@ -116,7 +114,7 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
         if i in inputs.joint:
             continue
         if tails[i]:
-            t, weights = _normal_rule(marginal, held.lower[i], held.upper[i])
+            t, weights = normal_rule(marginal, [held.lower[i], held.upper[i]])
             table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
         else:
             t, weights = gauss_rule(marginal, int(fitted.basis.indices[:, i].max()) + 1)
@@ -142,18 +140,6 @@ class Held:
         """Return φ (n, k) at points (n, d)."""
         coordinates = self.basis.coordinates
         return self.basis.values(coordinates.points(np.clip(coordinates.of(points), self.lower, self.upper)))
-
-
-def _normal_rule(marginal: Distribution, lower: float, upper: float) -> tuple[FloatArray, FloatArray]:
-    """Coordinates t and weights of a rule for functions with kinks at the coordinates lower and upper."""
-    from scipy.special import ndtri
-
-    alone = Inputs({"": marginal}).coordinates
-    p = marginal.cumulative(alone.points(np.array([[lower], [upper]]))[:, 0])
-    kinks = np.clip(ndtri(p), -FAR, FAR).tolist()
-    z, weights = panels(sorted({*np.linspace(-FAR, FAR, 7).tolist(), *kinks}))
-    weights = weights * np.exp(-(z**2) / 2)
-    return alone.of(marginal.from_normal(z)[0][:, None])[:, 0], weights / weights.sum()
 
 
 def tangent(inputs: Inputs, centre: Linearisation) -> Control:

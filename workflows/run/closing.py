@@ -109,6 +109,8 @@ def _bars(summary: Mapping[str, Any]) -> list[str]:
     shares, costs = told["shares"], summary.get("accuracy_seconds", {})
     worst = f"the {told['worst']['of']} of {told['worst']['output']}"
     kept = "kept" if told["kept"] else "NOT kept"
+    if told["unmet"]:
+        kept += f", all samples of {', '.join(told['unmet'])} are the same"
     if told["mesh"] is not None and not told["mesh"]["estimated"]:
         kept += " but for the mesh, whose error is not known"
     lines = [f"tolerance {told['tolerance']:g}: {kept}; {worst} is known to {told['reached']:.2g}"]

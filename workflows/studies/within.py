@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import Finding, FloatArray, SolveError
+from uq.accuracy.consequences import has
 from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.goal import Goal
+from uq.estimators.doubts import equal, unmet
 from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations
@@ -107,10 +109,12 @@ def _told(
         known = not (study.spec.meshed or study.spec.hidden) or not study.accuracy.mesh_error
     else:
         known = all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
+    missed = _unmet(found)
     return {
         "tolerance": goal.tolerance,
         "reached": float(goal.tolerance * parts["total"][row, column]),
-        "kept": known and bool((parts["total"] <= 1).all()),
+        "kept": known and not missed and bool((parts["total"] <= 1).all()),
+        "unmet": missed,
         "worst": {"output": names[column], "of": IN_WORDS[ESTIMATED[row]]},
         "shares": {source: float(parts[source][row, column]) for source in SOURCES},
         "method": chosen["method"],
@@ -135,6 +139,15 @@ def _told(
             for i, name in enumerate(names)
         },
     }
+
+
+def _unmet(found: xr.Dataset) -> dict[str, float]:
+    """Return what share of all cases samples may have missed, by output of which all of them are the same."""
+    if not has(found, "values", "sample", "output"):
+        return {}
+    values = found["values"].to_numpy()[found["ok"].to_numpy()]
+    names = np.array([str(name) for name in found["output"].values])
+    return dict.fromkeys(names[equal(values)].tolist(), unmet(len(values))) if len(values) else {}
 
 
 def _corrected(found: xr.Dataset, output: int) -> bool:
@@ -203,6 +216,17 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
     reached = f"{of} is known to {told['reached']:.2g}"
     asked_for = f"accuracy.tolerance = {told['tolerance']:g}"
     text = f"{asked_for} is not reached: {reached} (of the tolerance: {taken})."
+    if told["unmet"]:
+        listed = ", ".join(told["unmet"])
+        share = max(told["unmet"].values())
+        yield Finding(
+            "error",
+            f"{asked_for} is not known to be reached: all samples of {listed} are the same, so that what happens in up "
+            f"to {share:.2g} of all cases may be missed, and with it any part of mean and standard deviation. Leave a "
+            "constant out of the outputs; to meet an event, give a [method] with many samples.",
+        )
+        if shares["total"] <= 1 and (told["mesh"] is None or told["mesh"]["estimated"]):
+            return
     if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
         if told["mesh"] is not None and told["mesh"]["tried"]:
             why = f" {told['reasons'][0]}"

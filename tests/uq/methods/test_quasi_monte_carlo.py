@@ -426,7 +426,7 @@ def test_moments_of_what_is_held():
     basis_of = basis.orthonormal(inputs, basis.hyperbolic(4, 3, 1.0))
     reach = np.array([[-1.0] * 4, [1.2] * 4])
     nothing = np.zeros((len(basis_of.indices), 0))
-    fitted = Deviations(basis_of, nothing, nothing, np.zeros(0), np.ones(4, dtype=bool), None, reach, None)
+    fitted = Deviations(basis_of, nothing, nothing, np.zeros(0), np.ones(4, dtype=bool), None, reach, None, None)
     control = taylor.held_expansion(inputs, fitted)
     features = control.features(inputs.points(remembered(1, 0, 0, 2**15, 4)))
     assert np.abs(features).max() < 60  # of the basis itself: thousands

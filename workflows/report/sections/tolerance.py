@@ -31,6 +31,12 @@ class Tolerance(Section):
             f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
             tone="lead" if told["kept"] else "warning",
         )
+        for name, share in told.get("unmet", {}).items():
+            yield Text(
+                f"All samples of {name} are the same: what happens in up to {number(100 * share, 2)} % of all cases "
+                "may be missed.",
+                tone="warning",
+            )
         if told["mesh"] is not None and not told["mesh"]["estimated"]:
             yield Text("The error of the mesh is not known, and not counted.", tone="warning")
         yield Pictures([Picture.drawn(plots.tolerance_bars(told), "What each error takes of the tolerance.")])
