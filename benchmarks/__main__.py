@@ -31,6 +31,7 @@ NAMES = (
     "population",
     "designs",
     "intervals",
+    "posteriors",
     "streaming",
     "tails",
     "stability",

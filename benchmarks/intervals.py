@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from inverse.criticism.comparison import quantiles
+from inverse.criticism.answer import quantiles
 from inverse.methods.invert_few import invert_by_group
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
