@@ -136,7 +136,7 @@ def invert_by_reduced(
     full, cheap = Recorder(evaluate), Recorder(SerialEvaluate(reduced))
     centre, corrected = _corrected(inputs, full, cheap, data, method, errors)
     for number in range(1, ROUNDS + 1):
-        found = inverted(inputs, corrected, data, method, None, errors, finer, lambda _: None, say, None, reduced)
+        found = inverted(inputs, corrected, data, method, None, errors, finer, lambda _: None, say, None)
         checked, points, left = _checked(found, full, centre, corrected, method)
         share = f"weights worth {100 * checked.share:.0f} % of {method.reduced.solves} draws"
         say(f"posterior by the reduced model against full solves: {share}")

@@ -141,7 +141,6 @@ def invert_by_group(
 def invert_by_all(
     inputs: Inputs,
     evaluate: Evaluate,
-    model: ForwardModel,
     data: Data,
     method: Invert,
     look: Look | None,
@@ -149,6 +148,7 @@ def invert_by_all(
     finer: Finer | None = NOT_LOOKED,
     say: Callable[[str], None] = lambda line: None,
     shared: Shared | None = None,
+    model: ForwardModel | None = None,
 ) -> xr.Dataset:
     """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
     return inverted(
@@ -177,7 +177,7 @@ def inverted(
     start: Callable[[FloatArray], Start | None],
     say: Callable[[str], None],
     shared: Shared | None,
-    model: ForwardModel,
+    model: ForwardModel | None = None,
 ) -> Inverted:
     """Invert a data set, as `invert_by_group`; `start` predicts states from a solution at parameters (d,)."""
     counted = Recorder(evaluate)
@@ -246,12 +246,15 @@ def inverted(
 
 
 def _chains(
-    posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert, model: ForwardModel
+    posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert, model: ForwardModel | None
 ) -> Chains | None:
     match method.chains:
         case None:
             return None
         case "hmc":
+            if model is None:
+                message = "chains = 'hmc' follow the gradients of a model itself, which is not given"
+                raise ValueError(message)
             return gradient_chains(posterior, gaussian, model, seed=method.seed)
         case "emcee":
             return ensemble(posterior, gaussian, seed=method.seed)

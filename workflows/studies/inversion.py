@@ -235,6 +235,9 @@ class InversionStudy(StudyKind):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
                 yield ("method", "chains"), message, self.method.chains
+        if self.method.chains == "hmc" and self.method.reduced is not None:
+            message = "follows the gradients of the body itself, expected 'pcn' or 'emcee' with a reduced model"
+            yield ("method", "chains"), message, self.method.chains
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         yield from mistakes_of_factor(self.method.noise, "method", "noise")
         for name, value in self.data.truth.items():

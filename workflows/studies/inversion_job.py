@@ -419,7 +419,7 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
         else:
             full = recorders["/"]
             found = invert_by_all(
-                study.inputs, full, observed, data, study.method, made.look, errors, finer, say, shared
+                study.inputs, full, data, study.method, made.look, errors, finer, say, shared, observed
             )
         if study.predict is not None:
             recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
