@@ -18,7 +18,8 @@ from inverse.data.units import factor, split_head
 from inverse.fields.noise import Marginal
 from inverse.low_dimensional.evidence import weighed
 from inverse.low_dimensional.laplace import Laplace
-from inverse.low_dimensional.surrogate import SCRAMBLES, SHARE, WIDER, Mixture
+from inverse.low_dimensional.proposals import SHARE, WIDER, Mixture
+from inverse.low_dimensional.surrogate import SCRAMBLES
 from uq.inputs.distributions import LogNormal, LogUniform
 
 pytestmark = pytest.mark.unit

@@ -189,7 +189,7 @@ def test_one_adjoint_gives_all_gradients_at_the_price_of_one_solve():
     solution.adjoint(np.eye(len(model.outputs))[2])  # what the numbers of the model need is at hand
     before = solution.work.as_array()
     gradient = solution.adjoint(np.eye(len(model.outputs))[4])
-    residuals, assemblies, factorisations, back_substitutions, _ = solution.work.as_array() - before
+    residuals, assemblies, factorisations, back_substitutions, *_ = solution.work.as_array() - before
     assert gradient.shape == (len(point),)
     assert (residuals, assemblies, factorisations, back_substitutions) == (2, 0, 0, 1)  # one for each of two fields
 

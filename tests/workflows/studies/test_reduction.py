@@ -194,7 +194,13 @@ seed = 1
 cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "reduced", file = "model.npz" } }]
 """
     (folder / "several.toml").write_text(BODY + method)
-    assert main(["run", str(folder / "several.toml"), "--out", str(folder / "several"), "--quiet", "--no-report"]) == 0
+    code = main(["run", str(folder / "several.toml"), "--out", str(folder / "several"), "--quiet", "--no-report"])
+    summary = json.loads((folder / "several" / "summary.json").read_text())
+    errors = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert code == 3
+    assert [text.split(" failed")[0] for text in errors] == [
+        "2 of 3 estimates of the error of the mesh"
+    ]  # of two cells
     found, body = (xr.load_dataset(folder / name / "results.nc") for name in ("several", "direct"))
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 

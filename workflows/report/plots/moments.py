@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Estimated = Literal["mean", "std"]
 FIRST_SHOWN = 8  # estimates from fewer samples are meaningless
 MOST_BINS = 200
+WIDEST = 40  # characters of a name beside a plot
 
 
 def running_estimates(
@@ -175,7 +176,8 @@ def comparison(
     values = [float(d[estimated]) for d in shown.values()]
     errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
-    ax.set_yticks(places, [text_of(name) for name in shown])
+    short = [name if len(name) <= WIDEST else f"…{name[1 - WIDEST :]}" for name in shown]  # a long path leaves no room
+    ax.set_yticks(places, [text_of(name) for name in short])
     ax.set_ylim(-0.6, len(shown) - 0.4)
     ax.locator_params(axis="x", nbins=6)
     word = {"mean": "mean", "std": "standard deviation"}[estimated]
