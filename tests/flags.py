@@ -16,8 +16,7 @@ KERNELS = {"NEHALEM": "sse4_2", "HASWELL": "avx2"}
 
 
 def ways():
-    """Environments by their names, as far as this processor has what they need."""
-    yield "as it is", {}, ""
+    """Environments by their names, each with what a processor must have; `make test` is the one without changes."""
     for level, needed in LEVELS.items():
         flags = " ".join(native.FLAGS).replace("-march=native", f"-march={level}")
         yield f"compiled for {level}", {"TISSUQ_CFLAGS": flags}, needed
@@ -44,7 +43,7 @@ def main(arguments):
     say(f"processor: {processor()}")
     failed = 0
     for name, changes, needed in ways():
-        if needed and needed not in native.processor().split():
+        if needed not in native.processor().split():
             say(f"{name}: this processor has no {needed}")
             continue
         begin = time.monotonic()
