@@ -156,4 +156,4 @@ def test_the_recipe_of_conda_needs_what_the_wheel_needs():
 
 def test_the_extras_of_the_page_are_those_that_there_are():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(extras) - {"benchmarks", "check", "dev"}
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(extras) - {"benchmarks", "dev"}
