@@ -265,14 +265,23 @@ class Discretisation(Linearisation):
         self.set_state(u)
         return not ranks.smallest(self.comm, float(self.gradients()[axes, axes, nodes].min(initial=np.inf))) > 0
 
-    def turned(self, u: FloatArray, v: FloatArray) -> float:
-        """Largest angle (rad) by which a node is turned from a state to another, by polar decompositions."""
+    def turned(self, u: FloatArray, v: FloatArray, least: float) -> float:
+        """Largest angle (rad) by which a node is turned from a state to another; 0 if no node is by `least` or more.
+
+        Polar decompositions F = RU are taken where R may differ so much: ‖R − R'‖ ≤ 2 ‖F − F'‖/(σ + σ') with the
+        smallest singular values (R.-C. Li, SIAM J. Matrix Anal. Appl. 16 (1995) 327), and σ ≥ 2 det F/‖F‖².
+        """
         found = []
         for state in (u, v):
             self.set_state(state)
-            found.append(rotations(self.gradients()))
-        traces = np.einsum("abn,abn->n", *found)
-        trace = ranks.smallest(self.comm, float(traces.min(initial=3.0)))
+            found.append(self.gradients())
+        smallest = [2 * _determinants(F) / np.einsum("abn,abn->n", F, F) for F in found]
+        change = found[0] - found[1]
+        apart = 2 * np.sqrt(np.einsum("abn,abn->n", change, change))
+        chord = 2 * np.sqrt(2) * np.sin(least / 2)  # ‖R − R'‖ of that angle
+        near = (smallest[0] > 0) & (smallest[1] > 0) & (apart < chord * (smallest[0] + smallest[1]))
+        one, other = (rotations(np.ascontiguousarray(F[:, :, ~near])) for F in found)
+        trace = ranks.smallest(self.comm, float(np.einsum("abn,abn->n", one, other).min(initial=3.0)))
         return float(np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0)))
 
     def has_factor(self, u: FloatArray) -> bool:
@@ -375,3 +384,8 @@ class Discretisation(Linearisation):
             return 0.0
         strained = min(1.0, self.norm(u) / self._extent)
         return 0.0 if lacking <= VOLUME_ROUNDING * strained * self._volumes_size else lacking * self._force_per_volume()
+
+
+def _determinants(F: FloatArray) -> FloatArray:
+    """Determinants (n,) of matrices (3, 3, n)."""
+    return np.asarray(np.einsum("an,an->n", F[0], np.cross(F[1], F[2], axis=0)))

@@ -56,7 +56,7 @@ def strayed(
     if apart > max(NEAR * moved, NEAR * (length or 0.0), FEW * system.norm(u)):
         share = apart / moved if moved > 0 else np.inf
         return f"its distance from the tangent's prediction is {share:.2g} of the way"
-    angle = system.turned(predicted, u)
+    angle = system.turned(predicted, u, TURNED)
     if angle > TURNED:
         return f"a node is turned by {np.degrees(angle):.0f}° against the prediction"
     return ""

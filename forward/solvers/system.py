@@ -103,8 +103,8 @@ class System(Protocol):
     def crossed(self, u: FloatArray) -> bool:
         """Whether the body has passed through a plane that holds it along the normal n: n·Fn ≤ 0 somewhere on it."""
 
-    def turned(self, u: FloatArray, v: FloatArray) -> float:
-        """Largest angle (rad) by which a node is turned from one state to another."""
+    def turned(self, u: FloatArray, v: FloatArray, least: float) -> float:
+        """Largest angle (rad) by which a node is turned from a state to another; 0 if no node is by `least` or more."""
 
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
