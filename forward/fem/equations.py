@@ -43,6 +43,7 @@ class Discretisation(Linearisation):
     """
 
     _deadline: tuple[float, float] | None = None  # when the time of a solve ends, and its length
+    _deformed: tuple[FloatArray, FloatArray] | None = None  # a state, and the deformation gradients there
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
@@ -257,31 +258,27 @@ class Discretisation(Linearisation):
         held = np.bincount(nodes, minlength=self.nodes_owned)[nodes] < 3
         return nodes[held], axes[held]
 
+    def gradients_at(self, u: FloatArray) -> FloatArray:
+        """Deformation gradients (3, 3, n_owned) at the nodes of a state u (U_local,); the last ones are remembered."""
+        if self._deformed is None or self._deformed[0] is not u:
+            self.set_state(u)
+            self._deformed = (u, self.gradients())
+        return self._deformed[1]
+
     def crossed(self, u: FloatArray) -> bool:
         """Whether n·Fn ≤ 0 at a node that is held along an axis n."""
         nodes, axes = self._planes
         if ranks.smallest(self.comm, -float(len(nodes))) == 0:
             return False
-        self.set_state(u)
-        return not ranks.smallest(self.comm, float(self.gradients()[axes, axes, nodes].min(initial=np.inf))) > 0
+        return not ranks.smallest(self.comm, float(self.gradients_at(u)[axes, axes, nodes].min(initial=np.inf))) > 0
 
-    def turned(self, u: FloatArray, v: FloatArray, least: float) -> float:
-        """Largest angle (rad) by which a node is turned from a state to another; 0 if no node is by `least` or more.
+    def rotations(self, u: FloatArray) -> FloatArray:
+        """Rotations (3, 3, n_owned) of the nodes from rest to a state u (U_local,)."""
+        return rotations(self.gradients_at(u))
 
-        Polar decompositions F = RU are taken where R may differ so much: ‖R − R'‖ ≤ 2 ‖F − F'‖/(σ + σ') with the
-        smallest singular values (R.-C. Li, SIAM J. Matrix Anal. Appl. 16 (1995) 327), and σ ≥ 2 det F/‖F‖².
-        """
-        found = []
-        for state in (u, v):
-            self.set_state(state)
-            found.append(self.gradients())
-        smallest = [2 * _determinants(F) / np.einsum("abn,abn->n", F, F) for F in found]
-        change = found[0] - found[1]
-        apart = 2 * np.sqrt(np.einsum("abn,abn->n", change, change))
-        chord = 2 * np.sqrt(2) * np.sin(least / 2)  # ‖R − R'‖ of that angle
-        near = (smallest[0] > 0) & (smallest[1] > 0) & (apart < chord * (smallest[0] + smallest[1]))
-        one, other = (rotations(np.ascontiguousarray(F[:, :, ~near])) for F in found)
-        trace = ranks.smallest(self.comm, float(np.einsum("abn,abn->n", one, other).min(initial=3.0)))
+    def angle(self, R: FloatArray, Q: FloatArray) -> float:
+        """Largest angle (rad) between rotations (3, 3, n_owned) of the nodes of all ranks."""
+        trace = ranks.smallest(self.comm, float(np.einsum("abn,abn->n", R, Q).min(initial=3.0)))
         return float(np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0)))
 
     def has_factor(self, u: FloatArray) -> bool:
@@ -384,8 +381,3 @@ class Discretisation(Linearisation):
             return 0.0
         strained = min(1.0, self.norm(u) / self._extent)
         return 0.0 if lacking <= VOLUME_ROUNDING * strained * self._volumes_size else lacking * self._force_per_volume()
-
-
-def _determinants(F: FloatArray) -> FloatArray:
-    """Determinants (n,) of matrices (3, 3, n)."""
-    return np.asarray(np.einsum("an,an->n", F[0], np.cross(F[1], F[2], axis=0)))

@@ -208,9 +208,7 @@ class ReferenceFactor:
 
     def rotation(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
-        equations = self._equations
-        equations.set_state(u)
-        return rotations(equations.gradients(), self._rotations)
+        return rotations(self._equations.gradients_at(u), self._rotations)
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
@@ -272,11 +270,16 @@ class WayFromReference:
         self.reference, self.joined = reference, reference.joined
         self.state = reference.state
         self.rotation: FloatArray | None = None
+        self._predicted: FloatArray | None = None
 
     def corrector(self, u: FloatArray) -> Corrector:
         """Return the corrector at a prediction u (U_local,), whose rotations are remembered."""
-        self.rotation = self._factor.rotation(u)
+        self._predicted, self.rotation = u, self._factor.rotation(u)
         return self._factor.corrector(self.rotation)
+
+    def rotations(self, u: FloatArray) -> FloatArray:
+        """Return the rotations (3, 3, n_owned) of the nodes from the reference to u (U_local,)."""
+        return self.rotation if self.rotation is not None and u is self._predicted else self._factor.rotation(u)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve (U_local,) with the factor at the reference."""

@@ -39,13 +39,11 @@ REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been f
 LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
 
 
-def strayed(
-    system: System, before: FloatArray, predicted: FloatArray, u: FloatArray, length: float | None = None
-) -> str:
+def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatArray, way: Way | None = None) -> str:
     """Say why a state u may lie on another branch than the one before, from which a tangent predicted it; or nothing.
 
     Where tools touch the body the tangent predicts little, and only planes are looked at. Distances from the prediction
-    are compared with the `length` of the way, if that is known to be more than the state has moved.
+    are compared with the length of the `way`, if that is known to be more than the state has moved.
     """
     system.work.screens += 1
     if system.crossed(u):
@@ -53,10 +51,11 @@ def strayed(
     if system.contact:
         return ""
     moved, apart = system.norm(u - before), system.norm(u - predicted)
-    if apart > max(NEAR * moved, NEAR * (length or 0.0), FEW * system.norm(u)):
+    if apart > max(NEAR * moved, NEAR * (way.length if way is not None else 0.0), FEW * system.norm(u)):
         share = apart / moved if moved > 0 else np.inf
         return f"its distance from the tangent's prediction is {share:.2g} of the way"
-    angle = system.turned(predicted, u, TURNED)
+    rotations = system.rotations if way is None else way.rotations
+    angle = system.angle(rotations(predicted), rotations(u))
     if angle > TURNED:
         return f"a node is turned by {np.degrees(angle):.0f}° against the prediction"
     return ""
@@ -196,7 +195,7 @@ def settled(
     if settings.accept_unstable:
         return found
     predicted = start if found.predicted is None else found.predicted
-    why = strayed(system, start, predicted, found.state, None if way is None else way.length)
+    why = strayed(system, start, predicted, found.state, way)
     if way is not None and not way.joined:
         why = why or "the reference is not joined to rest"
     if not why and not audit:
@@ -250,7 +249,7 @@ def _leads(
             predicted = u
             mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
             u, residual = mixed.state, mixed.residual
-            if not mixed.reached or strayed(system, way.state, predicted, u, way.length):
+            if not mixed.reached or strayed(system, way.state, predicted, u, way):
                 return False
             known.append((t, ((u - way.state) / t - slope) / t))
             last = k == STEPS

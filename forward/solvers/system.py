@@ -103,8 +103,11 @@ class System(Protocol):
     def crossed(self, u: FloatArray) -> bool:
         """Whether the body has passed through a plane that holds it along the normal n: n·Fn ≤ 0 somewhere on it."""
 
-    def turned(self, u: FloatArray, v: FloatArray, least: float) -> float:
-        """Largest angle (rad) by which a node is turned from a state to another; 0 if no node is by `least` or more."""
+    def rotations(self, u: FloatArray) -> FloatArray:
+        """Return the rotations (3, 3, n_owned) of this rank's nodes from rest to u."""
+
+    def angle(self, R: FloatArray, Q: FloatArray) -> float:
+        """Largest angle (rad) between rotations of the nodes of all ranks."""
 
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
@@ -146,6 +149,9 @@ class Way(Protocol):
 
     def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
         """Whether Lanczos' process shows that the stiffness at an equilibrium is positive definite."""
+
+    def rotations(self, u: FloatArray) -> FloatArray:
+        """Return the rotations (3, 3, n_owned) of this rank's nodes from the reference to u (U_local,)."""
 
     def at(self, fraction: float) -> None:
         """Set the parameters of the system to those after a fraction of the path."""
