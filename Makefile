@@ -32,7 +32,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-faults test-flags test-all test-wheel lint notebooks bench docs clean system graphics browser
+.PHONY: help setup setup-wheel demo test test-unit test-faults test-flags test-all test-wheel lint house notebooks bench docs clean system graphics browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -68,6 +68,9 @@ lint: $(READY) ## check style, types and layers
 	@$(PYTHON) -m mypy
 	@.venv/bin/lint-imports
 	@$(PYTHON) -m tests.circles
+
+house: $(READY) ## count what says how large and how clear the code is
+	@$(PYTHON) -m tests.house
 
 notebooks: $(READY) ## run the notebooks, and leave them in results/notebooks with their pictures
 	@$(PYTHON) -m tests.notebooks $(ARGS)
