@@ -2,8 +2,7 @@
 
 The simulation gives the next block to the group that is free first, as the counter does. What is serial is the time of
 rank 0: keys of the blocks before they begin, one service of the counter for each block, one reception and one addition
-to the sums. Files are written by the groups themselves, side by side. Of jobs that share a study ("array"), each makes
-all keys, claims its blocks by files, and reads and adds all blocks at the end.
+to the sums. Files are written by the groups themselves, side by side.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ ROOT = CONFIG.parent.parent
 PICTURE = ROOT / "docs" / "scaling.png"
 SOLVES = 150  # that are measured
 EACH = 128  # samples for each group, in the table
-MOST_JOBS = 1_000  # of an array
 GROUPS = (1, 10, 100, 1_000, 10_000, 100_000)
 SCRIPT = """
 import sys, time
@@ -75,8 +73,7 @@ else:
 class Constants:
     """Times (s): of one take from the counter, of a block's key, file, and reception with addition; of the reference.
 
-    The last but two is how long each group prepares before its first sample, in mean solves; then a block's claim, and
-    what it takes to read its file.
+    The last is how long each group prepares before its first sample, in mean solves.
     """
 
     take: float
@@ -84,8 +81,6 @@ class Constants:
     file: float
     merge: float
     reference: float
-    claim: float
-    read: float
 
 
 def main(words: Sequence[str] = ()) -> None:
@@ -100,8 +95,7 @@ def main(words: Sequence[str] = ()) -> None:
     constants = replace(constants, take=given.take or constants.take, file=given.file or constants.file)
     print(f"counter {constants.take * 1e6:.1f} µs; each block: key {constants.key * 1e3:.2f} ms, ", end="")
     print(f"file {constants.file * 1e3:.1f} ms, reception and sum {constants.merge * 1e3:.2f} ms; ", end="")
-    print(f"reference {constants.reference:.1f} solves; ", end="")
-    print(f"of an array: claim {constants.claim * 1e3:.2f} ms, file read {constants.read * 1e3:.2f} ms")
+    print(f"reference {constants.reference:.1f} solves")
     for name, times in (("near the mean", short), ("wide inputs", wide)):
         print(f"solves {name}: mean {times.mean():.4f} s, spread {times.std() / times.mean():.2f} of it, ", end="")
         print(f"slowest of {len(times)} {times.max() / times.mean():.1f} times it")
@@ -116,7 +110,6 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
 
     from uq.evaluation.block import Merger
     from uq.evaluation.checkpoint import Checkpoint
-    from uq.evaluation.claims import Claims
     from uq.evaluation.evaluate import SerialEvaluate
     from uq.evaluation.request import Request
     from uq.inputs.sampling import random_points
@@ -146,12 +139,9 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
         checkpoint = Checkpoint(Path(folder), "scaling")
         key = _seconds(lambda: checkpoint.key(block))
         file = _seconds(lambda: checkpoint.save("block", solved))
-        read = _seconds(lambda: checkpoint.has("block") and checkpoint.load("block"))
-        claims = Claims.of(MPI.COMM_SELF, Path(folder), "1")
-        claim = _seconds(lambda: (claims.take("block"), claims.drop("block")))
     merger = Merger(request.fields)
     merge = _seconds(lambda: merger.add(_sent(solved)))
-    return Constants(float(_ranks(4, "counter")), key, file, merge, preparing, claim, read), times[0], times[1]
+    return Constants(float(_ranks(4, "counter")), key, file, merge, preparing), times[0], times[1]
 
 
 @dataclass(frozen=True)
@@ -187,9 +177,7 @@ def _ranks(ranks: int, *arguments: str) -> str:
     return subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, cwd=ROOT, check=True).stdout
 
 
-def simulated(
-    durations: FloatArray, groups: int, blocks: int, constants: Constants, latency: float = 0.0, *, array: bool = False
-) -> float:
+def simulated(durations: FloatArray, groups: int, blocks: int, constants: Constants, latency: float = 0.0) -> float:
     """Seconds from the request until rank 0 has its answer.
 
     Parameters
@@ -205,22 +193,17 @@ def simulated(
     latency
         Longest time that rank 0 may leave the counter of the others alone: as long as a solve, where the network needs
         its help.
-    array
-        Whether groups are jobs of their own that share the results directory.
     """
     size = -(-len(durations) // blocks)
     edges = np.arange(0, len(durations), size)
-    more = constants.file + (constants.claim if array else 0.0)
-    work = (np.add.reduceat(durations, edges) + more).tolist()
+    work = (np.add.reduceat(durations, edges) + constants.file).tolist()
     wait = (np.random.default_rng(0).random(len(edges)) * latency * (1 - 1 / groups)).tolist()
     free = [constants.key * len(edges) + constants.reference * float(durations.mean())] * groups
     counter, ends = 0.0, []
     for seconds, unheard in zip(work, wait, strict=True):
-        counter = free[0] if array else max(counter, free[0]) + constants.take
+        counter = max(counter, free[0]) + constants.take
         ends.append(counter + unheard + seconds)
         heapq.heapreplace(free, ends[-1])
-    if array:
-        return max(ends) + len(edges) * (constants.read + constants.merge)
     added = 0.0
     for end in sorted(ends):
         added = max(added, end) + constants.merge
@@ -258,15 +241,9 @@ def table(constants: Constants, shape: FloatArray) -> dict[str, list[tuple[int, 
                     seconds = simulated(durations, groups, blocks(groups), constants, latency * mean)
                     rows.append((groups, float(durations.sum() / groups / seconds)))
                 curves[f"{mean:g} s, {name}" + (", software counter" if latency else "")] = rows
-        name, blocks = list(settings.items())[1]
-        rows = []
-        for groups in (groups for groups in GROUPS if groups <= MOST_JOBS):
-            seconds = simulated(mean * draws[: EACH * groups], groups, blocks(groups), constants, array=True)
-            rows.append((groups, float(mean * draws[: EACH * groups].sum() / groups / seconds)))
-        curves[f"{mean:g} s, {name}, array"] = rows
     print(f"\n| solve, blocks | {' | '.join(f'{groups:,}' for groups in GROUPS)} |\n|---|{'---|' * len(GROUPS)}")
     for name, rows in curves.items():
-        cells = [f"{efficiency:.2g}" for _, efficiency in rows] + [""] * (len(GROUPS) - len(rows))
+        cells = [f"{efficiency:.2g}" for _, efficiency in rows]
         print(f"| {name} | {' | '.join(cells)} |")
     return curves
 
@@ -281,7 +258,7 @@ def draw(curves: dict[str, list[tuple[int, float]]]) -> None:
         for name, rows in curves.items():
             solve, _, setting = name.partition(", ")
             if solve == mean:
-                line = {"software counter": "--", "array": ":"}.get(setting.rpartition(", ")[2], "-")
+                line = "--" if setting.endswith("software counter") else "-"
                 colour = {"128": "C0", "4": "C1", "8": "C2"}[setting.split()[0]]
                 axis.plot(*zip(*rows, strict=True), line, color=colour, label=setting)
         axis.set(xscale="log", title=f"solves of {mean}", xlabel="groups of ranks", ylim=(0, 1.02))

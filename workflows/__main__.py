@@ -141,12 +141,6 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it"
         )
-    run.add_argument(
-        "--shared",
-        metavar="NAME",
-        default=os.environ.get("SLURM_ARRAY_TASK_ID", ""),
-        help="work on the study together with jobs of other names, in one DIR (default: the task of a SLURM array)",
-    )
     reduce.add_argument("--output", type=Path, metavar="FILE", help="copy the model there (default: DIR/reduced.npz)")
     serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
     serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts requests from other machines too")
@@ -231,14 +225,7 @@ def _run_study(options: argparse.Namespace, study: StudyKind, name: str) -> int:
         require_files(SHARED_BY_RANKS, "MPI")
     heed()
     out = options.out or Path("results") / name
-    return run(
-        study,
-        name,
-        out,
-        quiet=options.quiet,
-        report=not options.no_report,
-        shared=getattr(options, "shared", ""),
-    )
+    return run(study, name, out, quiet=options.quiet, report=not options.no_report)
 
 
 def _report(options: argparse.Namespace) -> int:

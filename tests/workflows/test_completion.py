@@ -37,7 +37,6 @@ def test_every_command_and_option_is_known():
         "--out",
         "--quiet",
         "--no-report",
-        "--shared",
     }
     for shell in SHELLS:
         script = completion(shell, _parser())

@@ -85,8 +85,6 @@ class Checkpoint:
     def has(self, key: str) -> bool:
         """Whether a block is finished; one that is damaged or answers another request is removed.
 
-        It may be gone a moment later: a job that finishes the study removes all blocks, whoever still reads them.
-
         Raises
         ------
         ModelError
@@ -100,9 +98,8 @@ class Checkpoint:
             with h5py.File(path, "r") as file:
                 note = str(file.attrs["note"])
         except OSError as error:
-            if path.exists():
-                sys.stderr.write(f"{error}; computed again\n")
-                path.unlink(missing_ok=True)
+            sys.stderr.write(f"{error}; computed again\n")
+            path.unlink(missing_ok=True)
             return False
         objection = self._code.objection(note) if self._code is not None else None
         if objection is not None:
@@ -125,17 +122,7 @@ class Checkpoint:
 
     def find(self, key: str, read: Callable[[Path], T]) -> T | None:
         """Return a finished block, as `read` reads it; None if there is none. Errors as for `has`."""
-        return self.load(key, read) if self.has(key) else None
-
-    def load(self, key: str, read: Callable[[Path], T]) -> T | None:
-        """Return a block that `has` has found, as `read` reads it; None if it has been removed since."""
-        path = self.path(key)
-        try:
-            return read(path)
-        except OSError:  # whatever file systems say of a file that is gone
-            if path.exists():
-                raise
-            return None
+        return read(self.path(key)) if self.has(key) else None
 
     @property
     def answers(self) -> bool:

@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -25,9 +24,6 @@ from uq.evaluation.checkpoint import Checkpoint, read
 from uq.evaluation.evaluate import OfModel
 from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
-
-if TYPE_CHECKING:
-    from uq.evaluation.claims import Claims
 
 T = TypeVar("T")
 O = TypeVar("O")
@@ -50,17 +46,14 @@ class Ensemble:
         Number of groups.
     say
         Shows the user a line while something runs; set on the rank that has one.
-    claims
-        Those of this job, if others work on the same study; None if none do.
     """
 
-    def __init__(self, world: Any, group: Any, rank_groups: int, index: int, claims: Claims | None = None) -> None:
+    def __init__(self, world: Any, group: Any, rank_groups: int, index: int) -> None:
         self.world = world
         self.group = group
         self.rank_groups = rank_groups
         self.index = index
         self.say: Callable[[str], None] = lambda line: None
-        self.claims = claims
         self._turns: Turns | None = None
 
     def count(self, done: int, failed: int) -> None:
@@ -79,7 +72,7 @@ class Ensemble:
                 self._turns = None
 
     @classmethod
-    def split(cls, world: Any, ranks_per_model: int = 1, claims: Claims | None = None) -> Ensemble:
+    def split(cls, world: Any, ranks_per_model: int = 1) -> Ensemble:
         """Split `world` into groups of consecutive ranks; collective.
 
         Raises
@@ -91,24 +84,7 @@ class Ensemble:
             message = f"{world.size} ranks cannot be split into groups of ranks_per_model = {ranks_per_model}"
             raise ValueError(message)
         index = world.rank // ranks_per_model
-        return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index, claims)
-
-    @contextmanager
-    def claim(self, key: str, path: Path) -> Iterator[bool]:
-        """Say whether this group does a piece of work, which a file keeps; False if another job does or has."""
-        claims = self.claims if self.group.rank == 0 else None
-        mine = claims is None or claims.take(key)
-        try:
-            # Another job may have finished it just before.
-            yield bool(self.group.bcast(mine and (claims is None or not path.exists())))
-        finally:
-            if claims is not None:
-                claims.drop(key)
-
-    @property
-    def over(self) -> bool:
-        """Whether another job has finished the study."""
-        return self.claims is not None and self.claims.over
+        return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index)
 
     def together(self, make: Callable[[], T]) -> T:
         """Return what `make` returns; what it raises on one rank is raised on all; collective.
@@ -306,44 +282,28 @@ class EnsembleEvaluate(OfModel):
         """Evaluate all points of a request on all groups; blocks on disk are read."""
         request = replace(request, model=self.name)
         blocks = request.blocks(self.blocks)
-        checkpoint, claims = self.worker.checkpoint, self.worker.claims
+        checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
-        kept: dict[int, str] = {}
+        kept = {i: key for i, key in enumerate(keys) if checkpoint and checkpoint.has(key)}
         merger, early = Merger(request.fields), dict[int, Evaluations]()
 
         def receive(index: int, block: Evaluations) -> None:
-            if claims is None or index == merger.count:
-                early[index] = block
-                add_in_order()
-            else:  # in its file: many of others may come before it
-                told.add(index)
+            early[index] = block
+            add_in_order()
 
         def add_in_order() -> None:
             while (i := merger.count) in early or i in kept:
-                block = early.pop(i, None)
-                if block is None:
+                if i in kept:
                     assert checkpoint is not None
-                    block = checkpoint.load(kept.pop(i), read)
-                    if block is None:  # removed since: another job has finished the study
-                        break
-                    if i not in told:
-                        self.progress(len(block.points), len(block.failures))
+                    block = read(checkpoint.path(kept.pop(i)))
+                    self.progress(len(block.points), len(block.failures))
+                else:
+                    block = early.pop(i)
                 merger.add(block)
 
-        def missing() -> list[int]:
-            return [i for i in range(merger.count, len(blocks)) if i not in kept and i not in early]
-
-        told, news = set[int](), True  # blocks whose progress was
-        while True:  # once, unless other jobs work on the study too
-            found = {i: keys[i] for i in missing() if checkpoint and checkpoint.has(keys[i])}
-            kept |= found
-            add_in_order()
-            pending = tuple(missing())
-            if not pending:
-                break
-            if claims is not None:
-                claims.wait(news=news or bool(found))
-                pending, news = claims.turned(pending), False
+        pending = tuple(i for i in range(len(blocks)) if i not in kept)
+        add_in_order()
+        if pending:
             self.progress(0, 0)
             self.worker.dispatch(_Order(request, self.blocks, pending, keys), receive, self.progress)
         assert merger.count == len(blocks)
@@ -360,11 +320,6 @@ class _Worker:
         self._turns = turns
         self._saved = -np.inf  # when a block was last written
 
-    @property
-    def claims(self) -> Claims | None:
-        """As of the ensemble."""
-        return self._ensemble.claims
-
     def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""
         with abort_all(self._ensemble.world):
@@ -378,9 +333,7 @@ class _Worker:
             progress(done, failed)
             self._turns.drain()
 
-        def accept(i: int, block: Evaluations | None, theirs: bool) -> None:
-            if block is None:
-                return
+        def accept(i: int, block: Evaluations, theirs: bool) -> None:
             if theirs:
                 progress(len(block.points), len(block.failures))
             receive(i, block)
@@ -396,33 +349,21 @@ class _Worker:
             return
         self._turns.follow(order.pending, self._solving(order, lambda done, failed: None))
 
-    def _solving(self, order: _Order, progress: Progress) -> Callable[[int], Evaluations | None]:
-        """Return the function that solves a block of an order, and keeps it; None comes if another job does that."""
+    def _solving(self, order: _Order, progress: Progress) -> Callable[[int], Evaluations]:
+        """Return the function that solves a block of an order, and keeps it."""
         blocks = order.request.blocks(order.blocks)
         solvers: list[BlockSolver] = []  # made for the first block that this group takes
-        claims = self.claims
-
-        def counted(done: int, failed: int) -> None:
-            progress(done, failed)
-            if claims is not None:
-                claims.beat()
 
         def solve(i: int) -> Evaluations:
             if not solvers:
                 solvers.append(BlockSolver(self.models[order.request.model], order.request))
             begin = time.monotonic()
-            block = solvers[0](blocks[i].points, counted)
+            block = solvers[0](blocks[i].points, progress)
             now = time.monotonic()
-            worth = now - begin > CHEAP or now - self._saved > SELDOM or claims is not None
-            if self.checkpoint is not None and self._ensemble.group.rank == 0 and worth and not self._ensemble.over:
+            worth = now - begin > CHEAP or now - self._saved > SELDOM
+            if self.checkpoint is not None and self._ensemble.group.rank == 0 and worth:
                 self.checkpoint.save(order.keys[i], block)
                 self._saved = now
             return block
 
-        def solve_if_mine(i: int) -> Evaluations | None:
-            if self.checkpoint is None or claims is None:
-                return solve(i)
-            with self._ensemble.claim(order.keys[i], self.checkpoint.path(order.keys[i])) as mine:
-                return solve(i) if mine else None
-
-        return solve_if_mine
+        return solve

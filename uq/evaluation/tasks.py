@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 from forward.model import SolveError
 from uq.evaluation.block import merge
 from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, read, write
-from uq.evaluation.claims import FinishedElsewhere
 from uq.evaluation.hdf5 import File, holds, netcdf
 from uq.evaluation.request import Evaluations
 
@@ -138,13 +137,7 @@ def run_tasks(
     keys = [] if checkpoint is None else [checkpoint.key(_Task(number, name)) for number, name in enumerate(names)]
     outcomes: dict[int, Outcome] = {}
 
-    def do(number: int) -> Outcome | None:
-        if checkpoint is None:
-            return done(number)
-        with ensemble.claim(keys[number], checkpoint.path(keys[number])) as mine:
-            return done(number) if mine else None
-
-    def done(number: int) -> Outcome:
+    def do(number: int) -> Outcome:
         begin = time.process_time()
         solved: list[Evaluations] = []
         dataset, reason = None, ""
@@ -154,40 +147,27 @@ def run_tasks(
             reason = error.reason or "no reason was given"
         evaluations = merge(solved) if solved else None
         outcome = Outcome(dataset, reason, evaluations, time.process_time() - begin)
-        if group.rank == 0 and checkpoint is not None and not ensemble.over:
+        if group.rank == 0 and checkpoint is not None:
             checkpoint.save(keys[number], outcome)
         kept()
         return outcome
 
-    def receive(number: int, outcome: Outcome | None, theirs: bool = False) -> None:
-        if outcome is not None:
-            outcomes[number] = outcome
-            arrived(number, outcome)
+    def receive(number: int, outcome: Outcome, theirs: bool = False) -> None:
+        outcomes[number] = outcome
+        arrived(number, outcome)
 
-    def find(before: int) -> list[int] | None:
-        """Read what is finished; return what is not, None if another job has all; on rank 0."""
+    def unfinished() -> list[int]:
+        """Read what is finished and return what is not; on rank 0."""
         for number, key in enumerate(keys):
-            if number in outcomes or checkpoint is None:
-                continue
-            if (outcome := checkpoint.find(key, Outcome.read)) is not None:
+            if checkpoint is not None and (outcome := checkpoint.find(key, Outcome.read)) is not None:
                 receive(number, outcome)
                 ensemble.count(outcome.solves, 0)
-        pending = [number for number in range(len(names)) if number not in outcomes]
-        if ensemble.claims is not None and pending:
-            try:
-                ensemble.claims.wait(news=len(outcomes) > before)
-            except FinishedElsewhere:
-                return None
-        return pending
+        return [number for number in range(len(names)) if number not in outcomes]
 
-    before = -1
     with ensemble.turns(progress) as turns, abort_all(world):
-        while pending := world.bcast(find(before) if world.rank == 0 else None):
-            before = len(outcomes)
-            if world.rank > 0:
-                turns.follow(pending, do)
-            else:
-                turns.lead(pending, do, receive)
-    if pending is None:
-        raise FinishedElsewhere
+        pending = world.bcast(unfinished() if world.rank == 0 else None)
+        if pending and world.rank > 0:
+            turns.follow(pending, do)
+        elif pending:
+            turns.lead(pending, do, receive)
     return [outcomes[number] for number in range(len(names))] if world.rank == 0 else None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import sys
 import time
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +49,7 @@ if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
 
 CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
-SECONDS_TO_BEGIN = 5.0  # in which another job that shares a study writes study.toml
+SECONDS_TO_END = 5.0  # in which ranks of a run that was killed end
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
@@ -59,7 +61,6 @@ def run(
     quiet: bool = False,
     silent: bool = False,
     report: bool = True,
-    shared: str = "",
 ) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
@@ -77,8 +78,6 @@ def run(
         Not even that line.
     report
         Whether report.html is written.
-    shared
-        Name of this job among several that work on the study in this directory; empty if it is alone.
 
     Returns
     -------
@@ -89,7 +88,7 @@ def run(
     Raises
     ------
     StudyError
-        If the directory holds another study or cannot be written.
+        If the directory holds another study, cannot be written, or belongs to a run that goes on.
     ModelError
         If the model cannot be made.
     SolveError
@@ -103,7 +102,8 @@ def run(
     was.
     """
     try:
-        return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report, shared=shared)
+        with ExitStack() as held:
+            return _run(study, name, directory, held, quiet=quiet or silent, silent=silent, report=report)
     except Exception as error:
         if isinstance(error, StopError) or not out_of_memory(error):
             raise
@@ -111,7 +111,9 @@ def run(
         raise StopError(reason) from error
 
 
-def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: bool, report: bool, shared: str) -> int:
+def _run(
+    study: StudyKind, name: str, directory: Path, held: ExitStack, *, quiet: bool, silent: bool, report: bool
+) -> int:
     from mpi4py import MPI
 
     from uq.evaluation.turns import alone
@@ -119,7 +121,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     world = MPI.COMM_WORLD
     begin = time.monotonic()
     loaded = Loaded() if own_code.modules(study) else None
-    finished = _agreed(world, lambda: _prepare(study, directory, world.size, shared=bool(shared)))
+    finished = _agreed(world, lambda: _prepare(study, directory, world.size, held))
     if finished is not None:
         with alone(world):
             if world.rank == 0:
@@ -130,11 +132,9 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         return int(finished)
 
     from uq.evaluation.checkpoint import Checkpoint
-    from uq.evaluation.claims import Claims, FinishedElsewhere
     from uq.evaluation.ensemble import Ensemble
 
-    claims = Claims.of(world, directory, shared) if shared else None
-    ensemble = Ensemble.split(world, study.parallel.ranks_per_model, claims)
+    ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
     checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
@@ -147,12 +147,8 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
         dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
-        if claims is not None and dataset is not None:
-            claims.writes()
-    except FinishedElsewhere:
-        return _elsewhere(world, directory, quiet=quiet)
     except BaseException as error:
-        if world.rank == 0 and claims is None:
+        if world.rank == 0:
             _withdraw(directory, error, checkpoint)
         raise
     with alone(world):
@@ -178,19 +174,6 @@ def _complete(
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
     add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
     return study.finished(dataset, evaluations)
-
-
-def _elsewhere(world: Any, directory: Path, *, quiet: bool) -> int:
-    """End a job whose study another one has finished, and return the exit code of that; collective."""
-    from uq.evaluation.turns import alone
-
-    with alone(world):
-        summary = read_summary(directory) if world.rank == 0 else None
-        if summary is None:
-            return DONE
-        if not quiet:
-            sys.stdout.write(f"{directory}: finished by another job, which writes the report\n")
-        return exit_code(summary)
 
 
 def _warn_of_memory(study: StudyKind, world: Any, *, quiet: bool) -> None:
@@ -263,8 +246,11 @@ def _report(directory: Path) -> None:
     write_report(directory, code=True)  # it has run already
 
 
-def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> int | None:
-    """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
+def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> int | None:
+    """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already.
+
+    Until `held` is closed, the directory belongs to this run.
+    """
     share = study.parallel.ranks_per_model
     if ranks % share:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
@@ -276,8 +262,6 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> 
             "of them will be idle; parallel.ranks_per_model makes groups larger"
         )
     kept = directory / "study.toml"
-    if shared:
-        _let_another_begin(directory, kept)
     try:
         if kept.exists():
             changes = differences(tomllib.loads(kept.read_text(encoding="utf-8")), document(study))
@@ -291,7 +275,8 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> 
         if not os.access(directory, os.W_OK | os.X_OK):
             message = f"{directory}: cannot be written: permission denied"
             raise StudyError(message)
-        _keep_study(directory, study, tidy=not shared)
+        _hold(directory, held)
+        _keep_study(directory, study)
     except tomllib.TOMLDecodeError:
         message = f"{kept}: is not a study, expected a directory of this study"
         raise StudyError(message) from None
@@ -309,19 +294,37 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, *, shared: bool) -> 
         raise StudyError(message) from None
 
 
-def _let_another_begin(directory: Path, kept: Path) -> None:
-    """Wait a while if another job has made the directory and not yet written study.toml into it."""
+def _hold(directory: Path, held: ExitStack) -> None:
+    """Lock a directory until `held` is closed or the process ends; file systems without locks are left alone.
+
+    Raises
+    ------
+    StudyError
+        If another run has it.
+    """
+    handle = os.open(directory, os.O_RDONLY)
+    held.callback(os.close, handle)
     begin = time.monotonic()
-    while directory.exists() and not kept.exists() and time.monotonic() < begin + SECONDS_TO_BEGIN:
-        time.sleep(0.05)
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > begin + SECONDS_TO_END:
+                message = f"{directory}: another run is at work there; wait for its end, or choose another --out"
+                raise StudyError(message) from None
+            time.sleep(0.05)
+        except OSError:
+            return
+        else:
+            return
 
 
-def _keep_study(directory: Path, study: StudyKind, *, tidy: bool) -> None:
+def _keep_study(directory: Path, study: StudyKind) -> None:
     """Write study.toml, also if only the block of the report differs; the report is then made again.
 
-    What a killed run was writing is removed where it is certain that no other job is writing it.
+    What a killed run was writing is removed.
     """
-    for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")] if tidy else ():
+    for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")]:
         leftover.unlink()
     kept = directory / "study.toml"
     if not kept.exists():

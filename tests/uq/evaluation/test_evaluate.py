@@ -58,7 +58,7 @@ def test_residuals_are_kept(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     assert checkpoint.key(request) != checkpoint.key(replace(request, iterations=4))
     checkpoint.save("block", evaluations)
-    found = checkpoint.load("block", read)
+    found = checkpoint.find("block", read)
     np.testing.assert_array_equal(found.residuals, evaluations.residuals)
     np.testing.assert_array_equal(found.converged, evaluations.converged)
 
@@ -92,7 +92,7 @@ def test_checkpoint_returns_what_was_saved(tmp_path):
     assert not checkpoint.has(key)
     checkpoint.save(key, evaluations)
     assert checkpoint.has(key)
-    found = checkpoint.load(key, read)
+    found = checkpoint.find(key, read)
     np.testing.assert_array_equal(found.outputs, evaluations.outputs)
     np.testing.assert_array_equal(found.tangents, evaluations.tangents)
     assert found.failures == evaluations.failures

@@ -1,17 +1,13 @@
 """Tasks that give datasets: shared by groups of ranks, kept in files of their own, failures as data."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import xarray as xr
 from mpi4py import MPI
 
 from forward.model import FunctionModel, SolveError
-from tests.launch import ROOT, environment, run_script
+from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.claims import Claims, FinishedElsewhere
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Request
@@ -194,92 +190,3 @@ def test_no_task_is_taken_before_turns_start_again():
     """However late that is: it would be done twice, and the job would wait forever for its second outcome."""
     done = run_script(2, LATE, timeout=60)
     assert "[0, 1]\n" in done.stdout, done.stderr
-
-
-@pytest.fixture
-def removed(tmp_path, monkeypatch):
-    """From a call on, another job finishes the study, and removes all blocks, while this one is about to read one."""
-    has, seen = Checkpoint.has, []
-
-    def looked_at(self, key):
-        found = has(self, key)
-        seen.append(found)
-        if sum(seen) == 2:
-            (tmp_path / "summary.json").write_text("{}")
-            self.clear()
-        return found
-
-    return lambda: monkeypatch.setattr(Checkpoint, "has", looked_at)
-
-
-def shared(folder):
-    return Ensemble.split(MPI.COMM_SELF, claims=Claims.of(MPI.COMM_SELF, folder, "slow"))
-
-
-def test_outcomes_that_another_job_removes_are_not_missed(tmp_path, removed):
-    checkpoint = Checkpoint(tmp_path, "study")
-    run_tasks(ensemble(), NAMES, work, checkpoint=checkpoint)
-    removed()
-    with pytest.raises(FinishedElsewhere):
-        run_tasks(shared(tmp_path), NAMES, work, checkpoint=checkpoint)
-
-
-def test_blocks_that_another_job_removes_are_not_missed(tmp_path, removed):
-    checkpoint = Checkpoint(tmp_path, "study")
-    model, points = FunctionModel(lambda p: p**2, ("x",), ("y",)), Request(np.arange(64.0)[:, None])
-
-    def found():
-        return shared(tmp_path).run(model, lambda evaluate: evaluate(points), checkpoint=checkpoint)
-
-    assert found().outputs[:, 0].tolist() == [x**2 for x in range(64)]
-    removed()
-    with pytest.raises(FinishedElsewhere):
-        found()
-
-
-OF_TWO_JOBS = """
-import sys
-import time
-from pathlib import Path
-import xarray as xr
-from mpi4py import MPI
-from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.claims import Claims
-from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.tasks import run_tasks
-
-directory, name = Path(sys.argv[1]), sys.argv[2]
-
-def work(number, solved):
-    with (directory / "calls").open("a") as calls:
-        calls.write(f"{name} {number}\\n")
-    begin = time.monotonic()
-    other = {"one": "two", "two": "one"}[name]
-    while number == 0 and other not in (directory / "calls").read_text() and time.monotonic() < begin + 60:
-        time.sleep(0.01)  # the job that comes second finds the first at work, whichever that is
-    time.sleep(0.02)
-    return xr.Dataset({"square": number**2})
-
-ensemble = Ensemble.split(MPI.COMM_SELF, claims=Claims.of(MPI.COMM_SELF, directory, name))
-found = run_tasks(ensemble, "abcdefgh", work, checkpoint=Checkpoint(directory, "study"))
-print(*(one.dataset["square"].item() for one in found))
-"""
-
-
-def test_jobs_share_tasks(tmp_path):
-    """Each task is done once; both jobs have all outcomes."""
-    jobs = [
-        subprocess.Popen(
-            [sys.executable, "-c", OF_TWO_JOBS, tmp_path, name],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-            env=environment(),
-        )
-        for name in ("one", "two")
-    ]
-    assert [job.communicate(timeout=120)[0] for job in jobs] == ["0 1 4 9 16 25 36 49\n"] * 2
-    done = [line.split() for line in (tmp_path / "calls").read_text().splitlines()]
-    assert sorted(number for _, number in done) == [str(number) for number in range(8)]
-    assert {name for name, _ in done} == {"one", "two"}
-    assert len(list((tmp_path / "evaluations").iterdir())) == 8

@@ -1,5 +1,6 @@
 """Runs that die: no memory, no room on disk, signals, models that end the process or never end."""
 
+import fcntl
 import json
 import os
 import re
@@ -422,3 +423,20 @@ def test_what_stands_in_the_way_is_said_and_the_rest_continues(study, tmp_path, 
         thing.rmdir() if harm == "folder" else thing.unlink()
         assert main(command) == 0
     assert json.loads((out / "summary.json").read_text())["status"] == "complete"
+
+
+def test_a_directory_in_which_another_run_is_at_work_is_left_to_it(study, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    command = ["run", str(study), "--out", str(out), "--quiet", "--no-report"]
+    monkeypatch.setattr("workflows.run.run.SECONDS_TO_END", 0.1)
+    out.mkdir()
+    other = os.open(out, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    assert main(command) == 2
+    assert (
+        capsys.readouterr().err == f"{out}: another run is at work there; wait for its end, or choose another --out\n"
+    )
+    assert not list(out.iterdir())
+    os.close(other)
+    assert main(command) == 0
+    assert json.loads((out / "summary.json").read_text())["evaluations"] == 101
