@@ -17,7 +17,7 @@ from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump, load, parse, schema
 from workflows.run.plan import plan
-from workflows.starter import _METHODS, starter
+from workflows.starter import KINDS, starter
 from workflows.studies.sampling import Study
 
 CONFIGS = sorted((Path(__file__).parent.parent.parent.parent / "configs").glob("*.toml"))
@@ -324,7 +324,7 @@ def test_shipped_studies_fit_the_schema(validator, path):
     validator.validate(tomllib.loads(path.read_text()))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in _METHODS if kind != "invert"])  # which needs a file
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "invert"])  # which needs a file
 def test_starters_and_dumps_fit_the_schema(validator, kind):
     validator.validate(tomllib.loads(starter(kind)))
     validator.validate(document(parse(tomllib.loads(starter(kind)))))
