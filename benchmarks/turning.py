@@ -25,7 +25,7 @@ from workflows.report.blocks import Heading
 from workflows.report.page import render
 from workflows.report.scene.scene import Quantity, Scene
 from workflows.report.scene.sliders import sliders
-from workflows.report.sections.body import turning
+from workflows.report.sections.bodies import turning
 
 PARAMETERS, ORDER, SHAPES = 6, 3, 24
 FRAMES = 30

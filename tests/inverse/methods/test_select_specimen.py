@@ -26,7 +26,7 @@ from uq.inputs.distributions import LogNormal
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
-from workflows.report.sections.finer_meshes import meshes
+from workflows.report.sections.errors import finer_mesh_table as meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies.findings_selection import doubts_of_selection, trusted_on_meshes

@@ -12,7 +12,7 @@ from forward.readable import interval, percent, quantity, rounded, scale, size, 
 from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
 from workflows.report import bodies, plots, small_density
 from workflows.report.page import write_report
-from workflows.report.sections import answer, population
+from workflows.report.sections import answer, inversions
 
 
 @pytest.fixture(autouse=True)
@@ -100,7 +100,7 @@ def test_small_densities_are_densities():
 
 def test_small_densities_of_one_sign_end_at_zero():
     draws = -stats.lognorm(0.7, scale=70).rvs(4000, random_state=1)
-    at, curve = population._new_specimens(draws, logarithmic=True)
+    at, curve = inversions._new_specimens(draws, logarithmic=True)
     assert (np.diff(at) > 0).all()
     assert at[-1] < 0
     scaled = curve / integrate.trapezoid(curve, at)

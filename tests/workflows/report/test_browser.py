@@ -19,7 +19,7 @@ from workflows.report.blocks import Folded, Heading, Table, Text
 from workflows.report.page import render, write_report
 from workflows.report.scene.scene import Quantity, Scene
 from workflows.report.scene.sliders import sliders
-from workflows.report.sections.body import turning
+from workflows.report.sections.bodies import turning
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium is installed (Debian: chromium)")
 VIEWER = "document.querySelector('.viewer').viewer"

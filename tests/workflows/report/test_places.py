@@ -6,7 +6,7 @@ from matplotlib.collections import PathCollection
 
 from forward.specimen import Specimen
 from workflows.report.plots import places as plots
-from workflows.report.sections.places import places_of
+from workflows.report.sections.bodies import places_of
 
 BALL = {"kind": "indenter", "shape": "sphere", "radius": 0.3, "on": "z-max", "direction": (0, 0, -1), "depth": 0.05}
 AT = ((0.2, 0.3, 1.0), (0.8, 0.3, 1.0), (0.5, 0.7, 1.0))

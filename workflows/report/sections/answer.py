@@ -13,10 +13,10 @@ from forward.words import duration, number, power_of_ten, with_error
 from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
-from workflows.report.sections.design import card as design
-from workflows.report.sections.error_budget import counting, parts_of
-from workflows.report.sections.findings import gravest
-from workflows.report.sections.population import card as population
+from workflows.report.sections.errors import counting, parts_of
+from workflows.report.sections.frame import gravest
+from workflows.report.sections.inversions import design_card as design
+from workflows.report.sections.inversions import population_card as population
 from workflows.report.sections.posterior import measured_kind
 from workflows.report.sections.reduced import card as reduced
 from workflows.report.small_density import CURVE, curve_of, smooth

@@ -1,4 +1,4 @@
-"""The posterior for each data set: estimates, pictures, load cases, directions, iterations."""
+"""Posteriors of a few parameters and of fields."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workflows.report.plots import path as curves
 from workflows.report.plots import residuals
 from workflows.report.plots.told_by_case import told_by_case
 from workflows.report.section import Results, Section
-from workflows.report.sections.body import specimen
+from workflows.report.sections.bodies import first, specimen
 from workflows.results.points import has_points
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
 PAIRABLE = 20  # draws from which on densities are drawn
 CASES_DRAWN = 24  # load cases and parameters that a map has
 LEAST = 0.005  # of a component that is not written as 0
-DRAWN = 8  # data sets that have more than a row in the table
 
 
 class Words(NamedTuple):
@@ -102,13 +101,6 @@ def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tupl
     rows.append([one["together_std"].sel(parameter=name) for name in names])
     heads = [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()]
     return heads, [[_shown(x / sizes[n][0], 2) for n, x in zip(names, row, strict=True)] for row in rows]
-
-
-def first(results: Results) -> Iterator[xr.Dataset]:
-    """Go through the first data sets that could be inverted."""
-    dataset = results.dataset
-    for name in dataset.data_set.values[dataset["ok"]][:DRAWN]:
-        yield dataset.sel(data_set=name)
 
 
 def verdict(results: Results, one: xr.Dataset) -> Iterator[Block]:
@@ -353,3 +345,51 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
     yield of_misfits(one)
     if np.isfinite(one["true"]).any():
         yield plots.errors(one), "Mean minus truth over the posterior standard deviation; 95 % lie in the grey band."
+
+
+class FieldPosterior(Section):
+    """The posterior of a field for each data set."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether a field was inferred."""
+        return "alone_stiffness_std" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """The same for each of the first data sets."""
+        for one in first(results):
+            yield from verdict(results, one)
+            yield from again(results, one)
+            yield Pairs([*amounts(one, one.sizes["node"], results.study), *more_amounts(one)])
+            yield posterior(one, results.study.units_of("/"))
+            yield Pictures([Picture.drawn(ax, caption) for ax, caption in field_pictures(one)])
+            alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
+            widths = [[number(float(width), 3)] for width in (*alone, one["stiffness_std"].mean())]
+            yield from cases(one, ["mean ± of ln stiffness"], widths)
+            yield iterations(one)
+
+
+def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
+    """The cost of the search, and how often the interval contains the truth, if known."""
+    yield "Hessian products", [f"{int(one['products']):,}"]
+    if np.isfinite(one["stiffness_true"]).all():
+        inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
+        yield "true ln stiffness within two standard deviations", [f"at {100 * inside:.0f} % of the nodes"]
+
+
+def field_pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
+    """Draw the results for one data set, each with a caption."""
+    cut = plots.Cut.of(one)
+    yield from on_a_plane(one, cut)
+    words = "What the data see: 0 where they determine the stiffness, 1 where it stays what the prior says,"
+    yield plots.left_of_prior(one, cut), f"{words} on {cut.words}."
+    words = "The directions that the data constrain most, and the last that were found"
+    yield plots.direction_slices(one, cut), f"{words}, on {cut.words}."
+    yield plots.alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {cut.words}."
+    words = "Prior and posterior of ln stiffness where it is smallest, largest, and least certain"
+    yield plots.node_marginals(one), f"{words}; the truth if known."
+    yield of_misfits(one)
+    if np.isfinite(one["stiffness_true"]).all():
+        yield (
+            plots.coverage(one),
+            "Error at the nodes over the posterior standard deviation, and the standard normal density.",
+        )

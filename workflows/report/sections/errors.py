@@ -1,0 +1,402 @@
+"""Errors by their source: sampling, meshes, tolerances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from forward.readable import and_error, margin, quantity, size, spoken
+from forward.words import NONE, duration, number
+from uq.estimators.rounding import only_rounding
+from uq.findings import DIGITS, NOT_KNOWN
+from workflows.report import bodies, plots
+from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
+from workflows.report.section import Results, Section
+from workflows.report.sections.bodies import NO_BODY
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FIRST = {"std": "std_", "nominal": "nominal_"}  # of the names of an estimate's mesh and total error
+MANY = 10.0  # times a value: percentages beyond say nothing
+LISTED = 8  # outputs that the sentence names
+BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
+ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at the mean parameters"}
+
+
+class ErrorBudget(Section):
+    """The errors of sampling, the mesh and the solver in each estimate."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether outputs of one body were estimated."""
+        return "nominal" in results.dataset and bool(results.study.spec.meshed)
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A sentence, a picture and a table."""
+        shown = [name for name in ESTIMATES if name in results.dataset]
+        shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
+        yield Heading("Error budget")
+        yield Text(sentence(results, shown[0]))
+        counts = counting(results) & np.isin(results.outputs, results.drawn)
+        outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
+        budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
+        if budgets and outputs:
+            yield Pictures(
+                [
+                    Picture.drawn(
+                        plots.error_budget(outputs, {by: e[counts] for by, e in found.items()}, ESTIMATES[name]),
+                        f"Errors of the {ESTIMATES[name]} by source.",
+                    )
+                    for name, found in budgets.items()
+                ]
+            )
+        if any(f"{name}_corrected" in results.dataset for name in shown):
+            yield Text(
+                "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
+                "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
+                "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
+            )
+            yield table(results, shown)
+
+
+def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
+    """Return the errors of an estimate by source, for each output (m,); NaN where they are not estimated."""
+    dataset, first = results.dataset, FIRST.get(name, "")
+    found = {}
+    if f"{name}_error" in dataset:
+        found["sampling"] = dataset[f"{name}_error"].to_numpy()
+    if f"{first}mesh_error" in dataset:
+        found["mesh"] = np.abs(dataset[f"{first}mesh_error"].to_numpy())
+        if f"{first}mesh_error_doubt" in dataset:  # as it is in the total
+            found["mesh"] += dataset[f"{first}mesh_error_doubt"].to_numpy()
+    tolerance = getattr(getattr(results.study.model, "solver", None), "tolerance", None)
+    if tolerance is not None:
+        found["solver"] = tolerance * np.abs(dataset[name].to_numpy())
+    if f"{first}total_error" in dataset:
+        found["total"] = dataset[f"{first}total_error"].to_numpy()
+    return found
+
+
+def counting(results: Results) -> NDArray[np.bool_]:
+    """Say which outputs (m,) are more than rounding."""
+    return ~only_rounding(results.dataset, {output: results.unit(output) for output in results.outputs})
+
+
+def relative(results: Results, name: str) -> dict[str, FloatArray]:
+    """Return the errors relative to the estimate, or to the standard deviation if that is larger than a mean."""
+    size = np.abs(results.dataset[name].to_numpy())
+    if name == "mean":
+        size = np.maximum(size, results.dataset["std"].to_numpy())
+    size = np.where(size > 0, size, np.nan)
+    return {source: errors / size for source, errors in parts_of(results, name).items()}
+
+
+def sentence(results: Results, name: str) -> str:
+    """Say which source is the largest for each output."""
+    found = relative(results, name)
+    total = found.pop("total", None)
+    if "mesh" not in found:
+        why = "is not known here"
+        if not getattr(results.study, "accuracy", None) or not results.study.accuracy.mesh_error:
+            why = "was not estimated, as asked (accuracy.mesh_error = false)"
+        return f"The error of the mesh {why}: the numbers after ± do not include it."
+    words, zero = [], []
+    for i, (output, counts) in enumerate(zip(results.outputs, counting(results), strict=True)):
+        if output not in results.drawn:
+            continue
+        known = {source: float(errors[i]) for source, errors in found.items() if np.isfinite(errors[i])}
+        if not counts:
+            zero.append(output)
+        elif "mesh" not in known:
+            words.append(f"{output} ({NOT_KNOWN})")
+        else:
+            largest = max(known, key=lambda source: known[source])
+            whole = float(total[i]) if total is not None else known[largest]
+            share = f"to {100 * whole:.2g}\u00a0%" if whole < MANY else f"to no better than {MANY:.0f} times its size"
+            words.append(f"{output} is known {share}, most of it by {BY[largest]}")
+    if len(words) > LISTED + 1:
+        words = [*words[:LISTED], f"the other {len(words) - LISTED} are in the table"]
+    said = [f"Of the {ESTIMATES[name]}, {'; '.join(words)}."] if words else []
+    if zero:
+        said.append(f"Zero but for rounding: {', '.join(zero)}.")
+    return " ".join(said)
+
+
+def table(results: Results, names: list[str]) -> Table:
+    """The errors of each estimate, and its corrected value."""
+    rows = []
+    for output in np.array(results.outputs)[counting(results)].tolist():
+        of_output, unit = results.of(output), results.unit(output)
+
+        def known(name: str, of_output: xr.Dataset = of_output) -> float:
+            return float(of_output[name]) if name in of_output else np.nan
+
+        for name in names:
+            value, first = known(name), FIRST.get(name, "")
+            error, doubt = (known(f"{first}mesh_error{end}") for end in ("", "_doubt"))
+            corrected, its_error = known(f"{name}_corrected"), known(f"{name}_corrected_error")
+            total = known(f"{first}total_error")
+            if name == "nominal":  # where nothing is sampled
+                its_error, total = doubt, abs(error) + doubt
+            rows.append(
+                (
+                    f"{ESTIMATES[name]} of {output}",
+                    size(value, unit, DIGITS)
+                    if results.meshes_unknown.get(output)
+                    else quantity(value, total if np.isfinite(total) else known(f"{name}_error"), unit),
+                    margin(known(f"{name}_error"), unit, like=value),
+                    "not known" if np.isnan(error) else and_error(error, doubt, unit, like=value),
+                    margin(total, unit, like=value),
+                    NONE if np.isnan(error) else and_error(corrected, its_error, unit),
+                )
+            )
+    head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")
+    return Table(head, rows)
+
+
+WORDS = {"mean": "mean", "std": "standard deviation"}
+
+
+class Tolerance(Section):
+    """The budget of a tolerance."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether one was asked for."""
+        return "accuracy" in results.summary
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A sentence, bars, the reasons, and the values that the tolerance is held by."""
+        told = results.summary["accuracy"]
+        worst = f"the {told['worst']['of']} of {told['worst']['output']}"
+        yield Heading("Tolerance")
+        asked, reached = number(100 * told["tolerance"]), number(100 * told["reached"], 2)
+        yield Text(
+            f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
+            f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
+            tone="lead" if told["kept"] else "warning",
+        )
+        for name, share in told.get("unmet", {}).items():
+            yield Text(
+                f"All samples of {name} are the same: what happens in up to {number(100 * share, 2)} % of all cases "
+                "may be missed.",
+                tone="warning",
+            )
+        if told["mesh"] is not None and not told["mesh"]["estimated"]:
+            yield Text("The error of the mesh is not known, and not counted.", tone="warning")
+        yield Pictures([Picture.drawn(plots.tolerance_bars(told), "What each error takes of the tolerance.")])
+        seconds = results.summary.get("accuracy_seconds", {})
+        costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
+        yield Pairs([("why", told["reasons"]), *([("what it took", costs)] if costs else [])])
+        yield Table(
+            ("estimate", "value ± 95 %", "mesh", "sampling", "in all"),
+            [
+                (
+                    f"{WORDS[estimate]} of {name}",
+                    and_error(of["value"], of["error"], results.unit(name)),
+                    *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
+                )
+                for name, estimates in told["outputs"].items()
+                for estimate, of in estimates.items()
+            ],
+        )
+        if told["mesh"] is not None:
+            yield Text("Values are corrected by the estimated error of the mesh. Shares are of the tolerance.")
+
+
+class Meshes(Section):
+    """The meshes of a multilevel method, and the contribution of each."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are several."""
+        return "mesh_samples" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A table of meshes, and rates, differences and pictures of each output."""
+        yield Heading("Meshes")
+        yield mesh_table(results)
+        for output in results.outputs:
+            yield Heading(output, level=3)
+            yield Text(rates(results, output))
+            yield differences(results, output)
+            yield Pictures(
+                [
+                    Picture.drawn(
+                        plots.mesh_variance(results.dataset, output),
+                        f"Variance of {output} and of its difference between meshes.",
+                    ),
+                    Picture.drawn(
+                        plots.mesh_mean(results.dataset, output),
+                        f"Mean of {output} and of its difference between meshes.",
+                    ),
+                    Picture.drawn(
+                        plots.mesh_samples(results.dataset, output),
+                        "Samples on every mesh: taken, and optimal for other errors.",
+                    ),
+                    Picture.drawn(
+                        plots.mesh_cost(results.dataset, output), "Predicted time of sampling, without linearisations."
+                    ),
+                ]
+            )
+
+
+def mesh_table(results: Results) -> Table:
+    """The meshes, and what was solved on them."""
+    dataset, rows = results.dataset, []
+    for level, found in zip(dataset["level"].to_numpy(), results.summary["meshes"], strict=True):
+        here = dataset.sel(level=level)
+        seconds = found["cpu_seconds"] / max(found["solves"], 1)
+        samples, failed = f"{int(here['mesh_samples']):,}", f"{int(here['mesh_failed']):,}"
+        cost = f"{float(here['mesh_cost']):.2g} s"
+        rows.append(
+            (f"{level}", f"{found['unknowns']:,}", samples, failed, f"{found['solves']:,}", cost, duration(seconds))
+        )
+    head = (
+        "level",
+        "unknowns",
+        "samples",
+        "failed",
+        "solves",
+        "a solve, predicted",
+        "a solve, measured (with the linearisation)",
+    )
+    return Table(head, rows)
+
+
+def differences(results: Results, output: str) -> Table:
+    """The contribution of every mesh to the mean of an output, and whether it can be trusted."""
+    rows = []
+    for level in results.dataset["level"].to_numpy():
+        here = results.dataset.sel(output=output, level=level)
+        unit = results.unit(output)
+        text = and_error(float(here["difference_mean"]), float(here["difference_mean_error"]), unit)
+        rest = (
+            "mesh_variance",
+            "difference_variance",
+            "difference_variance_ratio",
+            "difference_kurtosis",
+            "consistency",
+        )
+        rows.append((f"{level}", text, *(number(float(here[n]), 3) for n in rest)))
+    head = (
+        "level",
+        "mean of the difference",
+        "variance",
+        "variance of the difference",
+        "÷ by the control",
+        "kurtosis",
+        "consistency",
+    )
+    return Table(head, rows)
+
+
+def rates(results: Results, output: str) -> str:
+    """The rates of convergence of an output, in words."""
+    of_output = results.of(output)
+    weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
+    return (
+        f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "
+        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 confirms that the sum over the "
+        "meshes telescopes."
+    )
+
+
+class FinerMeshes(Section):
+    """The effect of a finer mesh on each candidate."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether meshes were checked."""
+        return "probability" in results.dataset and "mesh_checked" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Effect of a finer mesh", level=3)
+        yield Text(
+            "Solves of each candidate at its mode on finer meshes, with thinner cells at the faces that are held: the "
+            "error of its mesh, and what correcting it does. Where a candidate is corrected, evidence and unknowns "
+            "above are those of the corrected one; elsewhere it is what correcting it would do, to first order."
+        )
+        yield finer_mesh_table(results.dataset)
+
+
+def finer_mesh_table(dataset: xr.Dataset) -> Table:
+    """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
+    from inverse.criticism.doubts_of_meshes import change_in_words
+
+    rows = []
+    for model in dataset.model.values:
+        one = dataset.sel(model=model).isel(group=0)
+        if not bool(one["mesh_checked"]):
+            rows.append((str(model), "no", NONE, NONE, NONE, f"not checked: {one['mesh_why'].item()}"))
+            continue
+        error, shift = one["mesh_error"].to_numpy(), one["mesh_shift"].dropna("parameter")
+        shifts = [(spoken(str(name)), float(shift.sel(parameter=name))) for name in shift.parameter.values]
+        listed = [f"{name} {by:+.2g}".replace(" -", " −") for name, by in shifts]
+        size, most = (f"{value:.2g}" for value in (float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(abs(error)))))
+        moved = change_in_words(float(one["mesh_log_evidence"]), float(abs(shift).max()))
+        corrected = "yes" if bool(one["mesh_corrected"]) else "no"
+        rows.append((str(model), corrected, moved, size, most, ", ".join(listed)))
+    head = (
+        "model",
+        "corrected",
+        "ln Z",
+        "data, over the errors",
+        "at most",
+        "unknowns, in deviations of the posterior",
+    )
+    return Table(head, rows, text=frozenset({0, 1, 5}), long=frozenset({5}))
+
+
+class AdaptedMesh(Section):
+    """How the mesh was refined, what errors are left, and where they come from."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether a mesh was refined."""
+        return "mesh_indicator" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A table of meshes, a picture of their errors, and the last one."""
+        dataset, adapt = results.dataset, results.study.model.adapt
+        yield Heading("The mesh")
+        by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
+        yield Text(
+            "Solved at the mean of the parameters, and refined where cells have most of the estimated error, by "
+            f"{by}. An error is the exact minus the discrete value, estimated with elements of one degree higher; it "
+            "is not a bound. It does not include the part of a curved body that a coarse mesh cuts off."
+        )
+        yield cycles(results)
+        named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
+        yield Pictures(
+            [Picture.drawn(plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh.")]
+        )
+        captions = {
+            "mesh": "The mesh; cells in bright colours contribute most to the error, for their volume.",
+            "mesh cut": "What is behind the cell that contributes most.",
+        }
+        drawn = bodies.pictures(dataset, list(captions))
+        if drawn is None:
+            yield Text(NO_BODY)
+        else:
+            yield Pictures([Picture.of(drawn[name], caption) for name, caption in captions.items()])
+
+
+def cycles(results: Results) -> Table:
+    """The meshes, with the outputs and their estimated errors."""
+    dataset, rows = results.dataset, []
+    for k, told in enumerate(results.summary["adapted"]["cycles"]):
+        found = []
+        for output in results.outputs:
+            here = dataset.isel(cycle=k).sel(output=output)
+            value, error = float(here["cycle_value"]), float(here["cycle_mesh_error"])
+            unit = results.unit(output)
+            sign = "+" if error > 0 else ""
+            estimated = NONE if np.isnan(error) else sign + size(error, unit, like=value)
+            found += [size(value, unit, 4), estimated]
+        rows.append((f"{told['cells']:,}", f"{told['unknowns']:,}", duration(told["cpu_seconds"]), *found))
+    head = ["cells", "unknowns", "processor time"]
+    for output in results.outputs:
+        head += [output, "error"]
+    return Table(head, rows, text=frozenset())

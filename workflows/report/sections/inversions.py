@@ -1,0 +1,390 @@
+"""What goes with inversions: batches, predictions, populations, designs, synthetic data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.readable import and_error, interval, percent, place, quantity, scale, size, spoken
+from forward.specimen import Specimen
+from forward.words import NONE, named, number, with_error
+from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
+from workflows.report.plots import design as design_plots
+from workflows.report.plots import population as population_plots
+from workflows.report.section import Results, Section
+from workflows.report.small_density import CURVE, curve_of, smooth
+from workflows.results.summary import against_random
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import FloatArray
+
+TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
+
+
+class Batch(Section):
+    """All data sets that were inverted, one row each."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether several data sets were inverted."""
+        return "alone_eigenvalue" in results.dataset and results.dataset.sizes["data_set"] > 1
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("All data sets")
+        yield Text(
+            "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
+            "inverted follow one by one."
+        )
+        yield batch(results)
+
+
+def batch(results: Results) -> Table:
+    """A row for each data set."""
+    dataset = results.dataset
+    names = [str(name) for name in dataset.parameter.values]
+    sizes = {
+        name: scale(float(abs(dataset["mean"].sel(parameter=name)).median()), results.parameter_unit(name))
+        for name in names
+    }
+    rows = []
+    for label in dataset.data_set.values:
+        one = dataset.sel(data_set=label)
+        if not bool(one["ok"]):
+            rows.append((str(label), "", "failed", *[""] * (len(names) + 3)))
+            continue
+        values = [
+            with_error(*(float(one[which].sel(parameter=name)) / sizes[name][0] for which in ("mean", "std")))
+            for name in names
+        ]
+        rows.append(
+            (
+                str(label),
+                f"{int(np.isfinite(one['measured']).sum()):,}",
+                TRUSTED[int(one["trust"])],
+                *values,
+                number(float(one["determined"]), 3),
+                number(float(one["residual_probability"]), 2),
+                number(float(one["log_evidence"]), 6),
+            )
+        )
+    units = [named(spoken(name), sizes[name][1]) for name in names]
+    head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
+    return Table(head, rows, text=frozenset({0, 2}))
+
+
+SHOWN = 24  # rows of the table of a data set
+SETS = 12  # data sets that have a table
+
+
+class Predictions(Section):
+    """What is predicted from each data set, and what its data added."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether anything is."""
+        return "prediction_share" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A table and a picture for each data set."""
+        from workflows.report.plots.predictions import bands
+
+        of = results.dataset
+        yield Heading("Predictions")
+        yield Text(
+            "Outputs that were not measured, by the posterior: mean ± standard deviation, and the interval that holds "
+            "95 %. Beside it what was known before the data, and the share of the variance that the data have removed. "
+            "The error of the mesh is what is to be added to the mean; intervals do not hold it."
+        )
+        done = [str(name) for name, ok in zip(of["data_set"].values, of["ok"].values, strict=True) if bool(ok)]
+        for name in done[:SETS]:
+            one = of.sel(data_set=name)
+            if len(done) > 1:
+                yield Heading(name, level=3)
+            yield table(one)
+            if np.isfinite(one["prediction_std"]).any():
+                caption = "95 % intervals before and after the data, each relative to the one before."
+                yield Pictures([Picture.drawn(bands(one), caption)])
+        if len(done) > SETS:
+            yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
+
+
+def table(one: xr.Dataset) -> Table:
+    """What is predicted from a data set."""
+    rows = []
+    for goal in one["goal"].values[:SHOWN]:
+        at = one.sel(goal=goal)
+        unit = str(at["goal_unit"].item())
+        lower, upper, share, mesh = (float(at[f"prediction_{n}"]) for n in ("lower", "upper", "share", "mesh_error"))
+        rows.append(
+            (
+                str(goal),
+                and_error(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
+                interval(lower, upper, unit, float(at["prediction_mean"])),
+                and_error(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
+                NONE if np.isnan(share) else percent(share) if share >= 0 else "none",
+                size(mesh, unit) if np.isfinite(mesh) else "not estimated",
+            )
+        )
+    head = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
+    return Table(head, rows)
+
+
+class PopulationOfSpecimens(Section):
+    """Tables of the population and of its specimens."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there is one."""
+        return "population_draw" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """The population, then the specimens."""
+        of = results.dataset
+        yield Heading("The population")
+        logarithmic = bool(int(of["logarithmic"]))
+        what = (
+            "ln |parameter|, whose standard deviation is given, is normal" if logarithmic else "parameters are normal"
+        )
+        yield Text(
+            f"Over specimens, {what}. Intervals hold 95 %: that of the typical specimen is what is not known of it, "
+            "that of a new one has the spread of the population too."
+        )
+        rows = [
+            (
+                name,
+                *(
+                    _interval(
+                        of[f"{which}_quantiles"].sel(parameter=name),
+                        "1" if logarithmic and which == "scale" else results.parameter_unit(name),
+                    )
+                    for which in ("typical", "scale", "new")
+                ),
+            )
+            for name in results.parameters
+        ]
+        yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
+        pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
+        if pairs:
+            correlations = of["correlation_quantiles"]
+            cells = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
+            yield Table(("parameter", "with", "correlation"), cells, text=frozenset({0, 1}))
+        if "slope_quantiles" in of:
+            yield Text("How means change with what specimens differ in, by one unit of it:")
+            slopes = of["slope_quantiles"]
+            changes = [
+                (str(by), name, _interval(slopes.sel(covariate=by, parameter=name)))
+                for by in of["covariate"].values
+                for name in results.parameters
+            ]
+            yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
+        yield Heading("Its specimens")
+        caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
+        units = {name: results.parameter_unit(name) for name in results.parameters}
+        yield Pictures(
+            [Picture.drawn(population_plots.specimens(of, name, units[name]), caption) for name in results.parameters]
+        )
+        yield Text(
+            "By its own data alone, and with what the others say on what specimens are like. The last column is how "
+            "many of its draws lie where the population is."
+        )
+        yield specimens(results)
+
+
+def specimens(results: Results) -> Table:
+    """A line for each specimen."""
+    of = results.dataset
+    sizes = {
+        name: scale(float(of["typical_quantiles"].sel(parameter=name)[1]), results.parameter_unit(name))
+        for name in results.parameters
+    }
+    lines = []
+    for specimen in map(str, of["specimen"].values):
+        one = of.sel(specimen=specimen)
+        cells = [
+            with_error(*(float(one[f"{who}_{which}"].sel(parameter=name)) / size for which in ("mean", "std")))
+            for name, (size, _) in sizes.items()
+            for who in ("own", "specimen")
+        ]
+        lines.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
+    heads = [
+        f"{named(spoken(name), unit)}, {who}"
+        for name, (_, unit) in sizes.items()
+        for who in ("by itself", "of the population")
+    ]
+    return Table(("specimen", *heads, "effective"), lines)
+
+
+def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
+    """Write a median, to the place of a deviation, with the ends of an interval."""
+    lower, middle, upper = (float(x) for x in quantiles.to_numpy())
+    return f"{quantity(middle, (upper - lower) / 4, unit)} ({interval(lower, upper, unit, middle)})"
+
+
+def population_card(results: Results) -> Card:
+    """Each parameter: the typical specimen, and a new one."""
+    of = results.dataset
+    question = f"From {of.sizes['specimen']} specimens: what is typical of their kind, and what will a new one be like?"
+    answers = []
+    for name in results.parameters:
+        unit = results.parameter_unit(name)
+        (low, mid, high), new, scale = (
+            [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
+        )
+        factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
+        spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
+        at, curve = _new_specimens(
+            _trimmed(of["population_draw"].sel(parameter=name).to_numpy()), logarithmic=bool(of["logarithmic"])
+        )
+        lines = [
+            f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
+            f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
+            f"specimens differ by {spread_} (one standard deviation)",
+        ]
+        shown = curve_of(at, curve, (new[0], new[2]), unit, mid)
+        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
+    return Card(question, answers)
+
+
+def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray, FloatArray]:
+    """Return places (m,) and the density (m,) of draws (n,) there; of those of one sign by their logarithms."""
+    if not logarithmic:
+        return smooth(values)
+    sign = np.sign(np.median(values))
+    logs = np.log(sign * values[sign * values > 0])
+    at, curve = smooth(logs)
+    sizes = np.linspace(np.exp(logs.min()), np.exp(logs.max()), CURVE)
+    found = np.interp(np.log(sizes), at, curve) / sizes
+    order = np.argsort(sign * sizes)
+    return (sign * sizes)[order], found[order]
+
+
+def _trimmed(values: FloatArray) -> FloatArray:
+    """Return values without the outer per cent at each end, which may be far away."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    return np.asarray(values[(values >= low) & (values <= high)])
+
+
+WORTH = {
+    "information": "What they tell (nat)",
+    "parameters": "Share of the parameters' variances that they take away",
+    "predictions": "Share of the predictions' variances that they take away",
+    "models": "Expected ln Bayes factor of the true model (nat)",
+}
+FIRST = 5  # observations on the card
+
+
+class ChosenObservations(Section):
+    """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether observations were chosen."""
+        return "chosen" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """How many random ones they are worth, where they are, and each of them."""
+        found, design = results.dataset, results.summary["design"]
+        against = against_random(design)
+        yield Heading("Which observations tell most")
+        method, known = results.study.method, number(float(found["information"][-1]))
+        tell = (
+            f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
+            if method.criterion == "models"
+            else f"Together they tell {known} nat on average over the draws of what is not known"
+        )
+        yield Text(
+            f"{against[0].upper()}{against[1:]}. {tell}. They are in design.csv in their order.",
+            "lead",
+        )
+        ax = design_plots.against_number(found, WORTH[method.criterion])
+        drawn = [Picture.drawn(ax, "Chosen observations, and the band of 90 % of random ones.")]
+        if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
+            bounds = results.study.specs[0].body.bounds
+            drawn.append(
+                Picture.drawn(design_plots.on_body(found, bounds), "Candidates and chosen points, in their order.")
+            )
+        yield Pictures(drawn)
+        yield _table(results)
+        if "log_bayes_factor" in found:
+            names = [str(name) for name in found["model"].values]
+            cells = found["log_bayes_factor"].to_numpy()
+            rows = [(name, *(number(float(x)) for x in row)) for name, row in zip(names, cells, strict=True)]
+            yield Text("Expected ln Bayes factor (nat) of a model that is true against each other one:")
+            yield Table(("true", *names), rows)
+        if "field_variance_told" in found:
+            share = number(100 * float(found["field_variance_told"][-1]), 3)
+            yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
+        if "posterior_std" in found:
+            rows = [
+                (
+                    name,
+                    *(
+                        size(float(one[f"{which}_std"]), unit, 3, like=float(one["prior_std"]))
+                        for which in ("prior", "posterior")
+                    ),
+                )
+                for name in results.leading(found["posterior_std"] / found["prior_std"])
+                for one, unit in [(found.sel(parameter=name), results.parameter_unit(name))]
+            ]
+            yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
+            yield Table(("parameter", "before", "after"), rows)
+
+
+def design_card(results: Results) -> Card:
+    """The first of the chosen observations, and what all are worth."""
+    found, design = results.dataset, results.summary["design"]
+    together = f"{number(float(found['information'][-1]), 3)} nat"
+    lines = [against_random(design)]
+    if "log_bayes_factor" not in found:
+        lines.append("with 1 nat one unknown, or a combination of them, is known e = 2.7 times better")
+    if found.sizes["choice"] > FIRST:
+        lines.append(f"the first {FIRST} are shown here, all in the table below")
+    answers = [Answer(f"{found.sizes['choice']} observations", together, lines)]
+    for k, one in enumerate(design["chosen"][:FIRST], start=1):
+        where = [] if None in one["place"] else [f"at ({place(one['place'])})"]
+        case = [f"load case {one['case']}"] if one["case"] else []
+        answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 2)} nat", [*case, *where]))
+    return Card("Which observations tell most of what is not known?", answers)
+
+
+def _table(results: Results) -> Table:
+    rows = []
+    for k, one in enumerate(results.summary["design"]["chosen"], start=1):
+        where = NONE if None in one["place"] else place(one["place"])
+        cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
+        rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
+    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
+    return Table(head, rows, text=frozenset({1, 2, 3, 4}))
+
+
+class SyntheticData(Section):
+    """How many data were made, how large they are, and their errors."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether data were made."""
+        return "clean" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """A table: what was measured in each load case, or of each output over a path."""
+        of = results.dataset
+        parts = np.array([str(name).partition(".")[0] for name in of["output"].values])
+        units = units_of(results.study.model)
+        values, sigma = (of[name].to_numpy() for name in ("values", "sigma"))
+        rows = []
+        for part in dict.fromkeys(parts.tolist()):
+            for unit in dict.fromkeys(units.get(name, "m") for name in np.array(results.outputs)[parts == part]):
+                here = (parts == part) & np.array([units.get(name, "m") == unit for name in results.outputs])
+                made = np.isfinite(values[:, here])
+                if made.any():
+                    largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
+                    rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
+        yield Heading("The data")
+        yield Table(("of", "data", "largest", "largest standard error"), rows)
+
+
+def units_of(model: Any) -> dict[str, str]:
+    """Units of what is measured of a model beside displacements (m), by name."""
+    if isinstance(model, Specimen):
+        return {f"{case}.{name}": unit for case, of in model.measurable.items() for name, unit in of.items()}
+    return {output.name: output.unit for output in model.returned}

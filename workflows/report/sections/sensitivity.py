@@ -1,0 +1,284 @@
+"""Sobol' indices, Shapley effects, bounds by derivatives, local sensitivities."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from forward.readable import percent, size
+from forward.words import NONE, number, per, with_error, with_unit
+from workflows.report import plots
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.section import Results, Section
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class LocalSensitivities(Section):
+    """Effects of parameters, to first order."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are derivatives."""
+        return "derivative" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """Tables of each output, and tornado charts."""
+        dataset = results.dataset
+        yield Heading("Local sensitivities")
+        yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
+        for output in results.drawn:
+            yield Heading(output, level=3)
+            yield sensitivities(results, output)
+        captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.drawn}
+        yield Pictures([Picture.drawn(plots.tornado(dataset, o), caption) for o, caption in captions.items()])
+
+
+def sensitivities(results: Results, output: str) -> Table:
+    """Derivatives of an output, in physical units and times the standard deviation and the range of the parameter."""
+    unit, slopes = results.unit(output), results.of(output)
+    rows = []
+    for name in results.leading(slopes["derivative_per_std"]):
+        of_parameter = slopes.sel(parameter=name)
+        by = per(unit, results.parameter_unit(name))
+        slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
+        corrected = results.corrected("derivative", {"output": output, "parameter": name}, by)
+        scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
+        rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
+    known = ("corrected for the mesh",) if "derivative_corrected" in results.dataset else ()
+    return Table(("parameter", "derivative", *known, "× standard deviation", "× range"), rows)
+
+
+def largest_of(dataset: xr.Dataset) -> str:
+    """Say that not all parameters have bars."""
+    count = dataset.sizes["parameter"]
+    return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
+
+
+class LocalField(Section):
+    """Effects of parameters on the displacement field, to first order."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether its derivatives are known."""
+        return "field_derivative_rms" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Displacement field", level=3)
+        yield Text(
+            "Root mean square of the derivative of the displacement over the body: its L² norm over the root of the "
+            "volume."
+        )
+        yield field_norms(results)
+
+
+def field_norms(results: Results) -> Table:
+    """Root mean squares over the body of the derivatives of the displacement field."""
+    dataset = results.dataset
+    rows = []
+    for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
+        of_parameter = dataset.sel(parameter=name)
+        rms, std, wide = (
+            float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
+        )
+        slope = with_unit(number(rms, 5), per("m", results.parameter_unit(name)))
+        rows.append((name, slope, size(rms * std, "m", 4), size(rms * wide, "m", 4)))
+    return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
+
+
+class SobolIndices(Section):
+    """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are some."""
+        return "sobol_first" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """Tables and pictures of each output, then of all and of the field."""
+        dataset = results.dataset
+        yield Heading("Sobol' indices")
+        yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
+        for output in results.drawn:
+            yield Heading(output, level=3)
+            yield sobol(results, output)
+            if "sobol_second" in dataset:
+                yield second_order(results, output)
+            caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
+            pictures = [Picture.drawn(plots.index_bars(dataset, output), caption)]
+            if dataset.sizes.get("index_round", 0) > 1:
+                caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
+                pictures.append(Picture.drawn(plots.index_convergence(dataset, output), caption))
+            yield Pictures(pictures)
+        caption = "Shares of the variance: parameters alone, and the rest."
+        yield Pictures([Picture.drawn(plots.index_shares(dataset, results.drawn), caption)])
+
+
+def sobol(results: Results, output: str) -> Table:
+    """Sobol' indices of an output, and what they are without the error of the mesh."""
+    leading = results.leading(results.of(output)["sobol_total"])
+    groups = map(str, results.dataset["group"].values if "group" in results.dataset.coords else ())
+    single, grouped = (("sobol_first", "sobol_total"), ("sobol_group_first", "sobol_group_total"))
+    rows = [(name, *_cells(results, single, {"output": output, "parameter": name})) for name in leading]
+    rows += [(f"group {name}", *_cells(results, grouped, {"output": output, "group": name})) for name in groups]
+    head = _head(results, "sobol_first", ("first order", "total"))
+    return Table(("parameter", *head), rows)
+
+
+def second_order(results: Results, output: str) -> Table:
+    """Shares of the variance of an output due to interactions of two parameters."""
+    names = results.parameters
+    rows = []
+    for i, name in enumerate(names):
+        for partner in names[i + 1 :]:
+            at = {"output": output, "parameter": name, "partner": partner}
+            rows.append((name, partner, *_cells(results, ("sobol_second",), at)))
+    head = _head(results, "sobol_second", ("second order",))
+    return Table(("parameter", "with", *head), rows, text=frozenset({0, 1}))
+
+
+def _cells(results: Results, names: Sequence[str], at: Mapping[str, str]) -> Iterator[str]:
+    """Indices with their errors, each followed by its corrected value where there is one."""
+    for name in names:
+        value, error = (float(results.dataset[f"{name}{end}"].sel(at)) for end in ("", "_error"))
+        yield with_error(value, error)
+        yield from results.corrected(name, at)
+
+
+def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
+    for word in words:
+        yield word
+        if f"{name}_corrected" in results.dataset:
+            yield f"{word}, corrected"
+
+
+class SobolField(Section):
+    """Generalised Sobol' indices of the displacement field."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are some."""
+        return "field_sobol_first" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Displacement field", level=3)
+        yield Text("Generalised indices: the variances of all nodes and components together.")
+        yield field_sobol(results)
+
+
+def field_sobol(results: Results) -> Table:
+    """Generalised Sobol' indices of the displacement field."""
+    rows = []
+    for name in results.parameters:
+        of = results.dataset.sel(parameter=name)
+        pairs = [(of[f"field_sobol_{which}"], of[f"field_sobol_{which}_error"]) for which in ("first", "total")]
+        rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
+    return Table(("parameter", "first order", "total"), rows)
+
+
+class ShapleyEffects(Section):
+    """Shares of the variance that parameters are responsible for, a column for each output."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are some."""
+        return "shapley" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        outputs, of = results.drawn, results.dataset
+        yield Heading("Shapley effects")
+        yield Text(
+            "The share of the variance that a parameter is responsible for, with what it shares with others split "
+            "evenly: parameters that are given by the same draws depend on each other, and have no Sobol' indices."
+        )
+        rows = [
+            (name, *(_cell(of.sel(output=output, parameter=name)) for output in outputs)) for name in results.parameters
+        ]
+        yield Table(("parameter", *outputs), rows)
+
+
+def _cell(one: xr.Dataset) -> str:
+    return with_error(float(one["shapley"]), float(one["shapley_error"]))
+
+
+class DerivativeBased(Section):
+    """Bounds on total indices, and active subspaces."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are some."""
+        return "total_bound" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """Tables and pictures of each output."""
+        dataset = results.dataset
+        yield Heading("Sensitivity from derivatives")
+        yield Text(
+            "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
+            "distribution over the variance of the output. The active subspace is spanned by the directions along "
+            "which the output changes most, in parameters over their standard deviations."
+        )
+        for output in results.drawn:
+            yield Heading(output, level=3)
+            yield bounds(results, output)
+            yield leading_direction(results, output)
+            yield eigenvalues(results, output)
+            summary = f"{output} against its leading direction: a curve if only that direction matters."
+            spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
+            yield Pictures(
+                [
+                    Picture.drawn(plots.active_summary(dataset, output), summary),
+                    Picture.drawn(plots.spectrum(dataset, output), spectrum),
+                ]
+            )
+
+
+def slope_unit(results: Results, output: str, name: str) -> str:
+    """Unit of a squared derivative."""
+    unit = per(results.unit(output), results.parameter_unit(name))
+    return unit if unit == "1" else f"({unit})²"
+
+
+def bounds(results: Results, output: str) -> Table:
+    """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
+    of_output = results.of(output)
+    rows = []
+    for name in results.parameters:
+        of = of_output.sel(parameter=name)
+        squared = with_unit(with_error(float(of["dgsm"]), float(of["dgsm_error"])), slope_unit(results, output, name))
+        total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
+        bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
+        corrected = results.corrected("total_bound", {"output": output, "parameter": name})
+        share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
+        rows.append((name, share, squared, constant, total, bound, *corrected))
+    head = (
+        "parameter",
+        "share of the local variance",
+        "mean squared derivative",
+        "Poincaré constant",
+        "total index (expansion)",
+        "is at most",
+        *(("is at most, corrected",) if "total_bound_corrected" in results.dataset else ()),
+    )
+    return Table(head, rows)
+
+
+def leading_direction(results: Results, output: str) -> Table:
+    """Components of the direction along which an output changes most, in parameters over their deviations."""
+    of_output = results.of(output)
+    directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
+    rows = [
+        (name, with_error(float(component), float(error)))
+        for name, (component, error) in zip(results.parameters, directions, strict=True)
+    ]
+    return Table(("parameter", "leading direction"), rows)
+
+
+def eigenvalues(results: Results, output: str) -> Table:
+    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, each with its share of their sum."""
+    of_output = results.of(output)
+    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
+    whole = max(float(values[0].sum()), 1e-300)
+    rows = [
+        (str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole))
+        for i, (value, lower, upper) in enumerate(zip(*values, strict=True), start=1)
+    ]
+    return Table(("direction", "eigenvalue", "95 % range", "share of their sum"), rows)
