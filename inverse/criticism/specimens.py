@@ -18,10 +18,10 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 from scipy.special import logsumexp
 
 from forward.model import FloatArray
+from uq.inputs.quadrature import gauss_legendre
 
 DISAGREE = 3.0  # ln of the Bayes factor for two materials that is said: "strong" (Kass and Raftery 1995)
 
@@ -55,7 +55,7 @@ def mixture(log_evidence: FloatArray, weights: FloatArray) -> Mixture:
         Prior probabilities (K,) of the candidates, π.
     """
     count, specimens = log_evidence.shape
-    nodes, parts = leggauss(specimens // 2 + 1)  # type: ignore[no-untyped-call]
+    nodes, parts = gauss_legendre(specimens // 2 + 1)
     r, parts = (nodes + 1) / 2, parts / 2
     pairs = list(combinations(range(count), 2))
     found, shares = [], []

@@ -19,7 +19,7 @@ STEPS = 60  # of Newton's method, at most
 
 
 @cache
-def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
+def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
     """Points and weights of the Gauss–Legendre rule on [−1, 1]; to find those of 200 takes milliseconds each time."""
     x, w = np.polynomial.legendre.leggauss(count)  # type: ignore[no-untyped-call]
     x.flags.writeable = w.flags.writeable = False  # all share them
@@ -28,7 +28,7 @@ def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
 
 def panels(breaks: list[float]) -> tuple[FloatArray, FloatArray]:
     """Composite Gauss–Legendre rule between breakpoints."""
-    x, w = _gauss(PANEL)
+    x, w = gauss_legendre(PANEL)
     parts = [(a + (b - a) * (x + 1) / 2, w * (b - a) / 2) for a, b in pairwise(breaks) if b > a]
     return np.concatenate([nodes for nodes, _ in parts]), np.concatenate([weights for _, weights in parts])
 
@@ -115,7 +115,7 @@ class Cut:
 
     def _integral(self, u: FloatArray) -> FloatArray:
         """∫ exp(−v (t + v/2)) dv from the lower end to u, for a flat density."""
-        x, w = _gauss(24)
+        x, w = gauss_legendre(24)
         half = (np.asarray(u)[..., None] - self.lower) / 2
         v = self.lower + half * (x + 1)
         return np.asarray((np.exp(-v * (self.t + v / 2)) * half) @ w)

@@ -1,6 +1,5 @@
 """Weights of stacking: against ArviZ, a grid and the condition of a maximum; their errors against repeats."""
 
-import arviz as az
 import numpy as np
 import pytest
 import xarray as xr
@@ -39,6 +38,8 @@ def test_two_models_by_a_grid():
 
 def test_arviz_finds_the_same():
     """From scores that are given to it as if of one draw."""
+    import arviz as az
+
     found = scores(5, 3, 60, 1.0)
     told = {}
     for k, row in enumerate(found):

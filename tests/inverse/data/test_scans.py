@@ -9,7 +9,6 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-import pyvista
 from pydantic import ValidationError
 from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
@@ -70,6 +69,8 @@ def write(path):
         rows += [", ".join(map(repr, map(float, (*p, *u, s)))) for p, u, s in zip(POINTS, HOLES, SIGMA, strict=True)]
         path.write_text("\n".join(rows))
     elif path.suffix in {".vtp", ".vtk"} and "polygons" in path.name:
+        import pyvista
+
         found = pyvista.PolyData(POINTS, np.column_stack([np.full(4, 3), TRIANGLES]).ravel())
         for name, values in arrays.items():
             found.point_data[name] = values
@@ -77,6 +78,8 @@ def write(path):
         found.save(path, binary="ascii" not in path.name)
         locale.setlocale(locale.LC_ALL, words)  # VTK leaves "C"
     elif path.name in BY_VTK:
+        import pyvista
+
         grid = pyvista.UnstructuredGrid({pyvista.CellType.TRIANGLE: TRIANGLES}, POINTS)
         for name, values in arrays.items():
             grid.point_data[name] = values

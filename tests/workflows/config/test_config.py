@@ -4,7 +4,6 @@ import json
 import tomllib
 from pathlib import Path
 
-import jsonschema
 import pytest
 
 from forward.bodies.geometry import Box
@@ -314,6 +313,8 @@ def test_tails_of_no_material_are_told():
 
 @pytest.fixture(scope="module")
 def validator():
+    import jsonschema
+
     found = schema()
     jsonschema.Draft202012Validator.check_schema(found)
     return jsonschema.Draft202012Validator(found)
