@@ -1,4 +1,4 @@
-"""Models of the cases: the borehole of Worley (1987) and an oscillation after Genz (1984)."""
+"""Models of the cases: the borehole of Worley (1987), an oscillation after Genz (1984) and a rare event."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,3 +22,8 @@ def borehole_jacobian(p: ArrayLike) -> list[list[float]]:
 def oscillation(p: ArrayLike) -> float:
     """More waves than a few dozen samples show."""
     return float(np.cos(0.6 * np.pi + WAVES @ np.asarray(p)))
+
+
+def event(p: ArrayLike) -> float:
+    """What happens with probability 0.03: z above its quantile of 97 %."""
+    return float(np.asarray(p)[0] > 1.8807936)

@@ -65,6 +65,29 @@ def test_an_oscillation_that_no_expansion_knows(run):
     assert "sobol" not in summary or results["sobol_total"].isnull().all()
 
 
+# The same samples, none of which has met the event, "know" its share to 0: with 12, 22 % of all cases may be missed.
+@pytest.mark.parametrize(
+    ("method", "samples"),
+    [
+        ("{kind='automatic'}", 6),
+        ("{kind='monte-carlo', samples=12}", 12),
+        ("{kind='quasi-monte-carlo', samples=16, scrambles=4, control='none', seed=2}", 16),
+    ],
+)
+def test_an_event_that_no_sample_has_met(run, method, samples):
+    code, summary, _ = run("event", f"method={method}")
+    told = summary["accuracy"]
+    missed = 1 - 0.05 ** (1 / samples)
+    assert missed > 0.03
+    assert code == PARTIAL
+    assert summary["outputs"]["broke"]["std"] == 0
+    assert told["kept"] is False
+    assert told["unmet"] == {"broke": pytest.approx(missed)}
+    said = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert len(said) == 1
+    assert f"up to {missed:.2g} of all cases may be missed" in said[0]
+
+
 @pytest.mark.fem
 def test_a_column_beyond_buckling(run):
     code, summary, results = run("column", "method.samples=20")
