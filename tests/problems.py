@@ -114,3 +114,34 @@ def ridge(noise):
     y = two_of_four(TRUTH)
     model = FunctionModel(two_of_four, FOUR, ("u", "v"), slopes_of_four)
     return Posterior(inputs, SerialEvaluate(model), y, noise * y)
+
+
+def bananas(pairs, bend=0.7, seed=0, wide=100.0):
+    """2 `pairs` unknowns whose posterior is curved and known: a model, its posterior, mean (d,), std (d,) and ln Z.
+
+    With data zero of z = (a, b + bend (a² − 1), ...), all errors 1, priors that are `wide`, and a, b rotated unknowns:
+    the map to z has the Jacobian one, so that z is normal, b has mean 0 and the variance 1 + 2 bend², and Z is the
+    density of the prior.
+    """
+    rng = np.random.default_rng(seed)
+    d = 2 * pairs
+    Q, centre = np.linalg.qr(rng.normal(size=(d, d)))[0], rng.normal(size=d)
+
+    def values(w):
+        u = Q.T @ (w - centre)
+        z = u.copy()
+        z[1::2] += bend * (u[::2] ** 2 - 1)
+        return z
+
+    def slopes(w):
+        J = np.eye(d)
+        J[np.arange(1, d, 2), np.arange(0, d, 2)] = 2 * bend * (Q.T @ (w - centre))[::2]
+        return J @ Q.T
+
+    names = tuple(f"x{k}" for k in range(d))
+    model = FunctionModel(values, names, tuple(f"z{k}" for k in range(d)), slopes)
+    covariance = Q @ np.diag(np.tile([1.0, 1 + 2 * bend**2], pairs)) @ Q.T
+    log_evidence = -d / 2 * np.log(2 * np.pi * wide**2) - ((centre**2).sum() + np.trace(covariance)) / 2 / wide**2
+    inputs = Inputs({name: Normal(mean=0.0, std=wide) for name in names})
+    posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(d), np.ones(d))
+    return model, posterior, centre, np.sqrt(np.diag(covariance)), log_evidence

@@ -15,7 +15,7 @@ and effective sample sizes are ArviZ's (A. Vehtari et al., Bayesian Anal. 16 (20
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -88,6 +88,8 @@ class Chains:
         ln Z and its standard error, where the chains tell.
     apart
         Of the solves, those that no evaluation has counted.
+    x
+        Of few parameters, the draws in standard normal coordinates (chains, draws, c).
     """
 
     names: tuple[str, ...]
@@ -99,6 +101,7 @@ class Chains:
     needed: float = INDEPENDENT
     evidence: tuple[float, float] | None = None
     apart: int = 0
+    x: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @cached_property
     def rhat(self) -> FloatArray:
@@ -272,14 +275,14 @@ def chains_of_few(
         x = centre + z @ root.T
         return x, posterior.at(x).log_posterior
 
-    return crank_nicolson(
-        place,
-        len(centre),
-        keep=posterior.physical,
-        names=posterior.names,
-        lengths=lengths,
-        seed=seed,
-    )
+    return in_units(posterior, crank_nicolson(place, len(centre), lengths=lengths, seed=seed))
+
+
+def in_units(posterior: Posterior, chains: Chains) -> Chains:
+    """Return chains of standard normal coordinates as those of the parameters in physical units."""
+    x = chains.draws
+    values = posterior.physical(x.reshape(-1, x.shape[2])).reshape(x.shape)
+    return replace(chains, names=posterior.names, draws=values, x=x)
 
 
 def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = None, *, seed: int = 0) -> Chains:
@@ -314,6 +317,6 @@ def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = 
     state = sampler.run_mcmc(state, long.burn, store=False)
     sampler.run_mcmc(state, long.draws, thin_by=long.thin)
     x = np.swapaxes(sampler.get_chain(), 0, 1)
-    values = posterior.physical(x.reshape(-1, c)).reshape(count, long.draws, c)
     accepted = np.asarray(sampler.acceptance_fraction)
-    return Chains(posterior.names, values, sampler.get_log_prob().T, accepted, np.nan, long.evaluations)
+    walked = Chains((), x, sampler.get_log_prob().T, accepted, np.nan, long.evaluations)
+    return in_units(posterior, walked)

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.answer import answer, quantiles
+from inverse.criticism.assessment import Assessment, Points
 from inverse.criticism.stacking import stacking
+from inverse.criticism.verdict import Verdict
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
-from inverse.data.neighbours import Neighbours, neighbours
-from inverse.low_dimensional.evidence import Evidence
-from inverse.low_dimensional.laplace import Laplace
+from inverse.data.neighbours import DRAWS, agreement, neighbours
 from inverse.low_dimensional.posterior import Posterior
 from uq.inputs.random_parameters import Inputs
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
     from inverse.criticism.finer import MeshFound
 
-DRAWS = 4000  # of independent errors, for the correlation of neighbours
 QUANTILES = (0.05, 0.95)
 Pair = tuple[str, str]  # candidate and group
 
@@ -97,14 +96,6 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Assessment:
-    """The posterior of a candidate: Laplace's Gaussian, and weighted points with the evidence."""
-
-    gaussian: Laplace
-    evidence: Evidence
-
-
-@dataclass(frozen=True)
 class Criticism:
     """What the data say about one model.
 
@@ -128,14 +119,13 @@ class Criticism:
     correlation: float
 
 
-def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
+def criticise(found: Points, posterior: Posterior, data: Data) -> Criticism:
     """Compare the residuals of a model with its predictions of them."""
     from scipy.stats import chi2
 
-    w, density = found.weights, found.density
-    used = w > 0
-    w, outputs = w[used], density.outputs[used]
-    scale, r = posterior.scale(density.x[used]), posterior.residuals(outputs, density.x[used])
+    used = found.weights > 0
+    w, x = found.weights[used], found.x[used]
+    scale, r = posterior.scale(x), posterior.residuals(found.outputs[used], x)
     pointwise = -(r**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2
     log_ratio = np.log(w)[:, None] - pointwise
     top = log_ratio.max(axis=0)
@@ -158,11 +148,6 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     return Criticism(scores, np.array(pareto_k), np.array(trusted), whole, misfit, float(w @ larger))
 
 
-def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
-    """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
-    return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
-
-
 # --- all together --------------------------------------------------------------------------------------------------
 
 
@@ -171,6 +156,8 @@ def comparison(
     data_groups: Mapping[str, Data],
     posteriors: Mapping[Pair, Posterior],
     stated: Mapping[Pair, Assessment],
+    points: Mapping[Pair, Points],
+    verdicts: Mapping[Pair, Verdict],
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
     checks: Mapping[Pair, tuple[float, float]],
     left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
@@ -182,8 +169,9 @@ def comparison(
     ----------
     candidates, data_groups
         By name.
-    posteriors, stated
-        What was found, by candidate and group.
+    posteriors, stated, points, verdicts
+        What was found, by candidate and group: around the mode, what stands for the posterior, and how far it is
+        trusted.
     variants
         ln Z and error by the name of the variant, beginning with the study as it is.
     checks
@@ -197,7 +185,8 @@ def comparison(
 
     names = list(candidates)
     found = {pair: assessment.evidence for pair, assessment in stated.items()}
-    critics = {pair: criticise(found[pair], posteriors[pair], data_groups[pair[1]]) for pair in stated}
+    whole = {pair: assessment.log_evidence for pair, assessment in stated.items()}
+    critics = {pair: criticise(points[pair], posteriors[pair], data_groups[pair[1]]) for pair in stated}
     weights = np.array([candidate.weight for candidate in candidates.values()])
 
     def table(value: Mapping[Pair, Any]) -> Any:
@@ -226,15 +215,17 @@ def comparison(
         "variant_log_evidence": (("variant", "model"), np.array(sums)),
         "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
         "variant_probability": (("variant", "model"), chances),
-        "group_log_evidence": table({pair: e.log_evidence for pair, e in found.items()}),
-        "group_log_evidence_error": table({pair: e.error for pair, e in found.items()}),
+        "group_log_evidence": table({pair: value for pair, (value, _) in whole.items()}),
+        "group_log_evidence_error": table({pair: error for pair, (_, error) in whole.items()}),
         "laplace_log_evidence": table({pair: a.gaussian.log_evidence for pair, a in stated.items()}),
         "converged": table({pair: a.gaussian.converged for pair, a in stated.items()}),
         "route": table({pair: e.route for pair, e in found.items()}),
         "why": table({pair: e.why for pair, e in found.items()}),
         "effective": table({pair: e.ess for pair, e in found.items()}),
         "tail": table({pair: e.pareto_k for pair, e in found.items()}),
-        "trusted": table({pair: e.trusted for pair, e in found.items()}),
+        "trusted": table({pair: a.known for pair, a in stated.items()}),
+        "trust": table({pair: verdict.trust for pair, verdict in verdicts.items()}),
+        "verdict": table({pair: verdict.why for pair, verdict in verdicts.items()}),
         "misfit_probability": table({pair: c.misfit for pair, c in critics.items()}),
         "correlation_probability": table({pair: c.correlation for pair, c in critics.items()}),
         "score": ("model", scores.sum(axis=1)),
@@ -244,14 +235,19 @@ def comparison(
         "score_tail": ("model", [max(critics[name, group].pareto_k.max() for group in data_groups) for name in names]),
         "score_trusted": (
             "model",
-            [all(critics[name, group].trusted.all() for group in data_groups) for name in names],
+            [
+                all(
+                    verdicts[name, group].trust != "neither" and critics[name, group].trusted.all()
+                    for group in data_groups
+                )
+                for name in names
+            ],
         ),
     }
     if checks:
         variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
         variables["nested_log_evidence_error"] = table({pair: error for pair, (_, error) in checks.items()})
     if left_out:
-        whole = {pair: (e.log_evidence, e.error) for pair, e in found.items()}
         ours, theirs = zip(
             *((totals({pair: whole[pair] for pair in rest}), totals(rest)) for rest in left_out.values()), strict=True
         )
@@ -261,12 +257,17 @@ def comparison(
             dims,
             np.array([np.hypot(a[1], b[1]) for a, b in zip(ours, theirs, strict=True)]),
         )
-    columns = [_predictions(names, group, data, posteriors, stated, P) for group, data in data_groups.items()]
+    columns = [_predictions(names, group, data, posteriors, points, P) for group, data in data_groups.items()]
     for name, (dims, _) in columns[0].items():
         variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
     parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
     variables["point_log_likelihood"] = _pointwise(names, data_groups, critics)
-    variables |= _constants(names, list(data_groups), parameters, posteriors, stated)
+    variables |= _constants(names, list(data_groups), parameters, posteriors, stated, points)
+    chains = {pair: a.chains for pair, a in stated.items() if a.chains is not None}
+    if chains:
+        variables["chains"] = table({pair: len(one.draws) * one.mixed for pair, one in chains.items()})
+        variables["chain_rhat"] = table({pair: one.rhat.max() for pair, one in chains.items()})
+        variables["chain_effective"] = table({pair: one.ess for pair, one in chains.items()})
     if meshes:
         variables |= _meshes(names, data_groups, parameters, posteriors, meshes, variables["constant_std"][1])
     coordinates = {"model": names, "group": list(data_groups), "variant": list(variants), "parameter": parameters}
@@ -291,7 +292,7 @@ def _predictions(
     group: str,
     data: Data,
     posteriors: Mapping[Pair, Posterior],
-    stated: Mapping[Pair, Assessment],
+    points: Mapping[Pair, Points],
     P: FloatArray,
 ) -> dict[str, tuple[Any, Any]]:
     """Outputs of one group without noise, by each model and by all, beside the data."""
@@ -299,10 +300,10 @@ def _predictions(
     mean, std = np.empty((2, len(names), M))
     bands = np.empty((len(QUANTILES), len(names), M))
     for k, name in enumerate(names):
-        evidence = stated[name, group].evidence
-        used = evidence.weights > 0
-        w, outputs = evidence.weights[used], evidence.density.everything[used].copy()
-        outputs[:, :m] = evidence.density.outputs[used]  # corrected for the mesh, where that was done
+        found = points[name, group]
+        used = found.weights > 0
+        w, outputs = found.weights[used], found.everything[used].copy()
+        outputs[:, :m] = found.outputs[used]  # corrected for the mesh, where that was done
         mean[k] = w @ outputs
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
         bands[:, k] = np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T
@@ -330,6 +331,7 @@ def _constants(
     parameters: list[str],
     posteriors: Mapping[Pair, Posterior],
     stated: Mapping[Pair, Assessment],
+    points: Mapping[Pair, Points],
 ) -> dict[str, tuple[Any, Any]]:
     """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
     shape = (len(names), len(data_groups), len(parameters))
@@ -339,17 +341,17 @@ def _constants(
         for g, group in enumerate(data_groups):
             posterior, assessment = posteriors[name, group], stated[name, group]
             columns = [parameters.index(p) for p in posterior.names]
-            known = answer(posterior, assessment.gaussian, assessment.evidence)
+            known = answer(posterior, assessment.gaussian, assessment.evidence, assessment.chains)
             mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
             mean[k, g, columns], std[k, g, columns] = known.mean, known.std
             bands[:, k, g, columns] = known.quantiles(QUANTILES).T
-    count = max(assessment.evidence.weights.size for assessment in stated.values())
+    count = max(found.weights.size for found in points.values())
     places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
     for k, name in enumerate(names):
         for g, group in enumerate(data_groups):
-            posterior, found = posteriors[name, group], stated[name, group].evidence
-            columns = [parameters.index(p) for p in posterior.names]
-            places[k, g, : found.weights.size, columns] = posterior.physical(found.density.x).T
+            found = points[name, group]
+            columns = [parameters.index(p) for p in posteriors[name, group].names]
+            places[k, g, : found.weights.size, columns] = found.values.T
             shares[k, g, : found.weights.size] = found.weights
     dims = ("model", "group", "parameter")
     return {

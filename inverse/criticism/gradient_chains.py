@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from inverse.criticism.chains import SPREAD, Chains, Lengths
+from inverse.criticism.chains import SPREAD, Chains, Lengths, in_units
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 
@@ -201,9 +201,7 @@ def _chains(
 ) -> Chains:
     """Chains of draws z (chains, draws, c), in physical units."""
     x = gaussian.mode + z @ gaussian.root.T
-    values = posterior.physical(x.reshape(-1, x.shape[2])).reshape(x.shape)
-    needed = EACH * len(z)
-    return Chains(posterior.names, values, log_density, accepts.mean(axis=1), np.nan, count, needed)
+    return in_units(posterior, Chains((), x, log_density, accepts.mean(axis=1), np.nan, count, EACH * len(z)))
 
 
 def _start(potential: _Potential, z: FloatArray) -> FloatArray:

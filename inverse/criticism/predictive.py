@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.answer import quantiles
-from inverse.criticism.comparison import DRAWS, agreement
-from inverse.data.neighbours import Neighbours
+from inverse.data.neighbours import DRAWS, Neighbours, agreement
 from inverse.fields.field_posterior import Point
 from inverse.fields.low_rank import LowRankPosterior, Spectrum
 from inverse.low_dimensional.evidence import Evidence

@@ -51,8 +51,11 @@ class Verdict:
 def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chains: Chains | None = None) -> Verdict:
     """Judge the Gaussian of few parameters by weighted points, the residuals, and chains if there are any."""
     objection = _objection(gaussian.converged, test, gaussian.left)
-    if objection is not None:
-        return objection
+    return verdict_on_points(gaussian, found, chains) if objection is None else objection
+
+
+def verdict_on_points(gaussian: Laplace, found: Evidence, chains: Chains | None = None) -> Verdict:
+    """Judge the Gaussian of few parameters by weighted points, and chains if there are any."""
     if found.route == "closed form":
         return Verdict("laplace", found.why)
     n, c = found.density.x.shape

@@ -15,6 +15,7 @@ from forward.model import FloatArray
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
 NEAREST = 16  # other places that are tested from each
+DRAWS = 4000  # of independent errors, for the distribution of `agreement`
 SAME = 1e-9  # relative difference of distances that counts as rounding
 
 
@@ -37,6 +38,11 @@ def neighbours(places: FloatArray, kinds: NDArray[np.int64], measured: FloatArra
         pairs |= {(int(members[i]), int(members[j])) for i, j in _related(places[members])}
     ordered = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return ordered[:, 0], ordered[:, 1]
+
+
+def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
+    """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
+    return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
 
 
 def _related(points: FloatArray) -> set[tuple[int, int]]:

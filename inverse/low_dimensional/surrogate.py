@@ -187,10 +187,22 @@ def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basi
 
 
 def _tempered(log_density: FloatArray, least: float) -> FloatArray:
-    """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 with an effective sample size of at least `least`."""
+    """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 with an effective sample size of at least `least`.
+
+    Where the density is zero they are zero too, also if so few points are left that β = 0.
+
+    Raises
+    ------
+    SolveError
+        If it is zero everywhere.
+    """
+    there = np.isfinite(log_density)
+    if not there.any():
+        raise SolveError("a polynomial has no answer at any point that was drawn")
+    gaps = np.where(there, log_density - log_density[there].max(), 0.0)
 
     def weights(power: float) -> FloatArray:
-        w = np.exp(power * (log_density - log_density.max()))
+        w = np.where(there, np.exp(power * gaps), 0.0)
         return np.asarray(w / w.sum())
 
     if 1 / (weights(1.0) ** 2).sum() >= least:

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from forward.settings import Settings
-from inverse.criticism.chains import FEW, FIELD, walkers
-from inverse.criticism.gradient_chains import BUDGET
+from inverse.criticism.assessment import Kind, solves_of
+from inverse.criticism.chains import FIELD
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
@@ -86,7 +86,7 @@ class Invert(MeshTreatment, Settings):
     kind: Literal["invert"] = "invert"
     samples: Annotated[int, Field(ge=0)] | None = None
     noise: Distribution | None = None
-    chains: Literal["pcn", "emcee", "hmc"] | None = None
+    chains: Kind | None = None
     starts: Annotated[int, Field(ge=1)] = 4
     cutoff: Annotated[float, Field(gt=0)] = CUTOFF
     rank: Annotated[int, Field(ge=1)] = 256
@@ -117,13 +117,9 @@ class Invert(MeshTreatment, Settings):
 
     def chain_solves(self, size: int, *, field: bool) -> int:
         """Number of solves of the chains for a data set with `size` unknown parameters."""
-        if self.chains is None:
-            return 0
-        if field:
+        if field and self.chains is not None:
             return 2 * FIELD.evaluations  # the map of fields takes two
-        if self.chains == "hmc":
-            return BUDGET
-        return (FEW if self.chains == "pcn" else walkers(size)).evaluations
+        return solves_of(self.chains, size)
 
 
 def names_of(inputs: Inputs, method: Invert) -> tuple[str, ...]:

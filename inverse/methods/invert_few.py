@@ -10,22 +10,21 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
-from inverse.criticism.answer import Answer, answer, by_gaussian, gaussian_points
-from inverse.criticism.chains import Chains, chains_of_few, ensemble
+from inverse.criticism.answer import Answer, answer, by_gaussian
+from inverse.criticism.assessment import Assessment, Points, assess, even, of_chains, of_gaussian, weighted
 from inverse.criticism.finer import NOT_LOOKED, Finer
-from inverse.criticism.gradient_chains import gradient_chains
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
-from inverse.criticism.weights import FEWEST, resampled
+from inverse.criticism.weights import resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
-from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
+from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.methods.invert import Invert
@@ -37,7 +36,7 @@ from inverse.methods.record import (
     Data,
     Record,
     as_dataset,
-    of_chains,
+    diagnosed,
     of_data,
     of_mesh,
     of_motions,
@@ -45,7 +44,7 @@ from inverse.methods.record import (
     of_test,
 )
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.request import Evaluate, Request, Start
+from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
 
@@ -198,20 +197,19 @@ def inverted(
         treatment = method.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, finer, data.spread, treatment)
     best = posterior.physical(gaussian.mode[None])[0]
-    found = evidence(posterior, gaussian, method.solves(len(best), field=False) or LEAST, seed=method.seed)
+    solves = method.solves(len(best), field=False)
+    one = assess(posterior, gaussian, solves, chains=method.chains, model=model, seed=method.seed)
+    found, chains = one.evidence, one.chains
     at = posterior.at(gaussian.mode[None], derivatives=True)
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
-    chains = _chains(posterior, gaussian, found, method, model)
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, gaussian, found, chains)
-    log_evidence, error = found.log_evidence, found.error
-    if known.source == "chains" and chains is not None and chains.evidence is not None and not found.trusted:
-        log_evidence, error = chains.evidence
-    drawn = _drawn(posterior, gaussian, found, known, chains, at, method)
+    log_evidence, error = one.log_evidence
+    drawn = _drawn(posterior, one, at, method)
     moments = _moments(posterior, gaussian, known, drawn, look)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
@@ -222,10 +220,10 @@ def inverted(
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(posterior, drawn.draws, drawn.outputs),
-        "point": drawn.points,
-        "point_weight": drawn.weights,
+        "point": drawn.points.values,
+        "point_weight": drawn.points.weights,
         "source": np.array(SOURCES.index(known.source)),
-        **of_chains(chains, used=known.source == "chains"),
+        **diagnosed(chains, used=known.source == "chains"),
         "mode": best,
         "log_evidence": np.array(log_evidence),
         "log_evidence_error": np.array(error),
@@ -245,71 +243,32 @@ def inverted(
     return Inverted(as_dataset(record), posterior, found)
 
 
-def _chains(
-    posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert, model: ForwardModel | None
-) -> Chains | None:
-    match method.chains:
-        case None:
-            return None
-        case "hmc":
-            if model is None:
-                message = "chains = 'hmc' follow the gradients of a model itself, which is not given"
-                raise ValueError(message)
-            return gradient_chains(posterior, gaussian, model, seed=method.seed)
-        case "emcee":
-            return ensemble(posterior, gaussian, seed=method.seed)
-        case "pcn":
-            # Fewer points say little about a covariance.
-            enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
-            return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
-        case _:
-            assert_never(method.chains)
-
-
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Draws (n, c) of a posterior with their outputs (n, m), and points (N, c) with weights (N,) that stand for it."""
+    """Draws (n, c) of a posterior with their outputs (n, m), and points that stand for it."""
 
     draws: FloatArray
     outputs: FloatArray
-    points: FloatArray
-    weights: FloatArray
+    points: Points
     spread: FloatArray  # points that the stiffness is looked at, with weights
     shares: FloatArray
 
 
-def _drawn(
-    posterior: Posterior,
-    gaussian: Laplace,
-    found: Evidence,
-    known: Answer,
-    chains: Chains | None,
-    at: Density,
-    method: Invert,
-) -> _Drawn:
+def _drawn(posterior: Posterior, one: Assessment, at: Density, method: Invert) -> _Drawn:
     """Draw from what is printed; solves at draws of chains, whose outputs were not kept."""
-    if known.source == "points":
-        weights, points = found.weights, posterior.physical(found.density.x)
-        chosen, used = resampled(weights, method.draws, method.seed), weights > 0
-        return _Drawn(points[chosen], found.density.outputs[chosen], points, weights, points[used], weights[used])
-    d = len(posterior.inputs.names)
-    if known.source == "chains":
-        assert chains is not None
-        draws = _thinned(chains, method.draws)
-        which = slice(None) if posterior.which is None else list(posterior.which)
-        outputs = posterior.evaluate(Request(draws[:, :d], start=posterior.start)).outputs[:, which]
-        if posterior.mesh is not None:
-            outputs = outputs + posterior.mesh.at(draws[:, :d])
-        return _Drawn(draws, outputs, draws, _even(draws), chains.flat, _even(chains.flat))
-    x = gaussian_points(gaussian, max(method.draws, len(found.log_weights)))
-    points, moved = posterior.physical(x), (x - gaussian.mode)[: method.draws, :d]
-    # By the model linearised at the mode: exact where the posterior is Gaussian.
-    outputs = at.outputs + moved @ posterior.output_slopes(at)[0].T
-    return _Drawn(points[: method.draws], outputs, points, _even(points), points, _even(points))
-
-
-def _even(points: FloatArray) -> FloatArray:
-    return np.full(len(points), 1 / len(points))
+    match one.source:
+        case "points":
+            found = weighted(posterior, one.evidence)
+            chosen, used = resampled(found.weights, method.draws, method.seed), found.weights > 0
+            return _Drawn(found.values[chosen], found.outputs[chosen], found, found.values[used], found.weights[used])
+        case "chains":
+            assert one.chains is not None
+            found = of_chains(posterior, one.chains, method.draws)
+            return _Drawn(found.values, found.outputs, found, one.chains.flat, even(len(one.chains.flat)))
+        case "laplace":
+            found = of_gaussian(posterior, one.gaussian, at, max(method.draws, len(one.evidence.log_weights)))
+            drawn, outputs = found.values[: method.draws], found.outputs[: method.draws]
+            return _Drawn(drawn, outputs, found, found.values, found.weights)
 
 
 def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Drawn, look: Look | None) -> Record:
@@ -333,13 +292,6 @@ def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Dra
         "stiffness_mean": average,
         "stiffness_std": np.sqrt(np.maximum(drawn.shares @ (stiffness - average) ** 2, 0)),
     }
-
-
-def _thinned(chains: Chains, count: int) -> FloatArray:
-    """At most `count` draws (n, k), chain after chain, equally many from each."""
-    each = max(count // len(chains.draws), 1)
-    steps = np.linspace(0, chains.draws.shape[1] - 1, each).round().astype(int)
-    return chains.draws[:, steps].reshape(-1, chains.draws.shape[2])[:count]
 
 
 def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Data) -> Record:

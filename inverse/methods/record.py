@@ -291,7 +291,7 @@ def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
     }
 
 
-def of_chains(chains: Chains | None, *, used: bool = True) -> Record:
+def diagnosed(chains: Chains | None, *, used: bool = True) -> Record:
     """The diagnostics of chains, and how many have mixed and are used; zero if there are none."""
     if chains is None:
         return {"chains": np.array(0.0), "chain_rhat": np.array(np.nan), "chain_effective": np.array(np.nan)}

@@ -8,20 +8,25 @@ that were solved already (in standard normal coordinates, N(0, s²I) instead of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import Settings
-from inverse.criticism.comparison import Assessment, Candidate, Data, comparison
+from inverse.criticism.assessment import Assessment, Kind, Points, assess, of_chains, of_gaussian, solves_of, weighted
+from inverse.criticism.comparison import Candidate, Data, comparison
 from inverse.criticism.finer import Finer, MeshFound
+from inverse.criticism.verdict import verdict_on_points
+from inverse.criticism.weights import fewest
 from inverse.data.approximation_error import Places
 from inverse.data.shared_motion import Shared, determined
-from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
+from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
@@ -97,6 +102,9 @@ class Select(Settings):
         Of all draws.
     starts
         Starts of each search for the mode.
+    chains
+        Run Markov chains for each candidate too, as an inversion does: "pcn", "emcee" or "hmc". If they have mixed,
+        constants and predictions are theirs; those by "hmc" tell the evidence too, where weighted points cannot.
     check
         "dynesty": compute the evidences by nested sampling too.
     """
@@ -109,6 +117,7 @@ class Select(Settings):
     held_out: bool = False
     seed: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 4
+    chains: Kind | None = None
     check: Literal["dynesty"] | None = None
 
     @model_validator(mode="after")
@@ -124,6 +133,10 @@ class Select(Settings):
         """Number of times that all evidences are computed, not counting held-out tests."""
         return 1 + len(self.other_noises) + len(self.subsets)
 
+    def chain_solves(self, size: int) -> int:
+        """Most solves of the chains of a candidate with so many unknown constants."""
+        return solves_of(self.chains, size)
+
     def run(
         self,
         candidates: Mapping[str, Candidate],
@@ -133,6 +146,7 @@ class Select(Settings):
         finer: Callable[[str, str], Finer] | None = None,
         say: Callable[[str], None] = lambda line: None,
         shared: Mapping[tuple[str, str], Shared] | None = None,
+        model: Callable[[str, str], ForwardModel] | None = None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -152,6 +166,8 @@ class Select(Settings):
             Shows the user a line before the search of each candidate.
         shared
             What errors the data share, by candidate and group; by default they are independent.
+        model
+            The model of a candidate for a group itself, whose gradients chains follow.
 
         Returns
         -------
@@ -173,16 +189,19 @@ class Select(Settings):
             look = None if finer is None else (finer(name, group), _places(data_groups[group]))
             if look is not None and self.treatment is not None:
                 before_few(one, look[0], lambda line, name=name: say(f"{name}: {line}"))  # type: ignore[misc]
-            posteriors[name, group], stated[name, group], found = self._assess(one, (name, group), look, errors)
+            near, gaussian, found = self._around(one, (name, group), look, errors)
+            itself = None if model is None else model(name, group)
+            posteriors[name, group] = near
+            stated[name, group] = self._assessed(near, gaussian, (name, group), chains=self.chains, model=itself)
             if found is not None:
                 meshes[name, group] = found
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
-            STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
+            STATED: {pair: found.log_evidence for pair, found in stated.items()}
         }
         for width in WIDTHS:
             label = f"priors × {width:g}"
             variants[label] = {
-                pair: _rescaled(found.evidence, posteriors[pair], width) for pair, found in stated.items()
+                pair: found.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, found in stated.items()
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
@@ -203,7 +222,11 @@ class Select(Settings):
             if self.held_out
             else {}
         )
-        result = comparison(candidates, data_groups, posteriors, stated, variants, checks, left_out, meshes)
+        points = {pair: _standing(posteriors[pair], found) for pair, found in stated.items()}
+        verdicts = {pair: verdict_on_points(one.gaussian, one.evidence, one.chains) for pair, one in stated.items()}
+        result = comparison(
+            candidates, data_groups, posteriors, stated, points, verdicts, variants, checks, left_out, meshes
+        )
         if not shared:
             return result
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
@@ -226,15 +249,15 @@ class Select(Settings):
         """What is done about the error of meshes: there are none."""
         return None
 
-    def _assess(
+    def _around(
         self,
         posterior: Posterior,
         pair: tuple[str, str],
         look: tuple[Finer, Places] | None = None,
         shared: Shared | None = None,
-    ) -> tuple[Posterior, Assessment, MeshFound | None]:
-        """Find mode and evidence; the posterior too, with solves that start from the mode, corrected for its mesh."""
-        try:
+    ) -> tuple[Posterior, Laplace, MeshFound | None]:
+        """Find the mode; the posterior too, with solves that start from the mode, corrected for its mesh."""
+        with _of(pair):
             gaussian, found = laplace(posterior, starts=self.starts, seed=self.seed), None
             d = len(posterior.inputs.names)
             if shared is not None:  # which depends on the displacements
@@ -243,14 +266,23 @@ class Select(Settings):
             near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, :d])
             if look is not None:
                 near, gaussian, found = corrected_few(near, gaussian, *look, self.treatment or "report")
-            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed)), found
-        except SolveError as error:
-            message = f"candidate '{pair[0]}': {error.reason}"
-            raise SolveError(message, error.history) from None
+            return near, gaussian, found
+
+    def _assessed(
+        self,
+        near: Posterior,
+        gaussian: Laplace,
+        pair: tuple[str, str],
+        *,
+        chains: Kind | None = None,
+        model: ForwardModel | None = None,
+    ) -> Assessment:
+        with _of(pair):
+            return assess(near, gaussian, self.samples, chains=chains, model=model, seed=self.seed)
 
     def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
-        found = self._assess(posterior, pair)[1].evidence
-        return found.log_evidence, found.error
+        near, gaussian, _ = self._around(posterior, pair)
+        return self._assessed(near, gaussian, pair).log_evidence
 
 
 class SelectSpecimens(MeshTreatment, Select):
@@ -327,10 +359,34 @@ def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior
     return replace(posterior, data=values, sigma=sigma, which=tuple(which.tolist()), mesh=mesh, shared=shared)
 
 
-def _rescaled(found: Evidence, posterior: Posterior, width: float) -> tuple[float, float]:
-    """Return ln Z and its error with priors of another width, by the points that were solved."""
+def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatArray:
+    """Return what priors of another width add to ln of the prior density at points (n, c)."""
     inputs = posterior.inputs
-    x = found.density.x[:, : len(inputs.names)]
+    x = points[:, : len(inputs.names)]
     change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
-    change += np.log(inputs.admitted / inputs.admitted_at(width))
-    return found.reweighted(change)
+    return np.asarray(change + np.log(inputs.admitted / inputs.admitted_at(width)))
+
+
+def _standing(posterior: Posterior, one: Assessment) -> Points:
+    """Return what stands for a posterior: chains, else points that were solved, which know what is predicted too.
+
+    Of solved points it is enough that many count: what is predicted from a tail that is not to be trusted is nearer
+    than what a linearised model predicts.
+    """
+    count = len(one.evidence.log_weights)
+    if one.source == "chains":
+        assert one.chains is not None
+        return of_chains(posterior, one.chains, count)
+    if one.evidence.ess >= fewest(len(one.gaussian.mode)):
+        return weighted(posterior, one.evidence)
+    return of_gaussian(posterior, one.gaussian, posterior.at(one.gaussian.mode[None], derivatives=True), count)
+
+
+@contextmanager
+def _of(pair: tuple[str, str]) -> Iterator[None]:
+    """Say of which candidate a model has no answer."""
+    try:
+        yield
+    except SolveError as error:
+        message = f"candidate '{pair[0]}': {error.reason}"
+        raise SolveError(message, error.history) from None

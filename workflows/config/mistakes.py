@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 from pydantic import ValidationError
@@ -40,6 +41,13 @@ def refused(title: str, mistakes: Sequence[Mistake]) -> None:
                 for place, m, given in mistakes
             ],
         )
+
+
+def not_installed(key: str, given: str, packages: Sequence[str]) -> Iterator[Mistake]:
+    """Find packages that the value of a key of the method needs, and that are not installed."""
+    for package in packages:
+        if find_spec(package) is None:
+            yield ("method", key), f"needs {package}, which is not installed: pip install {package}", given
 
 
 _APART = [kind for kind in STUDIES.own if kind != SAMPLING]  # kinds of studies whose files have other blocks

@@ -142,10 +142,15 @@ def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> 
     wrong
         Candidates with wrong derivatives, of which that is said.
     """
-    doubtful, samples = _doubtful(found, by_probability(found, found["log_evidence"]))
-    if doubtful:
-        text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."
-        yield Finding("error", text)
+    for model in by_probability(found, found["log_evidence"]):
+        for group in found.group.values:
+            one = found.sel(model=model, group=group)
+            where = f"{model} in {group}" if found.sizes["group"] > 1 else model
+            if not bool(one["trusted"]):
+                yield Finding("error", f"Evidences not to be trusted: {where} ({one['verdict'].item()}).")
+            elif one["trust"].item() == "neither":
+                text = f"Constants are Laplace's, and not to be trusted: {where} ({one['verdict'].item()})."
+                yield Finding("warning", text)
     looked = found["mesh_checked"] if "mesh_checked" in found else found["trusted"]
     by_mesh = (found["trusted"] & ~judged["trusted"] & looked).any("group")
     names = [str(name) for name in found["model"].values[by_mesh.to_numpy()] if name not in wrong]
@@ -164,23 +169,6 @@ def _depends(dataset: xr.Dataset, order: list[str]) -> Iterator[Finding]:
             yield Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
     if changed:
         yield Finding("warning", f"It depends: the most probable is {'; '.join(changed)}.")
-
-
-def _doubtful(dataset: xr.Dataset, order: list[str]) -> tuple[list[str], int]:
-    """Evidences that cannot be trusted, each with the quality of its weights, and how many points may be enough."""
-    from inverse.criticism.weights import enough, worth
-
-    found, samples = [], 0
-    for model in order:
-        for group in dataset.group.values:
-            one = dataset.sel(model=model, group=group)
-            if not bool(one["trusted"]):
-                where = f"{model} in {group}" if dataset.sizes["group"] > 1 else model
-                count = int(np.isfinite(one["point"].to_numpy()).any(axis=-1).sum())
-                ess = float(one["effective"])
-                found.append(f"{where} ({worth(float(one['tail']), ess, count)})")
-                samples = max(samples, enough(ess, count))
-    return found, samples
 
 
 def doubts_of_selection(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -15,13 +14,14 @@ from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
+from inverse.criticism.assessment import NEEDED
 from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import StudyError, refused
+from workflows.config.mistakes import StudyError, not_installed, refused
 from workflows.config.predict import Predict
 from workflows.config.priors import mistakes_of_factor, mistakes_of_priors
 from workflows.config.report import Report
@@ -229,12 +229,8 @@ class InversionStudy(StudyKind):
 
     def _mistakes(self) -> Iterator[Mistake]:
         """Find mistakes common to all inversions."""
-        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee"), "hmc": ("arviz", "mici")}.get(
-            self.method.chains or "", ()
-        ):
-            if find_spec(package) is None:
-                message = f"needs {package}, which is not installed: pip install {package}"
-                yield ("method", "chains"), message, self.method.chains
+        if self.method.chains is not None:
+            yield from not_installed("chains", self.method.chains, NEEDED[self.method.chains])
         if self.method.chains == "hmc" and self.method.reduced is not None:
             message = "follows the gradients of the body itself, expected 'pcn' or 'emcee' with a reduced model"
             yield ("method", "chains"), message, self.method.chains

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -18,12 +17,13 @@ from forward.model import Finding, ForwardModel
 from forward.registry import KindError, named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
+from inverse.criticism.assessment import NEEDED
 from inverse.criticism.comparison import Candidate, Data
 from inverse.methods.selection import Select
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import StudyError, refused
+from workflows.config.mistakes import StudyError, not_installed, refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
@@ -232,7 +232,9 @@ class Comparison(StudyKind):
     def planned(self) -> int:
         """Approximate number of solves: the searches for the modes are not predictable."""
         searches = sum(self.searches(name) for name, _ in self.pairs)
-        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
+        noise = self.method.noise.factor is not None
+        chains = sum(self.method.chain_solves(len(self.candidates[name].parameters) + noise) for name, _ in self.pairs)
+        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs) + chains
 
     def searches(self, name: str) -> int:
         """Number of solves that the searches for the mode of a candidate take, roughly."""
@@ -282,9 +284,13 @@ class Comparison(StudyKind):
 
     def mistakes_of_method(self) -> Iterator[Mistake]:
         """Find what does not fit the candidates and the data."""
-        if self.method.check is not None and find_spec(self.method.check) is None:
-            message = f"needs {self.method.check}, which is not installed: pip install {self.method.check}"
-            yield ("method", "check"), message, self.method.check
+        if self.method.check is not None:
+            yield from not_installed("check", self.method.check, (self.method.check,))
+        if self.method.chains is not None:
+            yield from not_installed("chains", self.method.chains, NEEDED[self.method.chains])
+        if self.method.chains == "hmc" and self.parallel.ranks_per_model > 1:
+            message = "chains = 'hmc' follow gradients on one rank, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
         known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
         for name, tests in self.method.subsets.items():
             for test in tests:

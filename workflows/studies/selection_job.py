@@ -61,7 +61,12 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
             return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
         look = finer if why else None
-        return study.method.run(study.models, study.data_groups, recorded, free, look, ensemble.say, shared or None)
+
+        def itself(name: str, group: str) -> ForwardModel:
+            return makers[name, group]()
+
+        method = study.method
+        return method.run(study.models, study.data_groups, recorded, free, look, ensemble.say, shared or None, itself)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)

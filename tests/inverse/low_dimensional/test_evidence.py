@@ -15,7 +15,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.surrogate import fit
+from inverse.low_dimensional.surrogate import _tempered, fit
 from inverse.methods.selection import _rescaled
 from inverse.methods.selection import posterior as assemble
 from tests.problems import FOUR, ridge, slopes_of_four, two_of_four
@@ -222,9 +222,19 @@ def test_evidence_of_priors_with_inadmissible_tails(correlated, by_nested_sampli
     assert abs(found.log_evidence - exact[1.0]) < max(4 * found.error, 5e-3)
     assert found.error < 0.05
     for width in (0.5, 2.0):
-        value, error = _rescaled(found, whole, width)
+        value, error = found.reweighted(_rescaled(whole, width, found.density.x))
         assert abs(value - exact[width]) < max(4 * error, 5e-3)
     assert not found.weights[found.density.parameters.sum(axis=1) <= 0].any()
     if by_nested_sampling and find_spec("dynesty"):
         value, error = nested(whole, live=200)
         assert abs(value - exact[1.0]) < 4 * error
+
+
+@pytest.mark.unit
+def test_weights_of_points_where_a_polynomial_has_no_answer():
+    """They are nothing at any power, also where fewer points are left than are asked for."""
+    logs = np.array([-np.inf, 0.0, -3.0, -np.inf])
+    np.testing.assert_allclose(_tempered(logs, 8), [0, 0.5, 0.5, 0])
+    np.testing.assert_allclose(_tempered(logs, 1), [0, 1 / (1 + np.exp(-3)), 1 / (1 + np.exp(3)), 0])
+    with pytest.raises(SolveError, match="no answer at any point"):
+        _tempered(np.full(3, -np.inf), 2)

@@ -10,13 +10,18 @@ import xarray as xr
 from scipy.stats import multivariate_normal
 
 from forward.materials.material_point import HomogeneousModel, MaterialTest
+from inverse.criticism.assessment import weighted
 from inverse.criticism.comparison import Candidate, Data, criticise, probabilities
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
+from inverse.data.outputs import OutputData
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.invert import Invert
+from inverse.methods.invert_few import invert_by_group
 from inverse.methods.selection import Noise, Select, posterior
 from tests.launch import TISSUQ, run, run_script
+from tests.problems import bananas
 from tests.rubber import CONFIGS, FACTOR, treloar
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal, Uniform
@@ -170,7 +175,7 @@ def test_left_out_scores_of_a_linear_model():
     data = Data(values, None, labels, np.concatenate([test.at for test in tests]))
     inputs = Inputs(priors)
     whole = posterior(Candidate(inputs), data, Noise(relative=0.1), SerialEvaluate(it))
-    found = criticise(evidence(whole, laplace(whole), 2048), whole, data)
+    found = criticise(weighted(whole, evidence(whole, laplace(whole), 2048)), whole, data)
     A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
     r, sigma = values - it.stresses(inputs.mean[None])[0], 0.1 * np.abs(values)
     for j in (0, 7, 17):
@@ -385,7 +390,7 @@ def test_the_order_of_rows_says_nothing_of_neighbours():
         data = Data(values[order], None, ("biaxial",) * 30, grid[order, 0], grid[order])
         candidate = Candidate(Inputs({"C1": LogNormal(mean=2e5, std=1e5)}))
         one = posterior(candidate, data, Noise(absolute=2e4, factor=FACTOR), SerialEvaluate(it))
-        found.append(criticise(evidence(one, laplace(one), 64), one, data).correlation)
+        found.append(criticise(weighted(one, evidence(one, laplace(one), 64)), one, data).correlation)
     assert found[0] < 0.01
     np.testing.assert_allclose(found[1:], found[0], atol=1e-12)
 
@@ -575,17 +580,20 @@ def test_evidences_that_cannot_be_trusted_are_an_error():
             "log_evidence": ("model", [-3.0, -4.0]),
             "prior_probability": ("model", [0.5, 0.5]),
             "trusted": (by, [[True], [True]]),
-            "effective": (by, [[500.0], [3.0]]),
-            "tail": (by, [[0.1], [0.9]]),
-            "point": ((*by, "point", "parameter"), np.zeros((2, 1, 640, 1))),
+            "trust": (by, [["laplace"], ["neither"]]),
+            "verdict": (by, [["worth 500"], ["worth 3; run chains"]]),
         },
         {"model": ["one", "other"], "group": ["all"]},
     )
-    assert not list(untrusted(found, found, ()))
+    (warning,) = untrusted(found, found, ())
+    assert warning.severity == "warning"
+    assert warning.text == "Constants are Laplace's, and not to be trusted: other (worth 3; run chains)."
+    assert not list(untrusted(found.isel(model=[0]), found.isel(model=[0]), ()))
     few = found.assign(trusted=(by, [[True], [False]]))
     (error,) = untrusted(few, few, ())
     assert error.severity == "error"
-    assert error.text.startswith("Evidences not to be trusted: other (")
+    assert error.text == "Evidences not to be trusted: other (worth 3; run chains)."
+    found = found.assign(trust=(by, [["laplace"], ["corrected"]]))
     (error,) = untrusted(found, few, ())  # its mesh was looked at afterwards
     assert error == ("error", "Evidences not to be trusted for what meshes do to them: other.")
     assert not list(untrusted(found, few, ("other",)))
@@ -651,3 +659,67 @@ def test_a_table_of_strains_is_one_line(small, capsys):
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == 1
         assert told in lines[0]
+
+
+def of_bananas(pairs, **settings):
+    """What a comparison and an inversion of the same curved posterior find, and what is true."""
+    model, curved, *truth = bananas(pairs)
+    d = 2 * pairs
+    data = Data(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
+    method = Select(noise=Noise(), **settings)
+    evaluate = SerialEvaluate(model)
+    found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, model=lambda *_: model)
+    named = tuple(f"z{k}" for k in range(d))
+    of_outputs = OutputData(named, np.zeros(d), np.ones(d), named, outputs=named, parts=named)
+    beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
+    return (
+        found.sel(model="it", group="all"),
+        invert_by_group(curved.inputs, model, of_outputs, beside, None, finer=None),
+        truth,
+    )
+
+
+def test_where_points_count_little_a_comparison_says_what_an_inversion_says():
+    """40 unknowns, curved: few of the points count, and none of them stands for constants or predictions."""
+    found, inverted, _ = of_bananas(20, samples=64)
+    assert not found["trusted"]
+    assert found["effective"] < 20
+    assert str(found["trust"].item()) == "neither"
+    assert str(inverted["why"].item()).endswith(str(found["verdict"].item()))
+    np.testing.assert_allclose(found["constant_mean"], inverted["mean"], rtol=1e-9)
+    np.testing.assert_allclose(found["constant_std"], inverted["std"], rtol=1e-9)
+    weights = found["point_weight"].to_numpy()
+    assert 1 / (weights**2).sum() == pytest.approx(64)
+    spread = found["point"].to_numpy().std(axis=0)
+    np.testing.assert_allclose(spread, found["constant_std"], rtol=0.25)  # 64 points of 40 unknowns
+    assert (found["prediction_std"] > 0.7).all()  # of one point it would be nothing
+    assert not found["score_trusted"]
+
+
+def test_chains_of_a_comparison():
+    """12 unknowns, curved: constants, predictions and ln Z by gradients, as in an inversion, and as in closed form."""
+    pytest.importorskip("mici")
+    found, inverted, (mean, std, log_evidence) = of_bananas(6, samples=64, chains="hmc")
+    assert found["chains"] == 2
+    assert found["trusted"]
+    assert str(found["trust"].item()) == "corrected"
+    assert np.abs((found["constant_mean"] - mean) / std).max() < 0.2
+    assert np.abs(found["constant_std"] / std - 1).max() < 0.25
+    log, error = float(found["group_log_evidence"]), float(found["group_log_evidence_error"])
+    assert abs(log - log_evidence) < 3 * error < 3
+    assert log == pytest.approx(float(inverted["log_evidence"]), abs=1e-6)
+    np.testing.assert_allclose(found["constant_mean"], inverted["mean"], rtol=1e-6, atol=1e-6)
+    assert np.abs(found["prediction_mean"]).max() < 0.5  # z is standard normal
+    # Priors half as wide: Z is the density of the prior there too.
+    narrower = float(found["variant_log_evidence"].sel(variant="priors × 0.5"))
+    assert narrower - log == pytest.approx(12 * np.log(2), abs=0.1)
+
+
+def test_chains_that_a_comparison_cannot_run(small):
+    small.write_text(SMALL.replace("samples = 32", 'samples = 32\nchains = "nuts"', 1))
+    with pytest.raises(StudyError, match=r"method\.chains"):
+        load(small)
+    small.write_text(SMALL.replace("samples = 32", 'samples = 32\nchains = "pcn"', 1))
+    assert load(small).planned - load(small, ["method.chains='emcee'"]).planned < 0
+    with pytest.raises(StudyError, match=r"parallel\.ranks_per_model: .* follow gradients on one rank, expected 1"):
+        load(small, ["method.chains='hmc'", "parallel.ranks_per_model=2"])

@@ -1,0 +1,192 @@
+"""What is found of a posterior of few parameters around its mode, and what of it stands for the posterior.
+
+Laplace's Gaussian is corrected by weighted points and, where they are asked for, by chains. Inversions and comparisons
+of models call the same functions; which of the three counts is said in `inverse.criticism.answer`, and how far each can
+be trusted in `inverse.criticism.verdict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, assert_never
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel
+from inverse.criticism.answer import Source, gaussian_points, source_of
+from inverse.criticism.chains import FEW, Chains, chains_of_few, ensemble, walkers
+from inverse.criticism.gradient_chains import BUDGET, gradient_chains
+from inverse.criticism.weights import FEWEST
+from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
+from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.posterior import Density, Posterior
+
+Kind = Literal["pcn", "emcee", "hmc"]
+NEEDED: dict[Kind, tuple[str, ...]] = {"pcn": ("arviz",), "emcee": ("arviz", "emcee"), "hmc": ("arviz", "mici")}
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """A posterior around its mode.
+
+    Attributes
+    ----------
+    gaussian
+        Laplace's.
+    evidence
+        Weighted points, and ln Z by them.
+    chains
+        None if they were not asked for.
+    """
+
+    gaussian: Laplace
+    evidence: Evidence
+    chains: Chains | None = None
+
+    @property
+    def source(self) -> Source:
+        """What is printed."""
+        return source_of(self.evidence, self.chains)
+
+    @property
+    def log_evidence(self) -> tuple[float, float]:
+        """Ln Z and its standard error: by chains where they tell and weighted points cannot be trusted."""
+        return (self.evidence.log_evidence, self.evidence.error) if self._by_chains is None else self._by_chains[0]
+
+    @property
+    def known(self) -> bool:
+        """Whether ln Z can be trusted."""
+        return self.evidence.trusted or self._by_chains is not None
+
+    @property
+    def _by_chains(self) -> tuple[tuple[float, float], Chains] | None:
+        """Ln Z and its error by chains, where they are what is printed, and the chains."""
+        if self.chains is None or self.chains.evidence is None or self.evidence.trusted or self.source != "chains":
+            return None
+        return self.chains.evidence, self.chains
+
+    def reweighted(self, change: Callable[[FloatArray], FloatArray]) -> tuple[float, float]:
+        """Return ln Z and its error with ln of the prior density at x (n, c) changed by `change` (n,)."""
+        if self._by_chains is None:
+            return self.evidence.reweighted(change(self.evidence.density.x))
+        (log_evidence, error), chains = self._by_chains
+        changed = change(chains.x.reshape(-1, chains.x.shape[2]))
+        top = changed.max()
+        ratio = np.exp(changed - top)
+        scatter = ratio.std() / ratio.mean() / np.sqrt(chains.ess)
+        return log_evidence + float(top + np.log(ratio.mean())), float(np.hypot(error, scatter))
+
+
+def assess(
+    posterior: Posterior,
+    gaussian: Laplace,
+    samples: int,
+    *,
+    chains: Kind | None = None,
+    model: ForwardModel | None = None,
+    seed: int = 0,
+) -> Assessment:
+    """Correct Laplace's Gaussian by weighted points, and by chains if they are asked for.
+
+    Parameters
+    ----------
+    posterior, gaussian
+        What is looked at, around its mode.
+    samples
+        Solves for weighted points.
+    chains, model
+        Kind of chains; "hmc" follows the gradients of the model, point by point.
+    seed
+        Of all draws.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at any of the points.
+    """
+    found = evidence(posterior, gaussian, samples or LEAST, seed=seed)
+    return Assessment(gaussian, found, _run(posterior, gaussian, found, chains, model, seed))
+
+
+def _run(
+    posterior: Posterior, gaussian: Laplace, found: Evidence, kind: Kind | None, model: ForwardModel | None, seed: int
+) -> Chains | None:
+    match kind:
+        case None:
+            return None
+        case "hmc":
+            if model is None:
+                message = "chains = 'hmc' follow the gradients of a model itself, which is not given"
+                raise ValueError(message)
+            return gradient_chains(posterior, gaussian, model, seed=seed)
+        case "emcee":
+            return ensemble(posterior, gaussian, seed=seed)
+        case "pcn":
+            # Fewer points say little about a covariance.
+            enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
+            return chains_of_few(posterior, found if enough else gaussian, seed=seed)
+        case _:
+            assert_never(kind)
+
+
+def solves_of(kind: Kind | None, size: int) -> int:
+    """Return the most solves that chains for `size` unknown parameters take."""
+    if kind is None:
+        return 0
+    if kind == "hmc":
+        return BUDGET
+    return (FEW if kind == "pcn" else walkers(size)).evaluations
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points that stand for a posterior.
+
+    Attributes
+    ----------
+    x, values
+        Points (n, c), and the parameters there in physical units.
+    weights
+        (n,), of sum 1.
+    outputs, everything
+        What was measured (n, m), corrected where the error of the mesh is known, and all outputs (n, M), which are not.
+    """
+
+    x: FloatArray
+    values: FloatArray
+    weights: FloatArray
+    outputs: FloatArray
+    everything: FloatArray
+
+
+def weighted(posterior: Posterior, found: Evidence) -> Points:
+    """Return the weighted points that were solved."""
+    at = found.density
+    return Points(at.x, posterior.physical(at.x), found.weights, at.outputs, at.everything)
+
+
+def of_chains(posterior: Posterior, chains: Chains, count: int) -> Points:
+    """Return at most `count` draws of chains, equally many from each, which are solved for their outputs."""
+    each = max(count // len(chains.x), 1)
+    steps = np.linspace(0, chains.x.shape[1] - 1, each).round().astype(int)
+    at = posterior.at(chains.x[:, steps].reshape(-1, chains.x.shape[2])[:count])
+    return Points(at.x, posterior.physical(at.x), even(len(at.x)), at.outputs, at.everything)
+
+
+def of_gaussian(posterior: Posterior, gaussian: Laplace, at: Density, count: int) -> Points:
+    """Return points of Laplace's Gaussian with the outputs of the model linearised at the mode, solved in `at`.
+
+    These are exact where the posterior is Gaussian.
+    """
+    assert at.tangents is not None
+    x, d = gaussian_points(gaussian, count), len(posterior.inputs.names)
+    moved = (x - gaussian.mode)[:, :d]
+    slopes = at.tangents[0] @ posterior.inputs.from_normals(at.x[:, :d])[1][0]
+    outputs = at.outputs + moved @ posterior.output_slopes(at)[0].T
+    return Points(x, posterior.physical(x), even(count), outputs, at.everything + moved @ slopes.T)
+
+
+def even(count: int) -> FloatArray:
+    """Return equal weights (count,) of sum 1."""
+    return np.full(count, 1 / count)
