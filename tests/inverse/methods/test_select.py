@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -662,7 +663,7 @@ def test_a_table_of_strains_is_one_line(small, capsys):
 
 
 def of_bananas(pairs, **settings):
-    """What a comparison and an inversion of the same curved posterior find, and what is true."""
+    """What a comparison finds of a curved posterior; what makes an inversion of the same; and what is true."""
     model, curved, *truth = bananas(pairs)
     d = 2 * pairs
     data = Data(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
@@ -672,16 +673,14 @@ def of_bananas(pairs, **settings):
     named = tuple(f"z{k}" for k in range(d))
     of_outputs = OutputData(named, np.zeros(d), np.ones(d), named, outputs=named, parts=named)
     beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
-    return (
-        found.sel(model="it", group="all"),
-        invert_by_group(curved.inputs, model, of_outputs, beside, None, finer=None),
-        truth,
-    )
+    inverted = partial(invert_by_group, curved.inputs, model, of_outputs, beside, None, finer=None)
+    return found.sel(model="it", group="all"), inverted, truth
 
 
 def test_where_points_count_little_a_comparison_says_what_an_inversion_says():
     """40 unknowns, curved: few of the points count, and none of them stands for constants or predictions."""
-    found, inverted, _ = of_bananas(20, samples=64)
+    found, invert, _ = of_bananas(20, samples=64)
+    inverted = invert()
     assert not found["trusted"]
     assert found["effective"] < 20
     assert str(found["trust"].item()) == "neither"
@@ -697,9 +696,9 @@ def test_where_points_count_little_a_comparison_says_what_an_inversion_says():
 
 
 def test_chains_of_a_comparison():
-    """12 unknowns, curved: constants, predictions and ln Z by gradients, as in an inversion, and as in closed form."""
+    """12 unknowns, curved: constants, predictions and ln Z by gradients, against closed forms."""
     pytest.importorskip("mici")
-    found, inverted, (mean, std, log_evidence) = of_bananas(6, samples=64, chains="hmc")
+    found, _, (mean, std, log_evidence) = of_bananas(6, samples=64, chains="hmc")
     assert found["chains"] == 2
     assert found["trusted"]
     assert str(found["trust"].item()) == "corrected"
@@ -707,8 +706,6 @@ def test_chains_of_a_comparison():
     assert np.abs(found["constant_std"] / std - 1).max() < 0.25
     log, error = float(found["group_log_evidence"]), float(found["group_log_evidence_error"])
     assert abs(log - log_evidence) < 3 * error < 3
-    assert log == pytest.approx(float(inverted["log_evidence"]), abs=1e-6)
-    np.testing.assert_allclose(found["constant_mean"], inverted["mean"], rtol=1e-6, atol=1e-6)
     assert np.abs(found["prediction_mean"]).max() < 0.5  # z is standard normal
     # Priors half as wide: Z is the density of the prior there too.
     narrower = float(found["variant_log_evidence"].sel(variant="priors × 0.5"))
