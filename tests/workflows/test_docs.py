@@ -12,16 +12,23 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import NAMES
+from forward.materials.material import MATERIALS
+from forward.observables.observable import OUTPUTS
+from forward.spec import MODELS
+from forward.terms.term import LOADS
+from uq.methods.method import METHODS
 from workflows.__main__ import _parser
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.run.run import run
 from workflows.starter import starter
+from workflows.studies.study import SAMPLING, STUDIES
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"(?P<runs><!-- runs -->\n)?^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^    .*\n)+", re.MULTILINE)
+PLACE = re.compile(r"(?<![\w/])((?:benchmarks|configs|docs|notebooks|tests)/[\w./-]+\.\w+)")
 COMMAND = re.compile(r"(?<![\w./-])(?:\.venv/bin/)?tissuq (?:check|run|report|serve|init|schema)\b[^\n`]*")
 
 
@@ -80,13 +87,23 @@ def test_commands_parse(page, command):
 
 @pytest.mark.parametrize(
     ("page", "place"),
-    each(lambda text: sorted(set(re.findall(r"(?<![\w/])((?:configs|docs|notebooks)/[\w./-]+\.\w+)", text)))),
+    each(lambda text: sorted(set(PLACE.findall(text)))),
     ids=lambda given: given.stem if isinstance(given, Path) else given,
 )
 def test_files_are_there(page, place):
     if place in {"configs/NAME.toml", "configs/x.toml"} or place.endswith(".ipynb"):  # any, and what is made
         return
     assert (ROOT / place).exists()
+
+
+def test_every_kind_and_every_study_of_the_net_stands_among_the_abilities():
+    page = (ROOT / "docs" / "abilities.md").read_text(encoding="utf-8")
+    studies = [path.relative_to(ROOT).as_posix() for path in (ROOT / "benchmarks" / "net").glob("*.toml")]
+    kinds = [kind for family in (MATERIALS, LOADS, OUTPUTS, MODELS, METHODS, STUDIES) for kind in family.own]
+    missing = [name for name in (*kinds, *studies) if f"`{name}`" not in page and name != SAMPLING]
+    assert missing == []
+    without = re.findall(r"^\| (?!what|--)[^|]*\| (?!`)[^|]*\|$", page, re.MULTILINE)
+    assert without == [], "each line names what runs it"
 
 
 def test_targets_and_benchmarks_are_there():
