@@ -20,6 +20,7 @@ import tempfile
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,6 +70,7 @@ SHORTER = {  # what keeps the kind of study, at less cost
     "treloar": ("method.samples=64",),
 }
 NOT_HERE = ("um-bridge",)  # wants a server
+MOST = 12  # differences of a study that are said
 NAMES_OF_RESULTS = ("from", "file", "files", "source")  # keys that may name the results of another study
 # In names of variables, attributes and keys of the summary: what no run gives again, and where and when it ran.
 MEASURED = ("seconds", "times", "date", "commit", "results_sha256")
@@ -158,7 +160,8 @@ def main() -> int:
                 said = list(compared(old, new))
                 differs |= bool(said)
                 spent += old.seconds, new.seconds
-                words = "; ".join(said) or f"the same (exit code {new.code})"
+                words = "; ".join(said[:MOST]) or f"the same (exit code {new.code})"
+                words += f"; and {len(said) - MOST} more" if len(said) > MOST else ""
                 sys.stdout.write(f"{case.name:28} {old.seconds:6.1f} s {new.seconds:6.1f} s  {words}\n")
                 sys.stdout.flush()
         finally:
@@ -259,15 +262,22 @@ def _of_mappings(name: str, old: Mapping[str, Any], new: Mapping[str, Any], but:
             continue
         if key not in old or key not in new:
             yield f"{name}{key} only {_where(key, new)}"
-        elif isinstance(old[key], Mapping) and isinstance(new[key], Mapping):
-            yield from _of_mappings(f"{name}{key}.", old[key], new[key])
-        elif _plain(old[key]) != _plain(new[key]):
+            continue
+        a, b = _opened(old[key]), _opened(new[key])
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            yield from _of_mappings(f"{name}{key}.", a, b)
+        elif json.dumps(a) != json.dumps(b):
             yield f"{name}{key} differs"
 
 
-def _plain(value: Any) -> str:
-    """Return a value as text, to the last digit."""
-    return json.dumps(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
+def _opened(value: Any) -> Any:
+    """Return a value as JSON can hold it: lists are mappings by their places, texts of JSON are what these say."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, str) and value.startswith(("{", "[")):
+        with suppress(ValueError):
+            value = json.loads(value)
+    return {str(place): one for place, one in enumerate(value)} if isinstance(value, list) else value
 
 
 def _where(name: str, new: Any) -> str:

@@ -79,7 +79,8 @@ def done(folder, *, mean=1.0, findings=(), code=0, **more):
     folder.mkdir()
     dataset = xr.Dataset({"mean": ("output", [mean, 2.0], {"units": "m"}), "solve_seconds": 1 + mean}, attrs=more)
     (folder / "results.nc").write_bytes(netcdf(dataset))
-    summary = {"findings": list(findings), "outputs": {"sag": {"mean": mean}}, "cpu_seconds": 3 * mean}
+    meshes = [{"unknowns": 10, "seconds": mean}, {"unknowns": 20 + (mean > 1), "seconds": 3 * mean}]
+    summary = {"findings": list(findings), "outputs": {"sag": {"mean": mean}}, "cpu_seconds": mean, "meshes": meshes}
     (folder / "summary.json").write_text(json.dumps(summary))
     return Done(folder, code, 1.0)
 
@@ -87,20 +88,21 @@ def done(folder, *, mean=1.0, findings=(), code=0, **more):
 @pytest.mark.unit
 def test_what_differs_between_two_runs_is_said(tmp_path):
     note = {"severity": "note", "text": "All is well."}
-    one = done(tmp_path / "one", findings=[note], study="a")
-    assert list(same_results.compared(one, done(tmp_path / "two", findings=[note], study="a"))) == []
-    other = done(
-        tmp_path / "other", mean=1 + 2**-40, findings=[note | {"severity": "error"}], code=3, study="b", gone=np.nan
-    )
+    one = done(tmp_path / "one", findings=[note], study='{"a": 1, "seconds": 2}')
+    same = done(tmp_path / "two", findings=[note], study='{"a": 1, "seconds": 3}')
+    assert list(same_results.compared(one, same)) == []
+    worse = note | {"severity": "error"}
+    other = done(tmp_path / "other", mean=1 + 2**-40, findings=[worse], code=3, study='{"a": 2}', gone=np.nan)
     (other.directory / "batch.csv").touch()
     assert list(same_results.compared(one, other)) == [
         "exit code 0 before, 3 here",
-        "/@study differs",
+        "/@study.a differs",
         "/@gone only here",
         "/mean by 4.5e-13",
         "only before “note: All is well.”",
         "only here “error: All is well.”",
         "summary outputs.sag.mean differs",
+        "summary meshes.1.unknowns differs",
         "file batch.csv only here",
     ]
     assert any("no results" in text for text in same_results.compared(one, Done(tmp_path / "nowhere", 1, 0.0)))
