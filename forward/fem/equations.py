@@ -173,6 +173,11 @@ class Discretisation(Linearisation):
         moved = [f"tool '{name}' at {1e3 * fraction * deep:.4g} of {1e3 * deep:.4g} mm" for name, deep in tools if deep]
         return f" ({', '.join(moved)})" if moved else ""
 
+    @cached_property
+    def pushing(self) -> NDArray[np.bool_]:
+        """Which parameters (d,) are sizes of loads or prescribed displacements: without them, the body rests."""
+        return np.array([path.startswith(("loads.", "displacements.")) for path in self.parameters], dtype=bool)
+
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
         self.latest.moved()

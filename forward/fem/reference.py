@@ -35,6 +35,7 @@ class ReferenceFactor:
         self._reference: ReferenceSolution | None = None
         self._slopes: FloatArray | None = None
         self._lengths: FloatArray | None = None
+        self._rest: float | None = None
         self._vectors: FloatArray | None = None
         self._random: FloatArray | None = None  # forces that Lanczos' process begins with
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
@@ -46,7 +47,7 @@ class ReferenceFactor:
         """
         if self._reference is not None and self._reference.same(reference):
             return False
-        self._reference = self._slopes = self._lengths = self._vectors = None
+        self._reference = self._slopes = self._lengths = self._rest = self._vectors = None
         equations = self._set(reference)
         self._solver.factorise()
         self._rotations = rotations(equations.gradients())
@@ -57,7 +58,7 @@ class ReferenceFactor:
         """Free the factor, if there is one."""
         if self._reference is not None:
             self._solver.release()
-            self._reference = self._slopes = self._lengths = self._vectors = None
+            self._reference = self._slopes = self._lengths = self._rest = self._vectors = None
 
     def _set(self, reference: ReferenceSolution) -> Discretisation:
         equations = self._equations
@@ -83,6 +84,19 @@ class ReferenceFactor:
             d = len(self._reference.parameters)
             self._lengths = np.zeros(d) if d > MANY else self._equations.norms(self.slopes())
         return self._lengths
+
+    def from_rest(self) -> float:
+        """How far from rest the tangent by the load ends that leads back there, over the size of the state."""
+        assert self._reference is not None
+        if self._rest is None:
+            equations, state = self._set(self._reference), self._reference.state
+            equations.at_load(0.0)
+            kept, equations.work = equations.work, Work()  # as that of the factor
+            back = state - self._solver.solve(equations.residual(state).vector)
+            equations.work = kept
+            size = equations.norm(state)
+            self._rest = equations.norm(back) / size if size > 0 else 0.0
+        return self._rest
 
     def prepare_screen(self) -> bool:
         """Compute the vectors that show instabilities, unless they exist; this may change parameters and state.
@@ -245,6 +259,8 @@ class WayFromReference:
         Whether the reference is joined to rest.
     length
         What the parameters move the state by, one by one; 0 if that is not known.
+    reversed_from
+        As of `Way`.
     state
         Of the reference.
     rotation
@@ -263,7 +279,10 @@ class WayFromReference:
         screen: bool,
     ) -> None:
         self._screen, self._fraction = screen, 1.0
+        self._slopes = factor.slopes() if screen and len(parameters) <= MANY else None
         self.length = float(np.linalg.norm((parameters - reference.parameters) * factor.lengths())) if screen else 0.0
+        turned = (reference.parameters * parameters < 0) & equations.pushing
+        self.reversed_from = factor.from_rest() if screen and turned.any() else 0.0
         self.draw = draw(parameters)
         self._equations, self._factor = equations, factor
         self._from, self._to = reference.parameters, parameters
@@ -271,6 +290,11 @@ class WayFromReference:
         self.state = reference.state
         self.rotation: FloatArray | None = None
         self._predicted: FloatArray | None = None
+
+    @property
+    def slope(self) -> FloatArray | None:
+        """Derivative (U_local,) of the state by the fraction of the path, at the reference; None if not known."""
+        return None if self._slopes is None else np.asarray((self._to - self._from) @ self._slopes)
 
     def corrector(self, u: FloatArray) -> Corrector:
         """Return the corrector at a prediction u (U_local,), whose rotations are remembered."""

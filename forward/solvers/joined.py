@@ -13,7 +13,8 @@ random, is audited (`settled`): the path is followed, and the state that it lead
 
 from __future__ import annotations
 
-from dataclasses import replace
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,14 +23,14 @@ from forward.solvers.acceptance import Diverged, Unstable
 from forward.solvers.corrections import mix, straight
 from forward.solvers.newton import newton
 from forward.solvers.settings import SolverSettings
-from forward.solvers.steps import Steps
+from forward.solvers.steps import Steps, T, Task, abreast
 from forward.solvers.system import Found, System, Way
 
 NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved
 TURNED = np.pi / 4  # angle (rad) by which a node is turned against the prediction
 SAME = 1e-5  # distance of two states that are one, over their size: tolerances of residuals allow for less
 FEW = 0.01  # the same over the size of the state, below which no two branches are told apart
-STEPS = 4  # in which the way from a reference is followed
+STEPS = 4  # parts of the way from a reference, after each of which the state is looked at
 ROUGH = 1e-3  # relative residual of the states on that way
 QUICK = 5  # after a load step with at most this many iterations, the next one is twice as long
 SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
@@ -84,8 +85,8 @@ def load_steps(
 
     The load at which an equilibrium was unstable is not tried again until the stable branch has been followed to within
     `LOCATED` of it: from further away Newton would only find the same state. Once an equilibrium was unstable (at full
-    load, if `unstable` says so), the branch is expected to end: only `REFUSALS` more attempts may fail, and each after
-    the first has `LATE` iterations.
+    load, if `unstable` says so), the branch is expected to end: only `REFUSALS` attempts may find others, and each has
+    `LATE` iterations. It need not end: a body that is pushed aside a little bends much where without that it buckles.
 
     Parameters
     ----------
@@ -115,9 +116,9 @@ def load_steps(
             step = (load - reached) / 2
             if isinstance(stop, Unstable):
                 barrier, unstable, refused = load, True, max(refused, stop.stability)
-            refusals += unstable or not near
+            refusals += isinstance(stop, Unstable) or not near
             smallest = settings.minimum_load_step
-            if unstable:
+            if isinstance(stop, Unstable):
                 smallest = max(smallest, LOCATED)
             if near and (step < smallest or 2 * step <= SHORTEST * load):
                 history.append(f"the branch from rest ends at {100 * reached:.4g} % of the load")
@@ -196,8 +197,11 @@ def settled(
         return found
     predicted = start if found.predicted is None else found.predicted
     why = strayed(system, start, predicted, found.state, way)
+    known = way is not None and way.joined  # so that a path from there tells
     if way is not None and not way.joined:
         why = why or "the reference is not joined to rest"
+    elif way is not None and way.reversed_from > NEAR:  # a body that buckles to the side to which it is pushed
+        known, why = False, why or "a load is reversed on the way from the reference"
     if not why and not audit:
         return found
     work = system.work
@@ -205,7 +209,7 @@ def settled(
     work.calls += bool(why)
     work.audits += 1
     history.append(f"audit: {why or 'drawn at random'}")
-    if way is not None and way.joined and (yield from _leads(system, settings, found, way, history, counted=bool(why))):
+    if known and way is not None and (yield from _leads(system, settings, found, way, history, counted=bool(why))):
         answer = found
     else:
         answer = _from_rest(system, settings, zero, found, history)
@@ -231,36 +235,78 @@ def _leads(
 ) -> Steps[bool]:
     """Whether the straight line in parameters from a reference leads to a state, without loss of stability.
 
-    In `STEPS` steps, corrected with the factor of the reference. Where Lanczos' process does not tell that a state is
-    stable, negative eigenvalues are counted if `counted`; if not, at the end only, as they were for the state found.
+    States after each of `STEPS` equal parts of the line are corrected with the factor of the reference, all at a time,
+    from where the tangent at the reference and the state found predict them. Each has to lie where those before it
+    predict it. So has the state found, to a part of the last step, or what is corrected from that prediction is it.
+    Where Lanczos' process does not tell that a state is stable, negative eigenvalues are counted if `counted`; if not,
+    at the end only, as they were for the state found.
     """
-    slope = found.state - way.state
-    known: list[tuple[float, FloatArray]] = []
+    slope = found.state - way.state if way.slope is None else way.slope
+    bend = found.state - way.state - slope
+    places = [_Place(system, settings, copy(way), k / STEPS, history) for k in range(1, STEPS + 1)]
+    last = places[-1]
     try:
-        for k in range(1, STEPS + 1):
-            t = k / STEPS
-            way.at(t)
-            u = system.on_target(straight(way.state, slope, known, t))
-            residual = system.residual(u)
-            if not np.isfinite(residual.size):
+        states = yield from abreast(
+            [
+                place.task(place.corrected(way.state + place.t * (slope + place.t * bend), ROUGH))
+                for place in places[:-1]
+            ]
+        )
+        states.append(found.state)
+        known: list[tuple[float, FloatArray]] = []
+        predicted = way.state
+        for place, u in zip(places, states, strict=True):
+            predicted = straight(way.state, slope, known, place.t)
+            if strayed(system, way.state, predicted, u, way):
                 return False
-            correct = way.corrector(u)
-            tolerance = settings.tolerance if k == STEPS else ROUGH
-            predicted = u
-            mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
-            u, residual = mixed.state, mixed.residual
-            if not mixed.reached or strayed(system, way.state, predicted, u, way):
+            known.append((place.t, ((u - way.state) / place.t - slope) / place.t))
+        if system.norm(found.state - predicted) > NEAR * system.norm(found.state - states[-2]):
+            (end,) = yield from abreast([last.task(last.corrected(predicted, settings.tolerance))])
+            if not same(system, end, found.state):
                 return False
-            known.append((t, ((u - way.state) / t - slope) / t))
-            last = k == STEPS
-            if last and not same(system, u, found.state):
-                return False
-            if (last and found.stability == Stability.COUNTED) or (yield from way.definite(u, residual)):
-                continue
-            if (counted or last) and system.negative_eigenvalues(u) != 0:
-                return False
-    except SolveError:
+        open_ones = list(zip(places, states, strict=True))[: STEPS - (found.stability == Stability.COUNTED)]
+        definite = yield from abreast([place.task(place.definite(u)) for place, u in open_ones])
+        for (place, u), sure in zip(open_ones, definite, strict=True):
+            if not sure and (counted or place is last):
+                place.way.at(place.t)
+                if system.negative_eigenvalues(u) != 0:
+                    return False
+    except (SolveError, Diverged):
         return False
     finally:
         way.at(1.0)
     return True
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A body after a part t of the way from a reference, among others that use its equations in turn."""
+
+    system: System
+    settings: SolverSettings
+    way: Way
+    t: float
+    history: list[str]
+
+    def task(self, steps: Steps[T]) -> Task[T]:
+        """Return a solver at this place."""
+        return Task(steps, lambda _: self.way.at(self.t))
+
+    def corrected(self, start: FloatArray, tolerance: float) -> Steps[FloatArray]:
+        """Correct a prediction with the factor of the reference, or raise `Diverged`."""
+        u = self.system.on_target(start)
+        residual = self.system.residual(u)
+        if not np.isfinite(residual.size):
+            message = "the state has no finite residual"
+            raise Diverged(message)
+        correct, limit = self.way.corrector(u), self.settings.corrections
+        mixed = yield from mix(self.system, tolerance, u, residual, correct, limit, self.history)
+        if not mixed.reached:
+            message = "the reference is too far away"
+            raise Diverged(message)
+        return mixed.state
+
+    def definite(self, u: FloatArray) -> Steps[bool]:
+        """Whether Lanczos' process shows that the stiffness at a state is positive definite."""
+        self.way.corrector(u)  # remembers the rotations there
+        return (yield from self.way.definite(u, self.system.residual(u)))

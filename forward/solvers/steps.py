@@ -1,12 +1,12 @@
 """Solvers that ask for back-substitutions instead of making them, so that those of many states can be made at once.
 
-Such a solver is a generator: it yields a right-hand side (n,), is sent the solution, and returns its result. Meanwhile
-others may use the same equations.
+Such a solver is a generator: it yields a right-hand side (n,), or several (k, n), is sent what solves them, and returns
+its result. Meanwhile others may use the same equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -25,7 +25,7 @@ def plain(right: FloatArray) -> Steps[FloatArray]:
 
 
 def finish(steps: Steps[T], solve: Callable[[FloatArray], FloatArray]) -> T:
-    """Make the back-substitutions (n,) → (n,) that a solver asks for one by one; return its result."""
+    """Make the back-substitutions, (n,) → (n,) or of rows, that a solver asks for in turn; return its result."""
     try:
         right = next(steps)
         while True:
@@ -74,6 +74,41 @@ def failed(error: SolveError) -> Steps[T]:
     yield  # a generator
 
 
+@dataclass(frozen=True, eq=False)
+class _Done(Generic[T]):
+    """What a solver returns."""
+
+    result: T
+
+
+def _moved(task: Task[T], answer: FloatArray | None) -> FloatArray | _Done[T]:
+    """Begin, or go on with an answer: return what is asked for next, or the result."""
+    task.resume(0 if answer is None else 1 if answer.ndim == 1 else len(answer))
+    try:
+        return next(task.steps) if answer is None else task.steps.send(answer)
+    except StopIteration as stop:
+        return _Done(stop.value)
+
+
+def abreast(tasks: Sequence[Task[T]]) -> Steps[list[T]]:
+    """Return a solver that asks at once, as rows (k, n), for what these solvers ask for one by one.
+
+    Its result is that of each. It fails as soon as one does.
+    """
+    results: dict[int, T] = {}
+    answers: dict[int, FloatArray | None] = dict.fromkeys(range(len(tasks)))
+    while answers:
+        waiting: dict[int, FloatArray] = {}
+        for i, answer in answers.items():
+            found = _moved(tasks[i], answer)
+            if isinstance(found, _Done):
+                results[i] = found.result
+            else:
+                waiting[i] = found
+        answers = dict(zip(waiting, (yield np.array(list(waiting.values()))), strict=True)) if waiting else {}
+    return [results[i] for i in range(len(tasks))]
+
+
 def finish_all(
     tasks: Iterable[Task[T]], solve: Callable[[FloatArray], FloatArray], most: int
 ) -> Iterator[T | SolveError]:
@@ -95,20 +130,24 @@ def finish_all(
     more = True
 
     def moved(i: int, task: Task[T], answer: FloatArray | None) -> None:
-        task.resume(0 if answer is None else 1)
         try:
-            waiting.append((i, task, next(task.steps) if answer is None else task.steps.send(answer)))
-        except StopIteration as stop:
-            results[i] = stop.value
+            found = _moved(task, answer)
         except SolveError as error:
             results[i] = error
+            return
+        if isinstance(found, _Done):
+            results[i] = found.result
+        else:
+            waiting.append((i, task, found))
 
     while waiting or more:
         if waiting:
-            answers = solve(np.array([right for _, _, right in waiting]))
-            before, waiting = waiting, []
-            for (i, task, _), answer in zip(before, answers, strict=True):
-                moved(i, task, answer)
+            answers = solve(np.concatenate([np.atleast_2d(right) for _, _, right in waiting]))
+            before, waiting, first = waiting, [], 0
+            for i, task, right in before:
+                rows = np.atleast_2d(right).shape[0]
+                moved(i, task, answers[first] if right.ndim == 1 else answers[first : first + rows])
+                first += rows
         begun = due + len(results) + len(waiting)
         while more and len(waiting) < most and begun < due + 2 * most:
             found = next(coming, None)

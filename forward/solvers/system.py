@@ -141,6 +141,17 @@ class Way(Protocol):
         """What the parameters move the state by, one by one: the norm of the norms; 0 if that is not known."""
 
     @property
+    def reversed_from(self) -> float:
+        """How far the reference is from a linear answer to its loads, if one of these is reversed on the path; else 0.
+
+        That is where the tangent by the load ends that leads back to rest, over the size of its state.
+        """
+
+    @property
+    def slope(self) -> FloatArray | None:
+        """Derivative (U_local,) of the state by the fraction of the path, at the reference; None if not known."""
+
+    @property
     def draw(self) -> float:
         """A number in [0, 1) that depends only on the parameters: eigenvalues are counted if it is small."""
 

@@ -27,6 +27,10 @@ MATERIALS = {
     "gent": ({"mu": 2e3, "Jm": 2.0, "D1": 2e4}, 1.2e4),
     "mooney-rivlin": ({"C1": 800.0, "C2": 200.0, "D1": 2e4}, 4e3),
     "neo-hookean": ({"C1": 1e3, "D1": 2e4}, 4e3),
+    "ogden": (
+        {"mu1": 1e3, "alpha1": 2.0, "mu2": 400.0, "alpha2": 9.0, "mu3": 200.0, "alpha3": -2.0, "D1": 2e4},
+        4e4,
+    ),
 }
 ROLLERS = ({"on": "x-min", "x": 0.0}, {"on": "y-min", "y": 0.0}, {"on": "z-min", "z": 0.0})
 
@@ -90,6 +94,57 @@ def test_a_turned_state_is_recognised_wherever_it_comes_from():
         assert same(equations, found.state, right.state)
         assert (found.work.others, found.work.calls) == (1, 1)
         assert found.work.audit_residuals > 0
+
+
+# --- bodies that buckle to the side to which they are pushed --------------------------------------------------------
+
+
+def small_steps(model, point, count=64):
+    """Raise the loads by small steps of Newton's method from the last state."""
+    equations, state = model.equations, np.zeros(model.equations.size)
+    equations.latest.begin()
+    equations.set_parameters(point)
+    for k in range(1, count + 1):
+        state = newtons.newton(equations, model.spec.solver, state, [], k / count)[0].state
+    return state
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("form", ["mixed", "displacement"])
+@pytest.mark.parametrize("body", ["column", "plate"])
+def test_a_body_buckles_to_the_side_to_which_it_is_pushed(body, form):
+    """It stays on the other one where the push is reversed only once it has buckled, as a path from a reference is."""
+    column = body == "column"
+    aside = {"kind": "traction", "name": "aside", "on": "x-max", "direction": (0.0, 1.0, 0.0), "size": 0.5}
+    push = {"kind": "traction", "name": "push", "on": "x-max", "direction": (-1.0, 0.0, 0.0), "size": 140.0}
+    under = {"kind": "pressure", "name": "aside", "on": "y-min", "size": 5.0}
+    spec = Hyperelastic.model_validate(
+        {
+            "body": {"size": (1.0, 0.1, 0.1) if column else (1.0, 0.06, 0.3), "cells": (6, 1, 1)},
+            "material": {"kind": "neo-hookean", "C1": 1e4, "D1": 1e5},
+            "formulation": form,
+            "clamp": ("x-min",),
+            "displacements": () if column else ({"on": "x-max", "x": -0.02, "y": 0.0, "z": 0.0},),
+            "loads": (push, aside) if column else (under,),
+            "outputs": ({"kind": "mean-displacement", "name": "uy", "on": "y-max", "component": "y"},),
+        }
+    )
+    main, to = ("loads.push.size", 140.0) if column else ("displacements.x-max.x", -0.02)
+    limits = (-0.6, 1.6) if column else (-5.0, 15.0)
+    inputs = Inputs(
+        {
+            main: Uniform(lower=min(0.95 * to, 1.05 * to), upper=max(0.95 * to, 1.05 * to)),
+            "loads.aside.size": Uniform(lower=limits[0], upper=limits[1]),
+        }
+    )
+    model = spec.build(MPI.COMM_SELF, inputs.names)
+    guess = linearise(inputs, SerialEvaluate(model)).prediction.on(model)
+    points = to * np.array([[1, 0], [1, 0], [1, 0]]) + np.outer([0.5, 0.2, -0.2], [0.0, limits[1]])
+    many = list(model.solve_many(points, map(guess, points)))
+    for point, one in zip(points, many, strict=True):
+        assert one.outputs[0] * point[1] > 0
+        assert same(model.equations, one.state, small_steps(model, point))
+    assert [one.work.others for one in many] == [0, 0, 1]
 
 
 # --- an arch that snaps ----------------------------------------------------------------------------------------------

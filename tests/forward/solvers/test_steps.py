@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forward.model import SolveError
-from forward.solvers.steps import Task, failed, finish, finish_all, through
+from forward.solvers.steps import Task, abreast, failed, finish, finish_all, through
 
 
 def asking(times, value):
@@ -72,3 +72,34 @@ def test_a_solver_through_an_approximate_inverse():
         return (yield x / 2) + 1
 
     assert finish(through(asking(3, 8.0), halved), lambda x: 2 * x) == 11.0
+
+
+@pytest.mark.unit
+def test_a_solver_asks_for_several_at_once():
+    """Alone and among others; each part is resumed before it goes on, with what its own solution was."""
+    resumed, sizes = [], []
+
+    def several(lengths):
+        tasks = [Task(asking(n, i + 1), lambda count, i=i: resumed.append((i, count))) for i, n in enumerate(lengths)]
+        return (yield from abreast(tasks))
+
+    def doubled(rights):
+        sizes.append(np.atleast_2d(rights).shape[0])
+        return 2 * rights
+
+    assert finish(several([3, 0, 1]), doubled) == [8.0, 2.0, 6.0]
+    assert sizes == [2, 1, 1]
+    assert resumed == [(0, 0), (1, 0), (2, 0), (0, 1), (2, 1), (0, 1), (0, 1)]
+    sizes.clear()
+    counted = []
+    tasks = [Task(asking(2, 1), lambda _: None), Task(several([2, 2, 1]), counted.append)]
+    assert list(finish_all(tasks, doubled, 4)) == [4.0, [4.0, 8.0, 6.0]]
+    assert sizes == [4, 3]
+    assert counted == [0, 3, 2]
+
+
+@pytest.mark.unit
+def test_of_several_at_once_one_that_fails_ends_all():
+    tasks = [Task(asking(2, 1), lambda _: None), Task(failed(SolveError("broken")), lambda _: None)]
+    with pytest.raises(SolveError, match="broken"):
+        finish(abreast(tasks), lambda right: right)
