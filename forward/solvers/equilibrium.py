@@ -178,19 +178,7 @@ class _Search:
             if unstable:
                 message = f"{error.reason}; the equilibrium that was found at full load is unstable"
                 raise SolveError(message, error.history, error.work, self.refused) from None
-            if error.stability == Stability.NOT_TESTED and not self.system.contact:
-                found = self._jumped()
-                if found is not None:
-                    return self._known(found)
             raise
-
-    def _jumped(self) -> Found | None:
-        """Find where the body may jump to, by Newton's method from zero at full load; None without."""
-        try:
-            found = newton(self.system, self.settings, self.zero, self.history, 1.0)[0]
-        except Diverged:
-            return None
-        return None if self.system.crossed(found.state) else found._replace(snapped=True)
 
     def _settled(self, found: Found, way: Way | None, before: FloatArray | None = None) -> Steps[Found]:
         answer = settled(self.system, self.settings, self.zero, found, self.history, way, before, audit=self.audit)

@@ -13,6 +13,7 @@ random, is audited (`settled`): the path is followed, and the state that it lead
 
 from __future__ import annotations
 
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,7 @@ SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
 SHORTEST = 1 / 256  # of the load: a step that is no longer than this and still leaves the prediction is a jump
 LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
+ABOVE = (1 / 32, 1 / 16, 1 / 8)  # of the load that is added to find a jump
 LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
 
 
@@ -127,12 +129,7 @@ def load_steps(
                     return Found(beyond, 0.0, snapped=True)
                 near, ended, step = False, ended or (reached, found.state, stop), 1.0 - reached
             if step < smallest or refusals > REFUSALS:
-                last, state, why = ended or (reached, found.state, stop)
-                message = f"stopped at {100 * last:.4g} % of the load{system.in_words(last)}: {why}"
-                jacobian = system.smallest_jacobian(state)
-                if jacobian < SQUEEZED:
-                    message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
-                raise SolveError(message, history, system.work, refused) from None
+                return _jumped(system, settings, history, refused, *(ended or (reached, found.state, stop)))
             continue
         found, reached = there, load
         if reached >= barrier:
@@ -142,6 +139,36 @@ def load_steps(
         if iterations <= QUICK:
             step *= 2
     return found._replace(snapped=ended is not None)
+
+
+def _jumped(
+    system: System,
+    settings: SolverSettings,
+    history: list[str],
+    refused: Stability,
+    load: float,
+    u: FloatArray,
+    why: Diverged,
+) -> Found:
+    """Find where a body jumps to from u, the last stable state, at more than the whole load; go back from there.
+
+    Just beyond the end of a branch residuals are small along a long way, on which Newton's method is lost.
+
+    Raises
+    ------
+    SolveError
+        If nothing is found, or if an unstable equilibrium was `refused`: then the branch goes on as that.
+    """
+    if refused == Stability.NOT_TESTED and not system.contact:
+        for more in ABOVE:
+            with suppress(Diverged):
+                above = newton(system, settings, u, history, 1.0 + more)[0]
+                return _step(system, settings, above.state, history, 1.0, None, near=True)[0]._replace(snapped=True)
+    message = f"stopped at {100 * load:.4g} % of the load{system.in_words(load)}: {why}"
+    jacobian = system.smallest_jacobian(u)
+    if jacobian < SQUEEZED:
+        message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
+    raise SolveError(message, history, system.work, refused) from None
 
 
 def _step(

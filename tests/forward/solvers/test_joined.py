@@ -218,6 +218,31 @@ def test_an_arch_snaps_where_raising_the_load_makes_it(arch, mean):
         assert others > 0 if mean > limit else others == 0
 
 
+@pytest.mark.fem
+def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
+    """Where no equilibrium is near and residuals are small all the same."""
+    model = alone(arch)
+    equations, settings, most = model.equations, model.spec.solver, 60.0
+    state, load, step = np.zeros(equations.size), 0.0, 1 / 64
+    equations.latest.begin()
+    equations.set_parameters(np.array([most]))
+    while step > 1e-5:
+        try:
+            found = newtons.newton(equations, settings, state, [], load + step, near=True)[0]
+        except Diverged:
+            step /= 2
+        else:
+            state, load = found.state, load + step
+    assert 15 < most * load < 40
+    above = model.solve(np.array([1.3 * load * most]))
+    for more in (1e-3, 2e-3):
+        one = model.solve(np.array([(1 + more) * load * most]))
+        assert one.work.snaps == 1
+        equations.latest.begin()
+        there = newtons.newton(equations, settings, above.state, [], 1.0)[0].state  # down from above
+        assert same(equations, one.state, there)
+
+
 # --- who is audited, and what is said of it --------------------------------------------------------------------------
 
 
