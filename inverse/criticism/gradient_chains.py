@@ -99,6 +99,8 @@ def gradient_chains(
         return potential.both(z)[::-1]
 
     system = mici.systems.EuclideanMetricSystem(value, grad_neg_log_dens=gradient)
+    # All chains share it: copies are told apart by their addresses in what states remember, which differ between runs.
+    system.__deepcopy__ = lambda memo: system
     integrator = mici.integrators.LeapfrogIntegrator(system)
     sampler = mici.samplers.DynamicMultinomialHMC(system, integrator, rng, max_tree_depth=DEPTH)
     states: Any = [_start(potential, SPREAD * rng.standard_normal(len(gaussian.mode))) for _ in range(lengths.chains)]

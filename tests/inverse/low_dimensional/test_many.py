@@ -1,5 +1,6 @@
 """Posteriors of 10 to 60 unknowns: Gaussian ones and others bent a little, against closed forms and NumPy."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from forward.model import FunctionModel
 from inverse.criticism.answer import answer, by_gaussian, counts, gaussian_points
+from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains
 from inverse.criticism.predictive import examine_few
 from inverse.criticism.verdict import verdict_on_few
@@ -232,6 +234,25 @@ def test_chains_that_follow_gradients():
     judged = verdict_on_few(gaussian, alike, examine_few(posterior, gaussian), found)
     assert judged.trust == "corrected"  # fewer points do not overrule chains
     assert answer(posterior, gaussian, alike, found).source == "chains"
+
+
+def test_chains_come_back_to_their_starts_only(monkeypatch):
+    """There the length of steps is looked for; so the solves, which the budget bounds, are as many in every run."""
+    pytest.importorskip("mici")
+    posterior, _ = bent(2, 0.25)
+    asked, potential = Counter[bytes](), Posterior.potential
+
+    def counted(self, x, model):
+        asked[x.tobytes()] += 1
+        return potential(self, x, model)
+
+    monkeypatch.setattr(Posterior, "potential", counted)
+    lengths = Lengths(2, 40, 20, 1)
+    found = gradient_chains(
+        posterior, laplace(posterior, starts=1), posterior.evaluate.model, lengths=lengths, budget=0
+    )
+    assert found.apart == asked.total()
+    assert sum(times > 1 for times in asked.values()) <= lengths.chains
 
 
 @pytest.mark.unit
