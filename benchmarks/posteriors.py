@@ -75,7 +75,7 @@ def truth(posterior: Posterior, A: FloatArray, curvature: float, gaussian: Lapla
 
 
 def main() -> None:
-    """Print the largest errors of means, widths and ln Z."""
+    """Print the largest errors of means, widths and ln Z, and those of a curved posterior."""
     print("| unknowns | c | mean off by (sd) | width off by | ln Z off by | of its errors | refused |")
     print("|---|---|---|---|---|---|---|")
     for curvature in CURVATURES:
@@ -95,6 +95,7 @@ def main() -> None:
             within = f"{sum(ratio < 3 for ratio in ratios)} of {SEEDS} within 3" if curvature else "exact"
             errors = f"{max(means):.2g} | {100 * max(widths):.2g} % | {max(gaps):.2g}"
             print(f"| {size} | {curvature:g} | {errors} | {within} | {refused} of {SEEDS} |", flush=True)
+    curved()
 
 
 def curved() -> None:
@@ -116,13 +117,9 @@ def curved() -> None:
         mode = np.abs((posterior.physical(gaussian.mode[None])[0] - mean) / std).max()
         errors = f"{np.abs(gaps).max():.2g} | {np.sqrt((gaps**2).mean()):.2g} | {ratios.min():.2f}–{ratios.max():.2f}"
         of_evidence = f"{one.log_evidence[0] - log_evidence:+.2f} | {one.log_evidence[1]:.2f}"
-        of_chains = f"{chains.apart:,} | {chains.ess:.0f} | {chains.rhat.max():.3f} | {one.source}"
-        row = (
-            f"| {seed} | {mode:.2f} | {one.evidence.ess:.0f} | {errors} | {of_evidence} | {of_chains} | {seconds:.0f} |"
-        )
-        print(row, flush=True)
+        of_chains = f"{chains.apart:,} | {chains.ess:.0f} | {chains.rhat.max():.3f} | {one.source} | {seconds:.0f}"
+        print(f"| {seed} | {mode:.2f} | {one.evidence.ess:.0f} | {errors} | {of_evidence} | {of_chains} |", flush=True)
 
 
 if __name__ == "__main__":
     main()
-    curved()

@@ -21,9 +21,13 @@ from inverse.criticism.weights import FEWEST
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
+from inverse.low_dimensional.surrogate import operations
 
 Kind = Literal["pcn", "emcee", "hmc"]
 NEEDED: dict[Kind, tuple[str, ...]] = {"pcn": ("arviz",), "emcee": ("arviz", "emcee"), "hmc": ("arviz", "mici")}
+
+RATE = 1.5e10  # operations a second of polynomials (docs/measurements.md)
+SECONDS_PER_STEP = 5e-4  # of a path, besides solve and adjoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +141,19 @@ def solves_of(kind: Kind | None, size: int) -> int:
     if kind == "hmc":
         return BUDGET
     return (FEW if kind == "pcn" else walkers(size)).evaluations
+
+
+def own_seconds(size: int, outputs: int, samples: int, chains: Kind | None = None) -> float:
+    """Predict the most processor time (s) that an assessment takes besides solves: of polynomials, and steps of chains.
+
+    Parameters
+    ----------
+    size, outputs
+        Unknown parameters, and data.
+    samples, chains
+        As of `assess`.
+    """
+    return operations(size, outputs, samples) / RATE + (BUDGET * SECONDS_PER_STEP if chains == "hmc" else 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ et al., Stat. Comput. 18 (2008) 447–459).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -40,6 +41,7 @@ SCRAMBLES = 8
 FIRST, LAST = 2**11, 2**13  # points in the first clouds and in the last one
 ROUNDS = 4
 MOST_TERMS = 500  # of degree 2: beyond 30 unknowns a cloud is worth few of its points, and a fit takes minutes
+ALIKE = 1e-7  # size of what is left of a column by others, over the largest, below which they are nearly alike
 ENOUGH = 0.2  # effective share of a cloud from which no better proposal is needed
 
 
@@ -159,10 +161,8 @@ def _regression(
     size = np.where(spread > 0, spread, 1.0)
     fold = np.arange(n) % FOLDS
     best: tuple[float, Basis, FloatArray] | None = None
-    for degree in range(1, DEGREE + 1):
+    for degree in _degrees(d, len(np.unique(points, axis=0))):  # points drawn several times tell once
         basis = _hermite(centre, scale, d, degree)
-        if degree > 1 and ROWS_PER_TERM * len(basis.indices) > n * (d + 1) * (FOLDS - 1) / FOLDS:
-            break
         left = np.concatenate([basis.values(points)[:, None, :], basis.derivatives(points)], axis=1) * root
         missed = 0.0
         for k in range(FOLDS):
@@ -175,9 +175,42 @@ def _regression(
     return best
 
 
+def _degrees(size: int, count: int) -> Iterator[int]:
+    """Degrees that `count` points with derivatives by `size` variables are enough for."""
+    for degree in range(1, DEGREE + 1):
+        if degree > 1 and ROWS_PER_TERM * terms(size, degree) > count * (size + 1) * (FOLDS - 1) / FOLDS:
+            return
+        yield degree
+
+
+def operations(size: int, outputs: int, samples: int) -> float:
+    """Return about how many operations polynomials of `size` unknowns take where all `samples` points ask for them.
+
+    QR factors of rows × terms take 2 rows terms²; clouds evaluate polynomials and Gaussians.
+    """
+    if not affordable(size):
+        return 0.0
+    found = 0.0
+    for count in (samples // 4, samples // 2, 3 * samples // 4):
+        rows, columns = count * (size + 1), [terms(size, degree) for degree in _degrees(size, count)]
+        found += sum(2 * 2 * FOLDS * rows * column * (column + outputs) for column in columns)  # two coordinates
+        points = ROUNDS * FIRST + 2 * LAST
+        found += points * (2 * columns[-1] * (outputs + size) + 2 * CENTRES * size**2)
+    return found
+
+
 def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
-    terms, m = left.shape[2], right.shape[2]
-    return np.asarray(np.linalg.lstsq(left.reshape(-1, terms), right.reshape(-1, m), rcond=1e-10)[0])
+    """Return the solution (terms, m) of least squares: by QR, or by singular values where columns are nearly alike."""
+    from scipy.linalg import lapack, qr, solve_triangular
+
+    columns, m = left.shape[2], right.shape[2]
+    A, b = left.reshape(-1, columns), right.reshape(-1, m)
+    (reflectors, scales), R = qr(A, mode="raw", check_finite=False)
+    R, size = R[:columns], np.abs(np.diag(R))
+    if len(R) == columns and size.min() > ALIKE * size.max():
+        turned = lapack.dormqr("L", "T", reflectors, scales, b, lwork=64 * m)[0][:columns]
+        return np.asarray(solve_triangular(R, turned, check_finite=False))
+    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-10)[0])
 
 
 def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basis:

@@ -278,8 +278,20 @@ class EnsembleEvaluate(OfModel):
         self.worker.prepare(model)
         return replace(self, name=model)
 
+    @property
+    def spent(self) -> float:
+        """Processor time (s) of evaluations of all models so far, on this rank."""
+        return self.worker.spent
+
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request on all groups; blocks on disk are read."""
+        begin = time.process_time()
+        try:
+            return self._evaluated(request)
+        finally:
+            self.worker.spent += time.process_time() - begin
+
+    def _evaluated(self, request: Request) -> Evaluations:
         request = replace(request, model=self.name)
         blocks = request.blocks(self.blocks)
         checkpoint = self.worker.checkpoint
@@ -319,6 +331,7 @@ class _Worker:
         self.checkpoint = checkpoint
         self._turns = turns
         self._saved = -np.inf  # when a block was last written
+        self.spent = 0.0  # processor time (s) of evaluations
 
     def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from forward.words import NONE, named, places, with_error
+from forward.words import NONE, duration, named, places, with_error
 from uq.estimators.rounding import only_rounding
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.report import words
@@ -47,7 +47,10 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     if len(lines) == before:
         lines += _derivatives(dataset, summary)
     failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
-    lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
+    took, own = f"{summary['wall_seconds']:.1f} s", summary["own_seconds"]
+    if own > summary["cpu_seconds"] / 2:  # a third of all, or more
+        took += f", of which the method itself {duration(own)} of processor time"
+    lines.append(f"{words.counted(words.solves(summary))} in {took}, {failed}")
     if "stability" in summary:
         lines.append(words.stability(summary["stability"]))
     if "joined" in summary:

@@ -57,6 +57,7 @@ def summarised(
         **({"joined": joined} if joined else {}),
         "wall_seconds": wall,
         "cpu_seconds": seconds * study.parallel.ranks_per_model,
+        "own_seconds": job.own_seconds,
         "work": dict(zip(WORK, sum((found.work.sum(axis=0) for found in every), none).tolist(), strict=True)),
         **summarise(dataset),
         "provenance": {

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.fem.cost import REPORT, START
 from forward.readable import told
+from inverse.criticism.assessment import own_seconds
 from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
@@ -41,7 +43,7 @@ def plan(study: Inversion) -> list[str]:
         seconds = textbook * 15 * study.method.starts + each * study.method.solves(len(study.names), field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
     once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
-    seconds += once + _seconds_of_predictions(study)
+    seconds += once + _seconds_of_predictions(study) + _own_seconds(study, max(counts))
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
@@ -78,6 +80,14 @@ def _seconds_of_predictions(study: InversionStudy) -> float:
     return 2 * (cost.textbook + study.predict.solves(field=study.field) * (cost.sample + own))
 
 
+def _own_seconds(study: InversionStudy, data: int) -> float:
+    """Predict the most processor time (s) that an inversion of so many data takes besides solves."""
+    if study.field:
+        return 0.0
+    method, size = study.method, len(study.names)
+    return own_seconds(size, data, method.solves(size, field=False), method.chains)
+
+
 def _moved(count: int, usable: list[Measurement]) -> str:
     where = "" if all(m.on_surface for m in usable) else " outside the body"
     are = f"point{where} is" if count == 1 else f"points{where} are"
@@ -103,12 +113,15 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
         f"solves      about {study.solves // len(counts):,} for each",
         *_predicted(study),
     ]
-    cost = spec.cost()
+    cost, own = spec.cost(), _own_seconds(study, max(counts))
     if cost is None:
         derivable(study.spec.build(None, study.inputs.names), spec.kind)
+        each = f"up to about {duration(own)} for each, " if own else ""
+        lines.append(f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take")
     else:
         d = len(study.inputs.names)
         seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
+        seconds += own
         if method.treatment is not None:
             once, checked = mesh_check(spec)
             seconds += once

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from forward.model import FloatArray, ForwardModel
     from uq.evaluation.checkpoint import Checkpoint
-    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.ensemble import Ensemble, EnsembleEvaluate
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.turns import Progress
 
@@ -40,6 +41,10 @@ class Job(Protocol):
     @property
     def texts(self) -> Texts:
         """Further files of the directory, by name."""
+
+    @property
+    def own_seconds(self) -> float:
+        """Processor time (s) of the methods themselves, in this run."""
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
@@ -75,6 +80,8 @@ class MethodJob:
         Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
     passing
         Names of other models of which only the last one is kept in memory.
+    own
+        Processor time (s) that the method took besides evaluations, on rank 0; once it is done.
     meshes_before
         Meshes whose errors were estimated before this one was taken, as `workflows.studies.tolerance` keeps them.
     """
@@ -91,6 +98,12 @@ class MethodJob:
     estimates: Sequence[Evaluations] = ()
     passing: frozenset[str] = frozenset()
     meshes_before: Sequence[Mapping[str, Any]] = ()
+    own: list[float] = field(default_factory=list)
+
+    @property
+    def own_seconds(self) -> float:
+        """Processor time (s) that the method took besides evaluations."""
+        return sum(self.own)
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
@@ -112,9 +125,16 @@ class MethodJob:
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Run the method on rank 0, with an evaluation that all groups work on; collective over all ranks."""
+
+        def timed(evaluate: EnsembleEvaluate) -> xr.Dataset:
+            begin = time.process_time()
+            found = self.task(evaluate)
+            self.own.append(time.process_time() - begin - evaluate.spent)
+            return found
+
         return ensemble.run(
             self.model,
-            self.task,
+            timed,
             others=self.others,
             passing=self.passing,
             checkpoint=checkpoint if self.costly else None,
@@ -151,6 +171,12 @@ class TasksJob:
     arviz_groups: ArvizGroups = field(default=lambda _: {})
     texts: Texts = field(default=lambda _: {})
     outcomes: list[Outcome] = field(default_factory=list)
+
+    @property
+    def own_seconds(self) -> float:
+        """Processor time (s) of the tasks besides their solves."""
+        solves = sum(float(one.seconds.sum()) for one in self.evaluations.values())
+        return max(sum(one.seconds for one in self.outcomes) - solves, 0.0)
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:

@@ -5,6 +5,7 @@ It is the study that they came from that runs, for one of its data sets or group
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,12 +102,20 @@ class PopulationJob:
         The study, its name, and where results go.
     evaluations
         What was solved for specimens, by their names and how often it was.
+    own
+        Processor time (s) of the fit, and of what each specimen took besides its solves.
     """
 
     study: PopulationStudy
     name: str
     directory: Path
     evaluations: dict[str, Evaluations] = field(default_factory=dict)
+    own: list[float] = field(default_factory=list)
+
+    @property
+    def own_seconds(self) -> float:
+        """Processor time (s) of the fit, and of what each specimen took besides its solves."""
+        return sum(self.own)
 
     @property
     def labelled(self) -> Callable[[xr.Dataset], xr.Dataset]:
@@ -150,11 +159,24 @@ class PopulationJob:
         def task(asked: Callable[[tuple[str, Inputs]], Draws | str]) -> xr.Dataset:
             posteriors = self.study.posteriors
             prior = prior_of(method.source, method.model, next(iter(posteriors.values())).names)
-            return method.run(posteriors, prior, lambda *one: asked(one))
+            asking = 0.0
+
+            def timed(*one: Any) -> Draws | str:
+                nonlocal asking
+                begun = time.process_time()
+                found = asked(one)
+                asking += time.process_time() - begun
+                return found
+
+            begin = time.process_time()
+            fitted = method.run(posteriors, prior, timed)
+            self.own.append(time.process_time() - begin - asking)
+            return fitted
 
         return ensemble.led(task, lambda asked: again(*asked))
 
     def _keep(self, job: Job, label: str) -> None:
+        self.own.append(job.own_seconds)
         for part, found in job.evaluations.items():
             self.evaluations[label if part == "/" else f"{label}/{part}"] = found
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from inverse.criticism.assessment import own_seconds
 from workflows.studies.predictions import NOT_ASKED, duration
 
 if TYPE_CHECKING:
     from workflows.studies.selection import Comparison
 
-SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 # What data of a quantity are called, and what they are of.
 DATA = {
     "stress": ("stresses", "tests"),
@@ -22,7 +22,13 @@ def plan(study: Comparison) -> list[str]:
     """Say what is compared, and how long that will take."""
     method = study.method
     evidences = study.evidences
-    seconds = study.seconds_of_solves + SECONDS_PER_SURROGATE * evidences
+    sizes = {group: one.values.size for group, one in study.data_groups.items()}
+    own = sum(
+        own_seconds(len(study.candidates[name].parameters), sizes[group], method.samples) for name, group in study.pairs
+    )
+    seconds = study.seconds_of_solves + own * evidences / len(study.pairs)
+    if method.chains == "hmc":
+        seconds += len(study.pairs) * own_seconds(0, 0, 0, "hmc")
     meshes = study.mesh_checks
     if study.unchecked and method.treatment is None:
         meshes = [(0.0, NOT_ASKED)]

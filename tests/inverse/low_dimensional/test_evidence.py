@@ -10,12 +10,13 @@ from scipy.stats import chi2
 from forward.materials.admissible import Materials
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FunctionModel, SolveError
+from inverse.criticism.assessment import own_seconds
 from inverse.criticism.weights import pareto_shape
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.surrogate import _tempered, fit
+from inverse.low_dimensional.surrogate import _regression, _solve, _tempered, fit, operations
 from inverse.methods.selection import _rescaled
 from inverse.methods.selection import posterior as assemble
 from tests.problems import FOUR, ridge, slopes_of_four, two_of_four
@@ -238,3 +239,33 @@ def test_weights_of_points_where_a_polynomial_has_no_answer():
     np.testing.assert_allclose(_tempered(logs, 1), [0, 1 / (1 + np.exp(-3)), 1 / (1 + np.exp(3)), 0])
     with pytest.raises(SolveError, match="no answer at any point"):
         _tempered(np.full(3, -np.inf), 2)
+
+
+@pytest.mark.unit
+def test_polynomials_are_fitted_by_least_squares():
+    """Also where columns are alike, and where points were drawn several times: of these one says nothing new."""
+    rng = np.random.default_rng(0)
+    left, right = rng.normal(size=(12, 3, 20)), rng.normal(size=(12, 3, 4))
+    exact = np.linalg.lstsq(left.reshape(36, 20), right.reshape(36, 4), rcond=1e-10)[0]
+    np.testing.assert_allclose(_solve(left, right), exact, atol=1e-12)
+    left[:, :, 7] = left[:, :, 3] + left[:, :, 5]
+    exact = np.linalg.lstsq(left.reshape(36, 20), right.reshape(36, 4), rcond=1e-10)[0]
+    np.testing.assert_allclose(_solve(left, right), exact, atol=1e-10)
+    # 12 points with derivatives are enough for ten polynomials of degree 2 in 3 variables, 12 copies of two are not.
+    points = rng.normal(size=(12, 3))
+    outputs, tangents = (points**2).sum(axis=1)[:, None], 2 * points[:, None, :]
+    assert len(_regression(points, outputs, tangents, np.full(12, 1 / 12))[1].indices) == 10
+    which = np.arange(12) % 2
+    assert len(_regression(points[which], outputs[which], tangents[which], np.full(12, 1 / 12))[1].indices) == 4
+
+
+@pytest.mark.unit
+def test_own_work_is_predicted():
+    """It grows with unknowns, data and solves, and is nothing where no polynomial is fitted."""
+    few, more, many = (operations(size, 2 * size, 256) for size in (5, 10, 31))
+    assert 0 < few < more
+    assert many == 0
+    assert operations(10, 20, 256) < operations(10, 40, 256) < operations(10, 40, 512)
+    assert own_seconds(31, 60, 256) == 0
+    of_chains = own_seconds(2, 60, 256, "hmc") - own_seconds(2, 60, 256)
+    assert own_seconds(31, 60, 256, "hmc") == pytest.approx(of_chains)

@@ -662,9 +662,9 @@ def test_a_table_of_strains_is_one_line(small, capsys):
         assert told in lines[0]
 
 
-def of_bananas(pairs, **settings):
+def of_bananas(pairs, bend=0.7, **settings):
     """What a comparison finds of a curved posterior; what makes an inversion of the same; and what is true."""
-    model, curved, *truth = bananas(pairs)
+    model, curved, *truth = bananas(pairs, bend)
     d = 2 * pairs
     data = Data(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
     method = Select(noise=Noise(), **settings)
@@ -698,7 +698,7 @@ def test_where_points_count_little_a_comparison_says_what_an_inversion_says():
 def test_chains_of_a_comparison():
     """12 unknowns, curved: constants, predictions and ln Z by gradients, against closed forms."""
     pytest.importorskip("mici")
-    found, _, (mean, std, log_evidence) = of_bananas(6, samples=64, chains="hmc")
+    found, _, (mean, std, log_evidence) = of_bananas(6, 0.5, samples=64, chains="hmc")
     assert found["chains"] == 2
     assert found["trusted"]
     assert str(found["trust"].item()) == "corrected"

@@ -200,6 +200,8 @@ def times(results: Results) -> Iterator[tuple[str, str]]:
     yield "wall time", f"{duration(summary['wall_seconds'])} (of the run that finished the study)"
     cpu = summary["cpu_seconds"]
     yield "processor time of the solves", f"{duration(cpu)}; {duration(cpu / count)} a solve"
+    if "own_seconds" in summary:
+        yield "processor time of the method itself", duration(summary["own_seconds"])
     if any(summary["work"].values()):  # unknown for inversions in parallel
         for name, amount in summary["work"].items():
             yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
