@@ -12,7 +12,7 @@ from inverse.criticism.answer import counts
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights
 from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.weights import enough, fewest, worth
+from inverse.criticism.weights import enough, fewest, usual, worth
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode
 from inverse.low_dimensional.evidence import Evidence
@@ -64,7 +64,9 @@ def verdict_on_points(gaussian: Laplace, found: Evidence, chains: Chains | None 
         needed = fewest(c)
         if found.trusted:
             said = f"{said}, fewer than the {needed:.0f} that stand in place of a Gaussian of {c} unknowns"
-        return _by_chains(said, chains, enough(found.ess, n, needed) if found.ess >= SOME else 0)
+        # A few points do not tell that more would not do.
+        more = enough(found.ess, n, needed) if found.ess >= SOME else 0
+        return _by_chains(said, chains, max(more, usual(c)) if n < usual(c) else more)
     w, x = found.weights, found.density.x
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())

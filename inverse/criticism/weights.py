@@ -17,6 +17,7 @@ ALIKE = 0.8  # effective share above which weights are practically equal
 FEWEST = 20.0  # effective sample size below which weights say nothing
 PER_UNKNOWN = 2.0  # points that weights must be worth for each unknown, to stand in place of a Gaussian
 MORE = 4.0  # times the points
+LEAST_TRIED, EACH = 256, 8  # points that are tried by default: at least, and for each unknown
 RULE = (
     f"Weights are to be trusted where they are worth {FEWEST:.0f} points or more, and k̂ is {TRUSTED:g} or less or more "
     f"than {100 * ALIKE:.0f} % of the points count."
@@ -56,6 +57,11 @@ def fewest(size: int) -> float:
     A covariance of fewer points than unknowns is singular, and of twice as many still off by a third.
     """
     return max(FEWEST, PER_UNKNOWN * size)
+
+
+def usual(size: int) -> int:
+    """Return how many points are tried by default for so many unknowns: fewer may miss how good they would be."""
+    return max(LEAST_TRIED, 32 * -(-EACH * size // 32))
 
 
 def effective_sample_size(weights: FloatArray) -> float:

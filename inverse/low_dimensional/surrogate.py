@@ -41,7 +41,6 @@ SCRAMBLES = 8
 FIRST, LAST = 2**11, 2**13  # points in the first clouds and in the last one
 ROUNDS = 4
 MOST_TERMS = 500  # of degree 2: beyond 30 unknowns a cloud is worth few of its points, and a fit takes minutes
-ALIKE = 1e-7  # size of what is left of a column by others, over the largest, below which they are nearly alike
 ENOUGH = 0.2  # effective share of a cloud from which no better proposal is needed
 
 
@@ -186,7 +185,7 @@ def _degrees(size: int, count: int) -> Iterator[int]:
 def operations(size: int, outputs: int, samples: int) -> float:
     """Return about how many operations polynomials of `size` unknowns take where all `samples` points ask for them.
 
-    QR factors of rows × terms take 2 rows terms²; clouds evaluate polynomials and Gaussians.
+    Least squares of rows × terms take about 2 rows terms²; clouds evaluate polynomials and Gaussians.
     """
     if not affordable(size):
         return 0.0
@@ -200,17 +199,8 @@ def operations(size: int, outputs: int, samples: int) -> float:
 
 
 def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution (terms, m) of least squares: by QR, or by singular values where columns are nearly alike."""
-    from scipy.linalg import lapack, qr, solve_triangular
-
-    columns, m = left.shape[2], right.shape[2]
-    A, b = left.reshape(-1, columns), right.reshape(-1, m)
-    (reflectors, scales), R = qr(A, mode="raw", check_finite=False)
-    R, size = R[:columns], np.abs(np.diag(R))
-    if len(R) == columns and size.min() > ALIKE * size.max():
-        turned = lapack.dormqr("L", "T", reflectors, scales, b, lwork=64 * m)[0][:columns]
-        return np.asarray(solve_triangular(R, turned, check_finite=False))
-    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-10)[0])
+    terms, m = left.shape[2], right.shape[2]
+    return np.asarray(np.linalg.lstsq(left.reshape(-1, terms), right.reshape(-1, m), rcond=1e-10)[0])
 
 
 def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basis:

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, solves_of
 from inverse.criticism.chains import FIELD
+from inverse.criticism.weights import usual
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
@@ -16,7 +17,6 @@ from inverse.methods.mesh_correction import MeshTreatment
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
-SAMPLES, EACH = 256, 8  # solves that correct a Gaussian: at least, and for each unknown
 LEAST_SHARED = 8  # solves of an expansion
 
 
@@ -113,7 +113,7 @@ class Invert(MeshTreatment, Settings):
         """Number of solves for a data set with `size` unknown parameters that correct the Gaussian."""
         if self.samples is not None:
             return self.samples
-        return 0 if field else max(SAMPLES, LEAST * -(-EACH * size // LEAST))
+        return 0 if field else usual(size)
 
     def chain_solves(self, size: int, *, field: bool) -> int:
         """Number of solves of the chains for a data set with `size` unknown parameters."""

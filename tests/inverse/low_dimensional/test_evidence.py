@@ -16,7 +16,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.surrogate import _regression, _solve, _tempered, fit, operations
+from inverse.low_dimensional.surrogate import _regression, _tempered, fit, operations
 from inverse.methods.selection import _rescaled
 from inverse.methods.selection import posterior as assemble
 from tests.problems import FOUR, ridge, slopes_of_four, two_of_four
@@ -242,21 +242,13 @@ def test_weights_of_points_where_a_polynomial_has_no_answer():
 
 
 @pytest.mark.unit
-def test_polynomials_are_fitted_by_least_squares():
-    """Also where columns are alike, and where points were drawn several times: of these one says nothing new."""
-    rng = np.random.default_rng(0)
-    left, right = rng.normal(size=(12, 3, 20)), rng.normal(size=(12, 3, 4))
-    exact = np.linalg.lstsq(left.reshape(36, 20), right.reshape(36, 4), rcond=1e-10)[0]
-    np.testing.assert_allclose(_solve(left, right), exact, atol=1e-12)
-    left[:, :, 7] = left[:, :, 3] + left[:, :, 5]
-    exact = np.linalg.lstsq(left.reshape(36, 20), right.reshape(36, 4), rcond=1e-10)[0]
-    np.testing.assert_allclose(_solve(left, right), exact, atol=1e-10)
-    # 12 points with derivatives are enough for ten polynomials of degree 2 in 3 variables, 12 copies of two are not.
-    points = rng.normal(size=(12, 3))
-    outputs, tangents = (points**2).sum(axis=1)[:, None], 2 * points[:, None, :]
-    assert len(_regression(points, outputs, tangents, np.full(12, 1 / 12))[1].indices) == 10
+def test_copies_of_points_do_not_raise_the_degree():
+    """12 points with derivatives are enough for the ten polynomials of degree 2, 12 copies of two of them are not."""
+    points = np.random.default_rng(0).normal(size=(12, 3))
+    outputs, tangents, even = (points**2).sum(axis=1)[:, None], 2 * points[:, None, :], np.full(12, 1 / 12)
+    assert len(_regression(points, outputs, tangents, even)[1].indices) >= 10
     which = np.arange(12) % 2
-    assert len(_regression(points[which], outputs[which], tangents[which], np.full(12, 1 / 12))[1].indices) == 4
+    assert len(_regression(points[which], outputs[which], tangents[which], even)[1].indices) == 4
 
 
 @pytest.mark.unit

@@ -1,5 +1,6 @@
 """Posteriors of 10 to 60 unknowns: Gaussian ones and others bent a little, against closed forms and NumPy."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains
 from inverse.criticism.predictive import examine_few
 from inverse.criticism.verdict import verdict_on_few
-from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality
+from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality, usual
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -123,9 +124,9 @@ def test_few_points_replace_nothing():
     """Points of which one counts: what is printed is Laplace's, with its moments, and not trusted."""
     posterior, _ = bent(12, 0.0)
     gaussian = laplace(posterior, starts=1)
-    found = evidence(posterior, gaussian, 64)
-    one = np.repeat(found.density.x[:1], 64, axis=0)
-    alike = replace(found, route="surrogate", density=replace(found.density, x=one), log_weights=np.zeros(64), ess=1.0)
+    found = evidence(posterior, gaussian, 256)
+    one = np.repeat(found.density.x[:1], 256, axis=0)
+    alike = replace(found, route="surrogate", density=replace(found.density, x=one), log_weights=np.zeros(256), ess=1.0)
     assert not alike.trusted
     assert not counts(alike)
     judged = verdict(posterior, gaussian, alike)
@@ -262,3 +263,15 @@ def test_how_far_a_search_that_did_not_converge_is_from_its_end():
     found = evidence(posterior, gaussian, 64)
     said = verdict(posterior, replace(gaussian, converged=False, left=0.31), found).why
     assert said.endswith("did not converge: its next step would move an unknown by up to 0.31 standard deviations")
+
+
+@pytest.mark.parametrize(("size", "seed"), [(25, 7), (25, 8), (25, 9), (40, 7), (60, 7)])
+def test_advice_on_the_number_of_points_holds_when_taken(size, seed):
+    """From 32 points, of which one or two may count: the advice is a number, and enough."""
+    posterior, _ = bent(size, 0.25, seed)
+    gaussian = laplace(posterior, starts=1)
+    first = verdict(posterior, gaussian, evidence(posterior, gaussian, 32))
+    assert first.trust == "neither"
+    samples = int(re.search(r"take method\.samples = (\d+), or run chains", first.why)[1])
+    assert samples <= 8 * usual(size)
+    assert verdict(posterior, gaussian, evidence(posterior, gaussian, samples)).trust != "neither"
