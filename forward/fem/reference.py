@@ -86,16 +86,17 @@ class ReferenceFactor:
         return self._lengths
 
     def from_rest(self) -> float:
-        """How far from rest the tangent by the load ends that leads back there, over the size of the state."""
+        """Distance of the state from what the tangent at rest predicts for its loads, over its size."""
         assert self._reference is not None
         if self._rest is None:
             equations, state = self._set(self._reference), self._reference.state
-            equations.at_load(0.0)
             kept, equations.work = equations.work, Work()  # as that of the factor
-            back = state - self._solver.solve(equations.residual(state).vector)
+            zero = np.zeros_like(state)
+            equations.factorise(zero)
+            apart = equations.norm(state + equations.solve(equations.residual(zero).vector))
             equations.work = kept
             size = equations.norm(state)
-            self._rest = equations.norm(back) / size if size > 0 else 0.0
+            self._rest = apart / size if size > 0 else 0.0
         return self._rest
 
     def prepare_screen(self) -> bool:

@@ -51,12 +51,13 @@ def predict_correct(
         history.append(f"prediction at {target:.6g} of the way from the reference")
         u = system.on_target(guess)
         residual = system.residual(u)
-        close, predicted = bool(np.isfinite(residual.size)), u
+        close = bool(np.isfinite(residual.size))
+        predicted = system.on_target(start) if known else u  # states on the way may lie beyond a jump
         if close:
             correct = way.corrector(u)
             mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
             u, residual, close, first = mixed
-            if flat:
+            if flat and not known:
                 predicted = first
         if close and target == 1:
             stability = yield from accepted(system, settings, u, residual, way, history)

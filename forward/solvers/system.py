@@ -144,7 +144,7 @@ class Way(Protocol):
     def reversed_from(self) -> float:
         """How far the reference is from a linear answer to its loads, if one of these is reversed on the path; else 0.
 
-        That is where the tangent by the load ends that leads back to rest, over the size of its state.
+        That is the distance from what the tangent at rest predicts, over the size of its state.
         """
 
     @property
