@@ -35,6 +35,7 @@ NAMES = (
     "streaming",
     "tails",
     "stability",
+    "states",
     "locking",
     "mesh_error",
     "estimates",
