@@ -13,6 +13,7 @@ from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Corrector, Steps
 from forward.solvers.system import Found, Residual, System, Way
 
+NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved, of the same branch
 WINDOW = 8  # differences that Anderson mixing keeps
 PATIENCE = 6  # corrections without a smaller residual before giving up
 TOUCHING, LESS = 4, 1 / 3  # corrections of a body in contact after which the residual must be this much smaller
@@ -43,7 +44,7 @@ def predict_correct(
     known: list[tuple[float, FloatArray]] = []
     reached, target = 0.0, 1.0
     closest: FloatArray | None = None
-    least, failures = CLOSE, 0
+    least, failures, astray = CLOSE, 0, False  # astray: a state on the way may lie beyond a jump
     while True:
         way.at(target)
         guess = straight(way.state, slope, known, target)
@@ -52,13 +53,15 @@ def predict_correct(
         u = system.on_target(guess)
         residual = system.residual(u)
         close = bool(np.isfinite(residual.size))
-        predicted = system.on_target(start) if known else u  # states on the way may lie beyond a jump
+        predicted = system.on_target(start) if astray else u
         if close:
             correct = way.corrector(u)
             mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
             u, residual, close, first = mixed
             if flat and not known:
                 predicted = first
+            if close and target < 1:
+                astray = astray or system.norm(u - predicted) > NEAR * system.norm(u - way.state)
         if close and target == 1:
             stability = yield from accepted(system, settings, u, residual, way, history)
             return Found(u, residual.relative, corrected=True, stability=stability, predicted=predicted)

@@ -21,13 +21,12 @@ import numpy as np
 
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.acceptance import Diverged, Unstable
-from forward.solvers.corrections import mix, straight
+from forward.solvers.corrections import NEAR, mix, straight
 from forward.solvers.newton import newton
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Steps, T, Task, abreast
 from forward.solvers.system import Found, System, Way
 
-NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved
 TURNED = np.pi / 4  # angle (rad) by which a node is turned against the prediction
 SAME = 1e-5  # distance of two states that are one, over their size: tolerances of residuals allow for less
 FEW = 0.01  # the same over the size of the state, below which no two branches are told apart
