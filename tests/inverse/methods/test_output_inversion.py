@@ -11,7 +11,7 @@ from mpi4py import MPI
 from inverse.criticism.doubts_of_meshes import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
-from tests.launch import run_script
+from tests.launch import TISSUQ, run, run_script
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
@@ -330,3 +330,27 @@ def test_errors_of_data():
     np.testing.assert_allclose(found.with_sigma({"u": 0.5}, 0.1, 0.2).sigma, [0.5, 0.2, 0.2])
     with pytest.raises(DataError, match=r"data.outputs.v: the standard deviation .* not known, expected"):
         found.with_sigma({"u": 0.5}, 0.1, 0.0)
+
+
+@pytest.mark.mpi
+def test_chains_by_gradients_on_several_ranks(tmp_path):
+    """The numbers of one rank; where a rank is killed within them all end, and the same command finds them again."""
+    pytest.importorskip("mici")
+    study, module = tmp_path / "chained.toml", tmp_path / "lines_chained.py"
+    study.write_text(STUDY.replace("MODULE", "chained").replace("samples = 32", 'samples = 32\nchains = "hmc"'))
+    module.write_text(LINES)
+    alone, killed = tmp_path / "alone", tmp_path / "killed"
+    assert run(None, TISSUQ, "run", study, "--out", alone, "--no-report").returncode == 0
+    when = f"len(calls) == 500 and not os.path.exists({str(killed / 'on')!r})"
+    ends = f"    calls.append(p)\n    if {when}:\n        os._exit(9)\n"
+    module.write_text("import os\n\ncalls = []\n" + LINES.replace("    return A @ p\n", f"{ends}    return A @ p\n"))
+    command = (2, TISSUQ, "run", study, "--out", killed, "--no-report")
+    assert run(*command, timeout=100).returncode not in {0, 3}
+    assert not (killed / "summary.json").exists()
+    (killed / "on").touch()
+    done = run(*command)
+    assert done.returncode == 0, done.stderr
+    one, two = results(alone), results(killed)
+    assert (one["chains"] == 2).all()
+    for name in ("mean", "std", "draw", "log_evidence", "chain_rhat"):
+        np.testing.assert_array_equal(one[name], two[name])
