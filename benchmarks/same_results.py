@@ -199,8 +199,12 @@ def compared(old: Done, new: Done) -> Iterator[str]:
 
 
 def _run(tree: Path, case: Case, place: Path) -> Done:
-    """Run a study of a folder, where those are that it needs, with the code of a tree."""
-    folder = place / case.file.parent
+    """Run a study of a folder, where those are that it needs, with the code of a tree.
+
+    While it runs, the folder has the same name for all trees: results keep the paths of what was read.
+    """
+    now = place.with_name("now")
+    folder = now / case.file.parent
     command = [sys.executable, "-m", "workflows", "run", case.file.name, "--out", case.name, "--quiet"]
     command += [word for setting in SHORTER.get(case.name, ()) for word in ("--set", setting)]
     if "report" not in case.text:
@@ -209,10 +213,14 @@ def _run(tree: Path, case: Case, place: Path) -> Done:
         command = ["mpirun", "-n", str(case.ranks), "--oversubscribe", "--bind-to", "none", *command]
     paths = os.environ | {"PYTHONPATH": str(tree)}
     start = _spent()
-    done = subprocess.run(command, cwd=folder, env=paths, capture_output=True, text=True, check=False)
+    place.rename(now)
+    try:
+        done = subprocess.run(command, cwd=folder, env=paths, capture_output=True, text=True, check=False)
+    finally:
+        now.rename(place)
     if done.returncode not in {0, 3}:
         sys.stderr.write(f"{case.name} in {tree}: {done.stderr}")
-    return Done(folder / case.name, done.returncode, _spent() - start)
+    return Done(place / case.file.parent / case.name, done.returncode, _spent() - start)
 
 
 def _spent() -> float:
