@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import shutil
 import subprocess
@@ -27,6 +26,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+
+from tests.launch import environment, on_ranks
 
 ROOT = Path(__file__).parent.parent
 NET = Path("benchmarks/net")
@@ -209,9 +210,8 @@ def _run(tree: Path, case: Case, place: Path) -> Done:
     command += [word for setting in SHORTER.get(case.name, ()) for word in ("--set", setting)]
     if "report" not in case.text:
         command.append("--no-report")
-    if case.ranks > 1:
-        command = ["mpirun", "-n", str(case.ranks), "--oversubscribe", "--bind-to", "none", *command]
-    paths = os.environ | {"PYTHONPATH": str(tree)}
+    command = on_ranks(case.ranks if case.ranks > 1 else None, *command)
+    paths = environment() | {"PYTHONPATH": str(tree)}
     start = _spent()
     place.rename(now)
     try:
