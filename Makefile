@@ -19,7 +19,7 @@ DEMO := beam
 # Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.
 WORKERS := --numprocesses auto --dist loadfile
 ARGS :=
-# To compile all modules anew takes as long as the unit tests: kept here, whatever the environment says.
+# To compile all modules anew takes as long as the unit tests, in every worker: kept here, whatever the environment says.
 KEPT := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/.venv/compiled
 INSTALL = PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --no-compile --editable
 
@@ -45,7 +45,7 @@ demo: $(or $(wildcard $(READY)),$(RUNS)) ## run configs/beam.toml on 2 ranks; it
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
 
 test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
-	@$(PYTHON) -m pytest $(WORKERS) $(ARGS)
+	@$(KEPT) $(PYTHON) -m pytest $(WORKERS) $(ARGS)
 
 test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
 	@$(KEPT) $(PYTHON) -m pytest -m unit -p no:hypothesispytest $(ARGS)
@@ -54,7 +54,7 @@ test-faults: $(READY) ## plant faults in formulas in turn, and say which of them
 	@$(PYTHON) -m tests.faults $(ARGS)
 
 test-all: $(READY) browser ## run the test suite with the slow tests
-	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)
+	@$(KEPT) $(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)
 
 test-flags: $(READY) ## run what depends on compiler flags and on OpenBLAS's kernels with several of them
 	@$(PYTHON) -m tests.flags $(ARGS)

@@ -71,6 +71,8 @@ class StiffnessMatrix:
         expected: Factor,
         blocked: bool = False,
     ) -> None:
+        # PETSc keeps what Python has dropped, such as factors of models that are gone, until all ranks destroy it here.
+        PETSc.garbage_cleanup(comm)
         require(2 * BYTES_PER_NONZERO * expected.nonzeros / comm.size + SPARE, "the stiffness matrix")
         self.unknowns, self.comm, self.symmetric, self.expected = unknowns, comm, symmetric, expected
         self._form = form
