@@ -51,6 +51,7 @@ NAMES = (
     "meshes",
     "pgd",
     "multifidelity",
+    "controls",
     "gains",
     "blocks",
     "meshes_of_fields",
