@@ -4,7 +4,8 @@ Each specimen has constants of its own, drawn from the priors of the candidates,
 two directions, with errors of a share of the stress. Evidences are means of the likelihood over the same many points of
 the priors: with these errors that is exact enough, and much faster than what `select` does for data of any kind. The
 table says of sets of forty specimens, of one material and of two, in how many it is said that they disagree, how large
-ln of the Bayes factor for two materials is, and in how many a probability above 99 % stands there all the same.
+ln of the Bayes factor for two materials is, and in how many a probability above 99 % stands there all the same. In the
+last rows all specimens of a set have the same constants, which is not what the priors say of specimens.
 
     python -m benchmarks.specimens [SETS [ERROR [POINTS]]]
 """
@@ -47,10 +48,11 @@ def stresses(kind: str, normals: FloatArray) -> FloatArray:
     return model.stresses(Inputs(KINDS[kind]).from_normals(normals)[0])
 
 
-def evidences(kind: str, count: int, seed: int, error: float, points: int) -> FloatArray:
-    """Return ln Z (K, count) of the candidates for specimens of one material."""
-    rng = np.random.default_rng(seed)
-    exact = stresses(kind, rng.standard_normal((count, len(KINDS[kind]))))
+def evidences(kind: str, sets: int, seed: int, error: float, points: int, *, alike: bool = False) -> FloatArray:
+    """Return ln Z (K, count) of the candidates for specimens of one material, all alike in each set or not."""
+    rng, count = np.random.default_rng(seed), sets * SPECIMENS
+    normals = rng.standard_normal((sets if alike else count, len(KINDS[kind])))
+    exact = stresses(kind, np.repeat(normals, count // len(normals), axis=0))
     sigma = np.maximum(error * np.abs(exact), LEAST)
     values = exact + sigma * rng.standard_normal(exact.shape)
     found = np.empty((len(KINDS), count))
@@ -72,13 +74,17 @@ def told(sets: list[FloatArray]) -> tuple[int, FloatArray, int]:
 
 def main(sets: int = 20, error: float = 0.1, points: int = 16384) -> None:
     """Print the table."""
-    of = {kind: evidences(kind, sets * SPECIMENS, seed, error, points) for seed, kind in enumerate(KINDS)}
+    of, alike = {}, {}
+    for seed, kind in enumerate(KINDS):
+        of[kind] = evidences(kind, sets, seed, error, points)
+        alike[f"{kind}, alike"] = evidences(kind, sets, seed, error, points, alike=True)
     mixed = [(a, b, share) for a, b in combinations(KINDS, 2) for share in (0.5, 0.2, 0.1)]
+    every = of | alike
     sys.stdout.write(f"{'specimens':34}  said      ln B: least, median, largest   above 99 %\n")
-    for a, b, share in [*((kind, kind, 0.0) for kind in KINDS), *mixed]:
+    for a, b, share in [*((kind, kind, 0.0) for kind in of), *mixed, *((kind, kind, 0.0) for kind in alike)]:
         second = round(share * SPECIMENS)
         rows = [
-            np.hstack([of[a][:, start : start + SPECIMENS - second], of[b][:, start : start + second]])
+            np.hstack([every[a][:, start : start + SPECIMENS - second], every[b][:, start : start + second]])
             for start in range(0, sets * SPECIMENS, SPECIMENS)
         ]
         said, factors, sure = told(rows)

@@ -55,6 +55,6 @@ def test_mixtures_are_said_and_single_materials_are_not():
         assert all(one.log_bayes_factor > DISAGREE for one in found)
         assert np.mean([one.first[:seconds].mean() for one in found]) < 0.1
         assert np.mean([one.first[seconds:].mean() for one in found]) > 0.9
-    for apart in (0.1, 0.5, 1.0, 2.0, 5.0):
+    for apart in (0.01, 0.1, 0.5, 1.0, 2.0, 5.0):
         alarms = sum(mixture(of_normals(0, apart, rng), halves).log_bayes_factor > DISAGREE for _ in range(200))
         assert alarms <= 200 * np.exp(-DISAGREE)
