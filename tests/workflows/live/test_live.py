@@ -247,10 +247,10 @@ def test_the_page_moves_in_a_browser(small, tmp_path):  # noqa: F811
         _patiently(f"http://127.0.0.1:{page}/")
         with browser() as tab:
             tab.open(f"http://127.0.0.1:{page}/")
-            tab.wait("document.getElementById('rate').textContent.includes('needs its token')")
+            tab.wait("document.getElementById('rate')?.textContent.includes('needs its token')")
             tab.errors.clear()  # a page without token is refused what it asks for
             tab.run(f"location.hash = '{token}'")
-            tab.wait("/[1-9]\\d* pictures a second/.test(document.getElementById('rate').textContent)")
+            tab.wait("/[1-9]\\d* pictures a second/.test(document.getElementById('rate')?.textContent)")
             number = "document.querySelector('#outputs td:nth-child(2)').textContent"
             before = float(tab.run(number))
             slider = small.parameters.index("loads.gravity.density")
