@@ -116,9 +116,9 @@ def wrong(differences: FloatArray) -> FloatArray:
         return np.asarray(np.inf)
     R = differences.shape[1]
     off, scatter = differences.mean(axis=1), differences.var(axis=1, ddof=1) / R
-    # Means, though a fit may have lost just the sample that decides: then it is one sample that decides.
-    size, common = (off**2).mean(axis=0), (K - 1) * off.mean(axis=0)
-    return np.where(size <= EXPLAINED * scatter.mean(axis=0), 0.0, np.hypot(np.sqrt(size), common))
+    # Medians, since a fit may have lost just the sample that decided.
+    size, common = np.median(off**2, axis=0), (K - 1) * np.median(off, axis=0)
+    return np.where(size <= EXPLAINED * np.median(scatter, axis=0), 0.0, np.hypot(np.sqrt(size), common))
 
 
 def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:
