@@ -37,7 +37,7 @@ WRAPPERS = (
     "inverse/data/measured_model.py",
     "uq/evaluation/kept.py",
 )
-CHAINS = ("inverse/methods/invert_few.py inverted", "inverse/methods/selection.py _assess")
+CHAINS = ("inverse/methods/invert_few.py inverted", "inverse/methods/selection.py run")
 
 
 @dataclass(frozen=True)
