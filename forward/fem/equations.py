@@ -264,7 +264,10 @@ class Discretisation(Linearisation):
         return nodes[held], axes[held]
 
     def gradients_at(self, u: FloatArray) -> FloatArray:
-        """Deformation gradients (3, 3, n_owned) at the nodes of a state u (U_local,); the last ones are remembered."""
+        """Deformation gradients (3, 3, n_owned) at the nodes of a state u (U_local,), which nobody changes in place.
+
+        Those of the last state are remembered; the state that is set is u only where they were not.
+        """
         if self._deformed is None or self._deformed[0] is not u:
             self.set_state(u)
             self._deformed = (u, self.gradients())

@@ -37,8 +37,8 @@ SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
 SHORTEST = 1 / 256  # of the load: a step that is no longer than this and still leaves the prediction is a jump
 LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
-ABOVE = (1 / 32, 1 / 16, 1 / 8)  # of the load that is added to find a jump
 LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
+ABOVE = (1 / 32, 1 / 16, 1 / 8)  # of the load that is added to find a jump
 
 
 def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatArray, way: Way | None = None) -> str:
