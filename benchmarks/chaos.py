@@ -136,7 +136,12 @@ def _cases() -> Iterator[Case]:
 
 def _joint(inputs: Inputs) -> Any:
     """Return chaospy's distribution: it takes parameters that share an object for the same parameter."""
-    return chaospy.J(*(type(m).model_validate(m.model_dump()).dist for m in inputs.marginals.values()))
+    return chaospy.J(
+        *(
+            chaospy.Beta(m.a, m.b, m.lower, m.upper) if isinstance(m, Beta) else chaospy.Uniform(m.lower, m.upper)
+            for m in inputs.marginals.values()
+        )
+    )
 
 
 def _by_chaospy(case: Case, points: FloatArray, values: FloatArray, test: FloatArray, order: int) -> Found:

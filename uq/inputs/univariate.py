@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import model_validator
@@ -33,10 +33,6 @@ class Univariate(Settings):
     closed: ClassVar[bool] = False
     """Whether the recurrence of the orthogonal polynomials is known in closed form."""
 
-    @abstractmethod
-    def _chaospy(self, cp: Any) -> Any:
-        """Build the chaospy distribution."""
-
     @property
     @abstractmethod
     def _frame(self) -> tuple[float, float]:
@@ -53,13 +49,6 @@ class Univariate(Settings):
     @abstractmethod
     def _inverse(self, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantile u at p = 1 − q, with ln of the density there."""
-
-    @cached_property
-    def dist(self) -> Any:
-        """The chaospy distribution."""
-        import chaospy
-
-        return self._chaospy(chaospy)
 
     @cached_property
     def moments(self) -> tuple[float, float]:
@@ -85,11 +74,7 @@ class Univariate(Settings):
 
         π_k+1 = (t − α_k) π_k − β_k π_k−1 (W. Gautschi, Orthogonal Polynomials (2004), theorem 1.27).
         """
-        mean, std = self.moments
-        pair = np.asarray(self.dist.ttr(np.arange(degree + 1)), dtype=float).reshape(2, degree + 1)
-        pair = np.array([(pair[0] - mean) / std, pair[1] / std**2])
-        pair[1, 0] = 1.0
-        return pair
+        raise NotImplementedError
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:

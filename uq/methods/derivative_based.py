@@ -44,6 +44,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.distributions import (
     Beta,
+    Chaospy,
     Distribution,
     Gamma,
     LogNormal,
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
 
 SETTLED = 1e-5  # relative change of a Poincaré constant, when the degree is doubled, at which it counts as known
 DEGREES = (8, 16, 32, 64)
+GROWS = 1.01  # of min(F, 1 − F)/p from a probability of 1e-3 to one of 1e-8: it grows without limit
 ORDER = 6  # largest order of the expansion for total indices
 RANGE = (0.025, 0.975)
 
@@ -199,8 +201,20 @@ def poincare(marginal: Distribution, *, logarithm: bool) -> float:
             return float(theta**2 * ((k + 1) ** 2 / k if k > 1 else 4))
         case Uniform() | LogUniform() | Triangular() | Beta() | TruncatedNormal():
             return _by_galerkin(marginal, logarithm=logarithm)
+        case Chaospy():
+            return _by_galerkin(marginal, logarithm=logarithm) if logarithm or not _heavy(marginal) else np.inf
         case _:
             assert_never(marginal)
+
+
+def _heavy(marginal: Distribution) -> bool:
+    """Whether a tail falls more slowly than an exponential function: then min(F, 1 − F)/p grows without limit in it."""
+    p: FloatArray = np.array([1e-3, 1e-8])
+    for far in (p, np.asarray(1 - p)):
+        near, beyond = p / marginal.density(marginal.quantile(far))
+        if beyond > GROWS * near:
+            return True
+    return False
 
 
 def _by_galerkin(marginal: Distribution, *, logarithm: bool) -> float:
