@@ -279,12 +279,15 @@ def _of_mappings(name: str, old: Mapping[str, Any], new: Mapping[str, Any], but:
 
 
 def _opened(value: Any) -> Any:
-    """Return a value as JSON can hold it: lists are mappings by their places, texts of JSON are what these say."""
+    """Return a value as JSON can hold it: lists are mappings by their places, texts of JSON or TOML what these say."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, str) and value.startswith(("{", "[")):
         with suppress(ValueError):
             value = json.loads(value)
+    elif isinstance(value, str) and "\n" in value:
+        with suppress(ValueError):
+            value = tomllib.loads(value)
     return {str(place): one for place, one in enumerate(value)} if isinstance(value, list) else value
 
 

@@ -186,13 +186,13 @@ class OfKind:
     kinds
         The kinds.
     default
-        The kind if none is given; None if it is required.
+        The kind if none is given, or what tells it from the block; None if it is required.
     make
         Returns the block of a kind, if the kinds are not blocks themselves.
     """
 
     kinds: Kinds
-    default: str | None = None
+    default: str | Callable[[Mapping[str, Any]], str] | None = None
     make: Callable[[str], type[Settings]] | None = None
 
     def block(self, kind: str) -> Any:
@@ -205,7 +205,8 @@ class OfKind:
             return value
         if not isinstance(value, Mapping):
             raise PydanticCustomError("model_type", "expected a table, {{ key = value }}")
-        kind = value.get("kind", self.default)
+        usual = self.default(value) if callable(self.default) else self.default
+        kind = value.get("kind", usual)
         if kind is None:
             raise _mistake("missing", "missing", value)
         if not isinstance(kind, str):

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from forward.model import ModelError
-from forward.registry import Kinds
+from forward.registry import Kinds, OfKind
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings
 from forward.words import named
@@ -272,3 +272,15 @@ MODELS = Kinds(
     },
     ModelSpec,
 )
+
+
+def usual_kind(block: Mapping[str, Any]) -> str:
+    """Return the kind of a measured model whose block has none.
+
+    One that has outputs of its own, and no load cases, is a body; others are specimens.
+    """
+    return "hyperelastic" if "outputs" in block and "cases" not in block else "specimen"
+
+
+Measured = Annotated[ModelSpec, OfKind(MODELS, usual_kind)]
+"""A model that data are of: displacements of a specimen, or outputs of any other."""

@@ -206,7 +206,7 @@ STUDIES = Kinds(
         SAMPLING: "workflows.studies.sampling:Study",
         "select": "workflows.studies.selection:Comparison",
         "invert": "workflows.studies.inversion:InversionStudy",
-        "synthesize": "workflows.studies.synthesis:SynthesisStudy",
+        "synthesize": "workflows.studies.synthesis:Synthesis",
         "population": "workflows.studies.population:PopulationStudy",
         "design": "workflows.studies.design:DesignStudy",
         "reduce": "workflows.studies.reduction:ReductionStudy",

@@ -1,0 +1,198 @@
+"""Files of synthetic displacements of a specimen: tables, clouds of points, or surfaces, each with what is true."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from forward.bodies.geometry import AXES
+from forward.bodies.inclusions import log_factor
+from inverse.data.observations import kinds
+from workflows.studies.synthetic import OF_TRUTH, Synthetic, head
+from workflows.studies.synthetic_surfaces import facets_among, surfaces
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.fem.specimen import SpecimenModel
+    from forward.model import FloatArray
+    from forward.specimen import Specimen
+    from inverse.methods.synthesize import Synthesize
+    from uq.evaluation.ensemble import Ensemble
+    from uq.inputs.random_parameters import Inputs
+
+
+def displacements(
+    specimen: Specimen, method: Synthesize, inputs: Inputs, model: SpecimenModel, ensemble: Ensemble
+) -> Synthetic:
+    """Return what is measured of a specimen; collective over the group."""
+    places, points = model.space.coordinates, points_of(model)
+    if method.frame is not None:  # components along the axes of the scanner
+        along = method.motion.rotation.T[model.axes]
+        model = model.observing(model.places, model.axes.tolist(), model.cases.tolist(), along)
+    fields = np.ones((len(method.fraction), 1))
+    if specimen.fields and ensemble.index == 0:
+        drawn = model.space.factors(method.truths(inputs))
+        for one in (random for random in specimen.fields if random.of == "stiffness" and ensemble.group.rank == 0):
+            fields = fields * drawn[one.label]
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        """Add the true factor on the stiffness at each node, as rows x, y, z, factor."""
+        truths = found["truth"].to_numpy()
+        factor = fields * np.exp(log_factor(specimen.inclusions, inputs.names, truths, places))
+        table = np.concatenate([np.broadcast_to(places, (len(truths), *places.shape)), factor[:, :, None]], axis=2)
+        return found.assign(factor=(("data_set", "place", "axis"), table))
+
+    def files(name: str, found: xr.Dataset) -> dict[str, str]:
+        return synthetic_files(specimen, method, inputs, name, found, (points, model.cases, model.axes, model.places))
+
+    groups = np.where(points < 0, len(model.models) + kinds(model.cases, model.axes), model.cases)
+    return Synthetic(model, groups, points, labelled, files)
+
+
+def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
+    """An inclusion with changed numbers, by their paths."""
+    block: dict[str, Any] = inclusion.model_dump()
+    return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
+
+
+def points_of(model: SpecimenModel) -> NDArray[np.int64]:
+    """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases.
+
+    It is -1 of outputs that are measured at no point.
+    """
+    found, at = np.full(len(model.axes), -1), model.axes < len(AXES)
+    found[at] = np.unique(np.round(model.places[at], 12), axis=0, return_inverse=True)[1].ravel()
+    return found
+
+
+def synthetic_files(
+    specimen: Specimen, method: Synthesize, inputs: Inputs, name: str, found: xr.Dataset, model: Any
+) -> dict[str, str]:
+    """Return the texts of the files of synthetic data, by their names."""
+    texts = {}
+    points, cases, axes, places = model
+    rigid = method.motion
+    frame = (places - rigid.shift) @ rigid.rotation  # where the scanner sees them
+    count = found.sizes["data_set"]
+    scalars = {path: scalar.value for path, scalar in specimen.scalars.items()}
+    varies = [path for path in scalars if path.startswith(OF_TRUTH) or path in inputs.names]
+    for k in range(count):
+        one = found.isel(data_set=k)
+        truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
+        label = name if count == 1 else f"{name}-{k + 1}"
+        file = io.StringIO()
+        file.write(head(specimen, method))
+        file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
+        if specimen.inclusions and not specimen.fields:
+            inclusions = [_with_values(inclusion, truth) for inclusion in specimen.inclusions]
+            file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
+        if specimen.fields:
+            file.write(f"# truth.stiffness = truth/{label}.csv\n")
+            lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
+            texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
+        unit = method.metres
+        values, sigma = one["values"].values / unit, one["sigma"].values / unit
+        if method.format != "csv":
+            arrays = _arrays(specimen, method, values, sigma, (points, cases, axes))
+            truths = {path: truth[path] for path in varies}
+            texts |= _described(specimen, method, label, (places, frame / unit), arrays, truths)
+            continue
+        said = "" if method.units == "m" else f" [{method.units}]"
+        heads = [f"{head}{said}" for head in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
+        apart = points < 0  # outputs of load cases, in units of their own
+        more = ["output", "value", "sigma_value"] if apart.any() else []
+        file.write(",".join([*heads, "case", *more] if not apart.all() else ["case", *more]) + "\n")
+        for case, case_name in enumerate(c.name for c in specimen.cases):
+            for point in np.unique(points[(cases == case) & (points >= 0)]):
+                rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
+                if len(rows) == 0:
+                    continue
+                motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
+                where = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
+                cells = ",".join(motion.get(axis, "") for axis in range(3))
+                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}{',' * len(more)}\n")
+            names = tuple(output.name for output in specimen.cases[case].outputs)
+            for row in np.flatnonzero((cases == case) & apart):
+                output, empty = names[axes[row] - len(AXES)], "" if apart.all() else "," * len(heads)
+                value, error = (float(one[key].values[row]) for key in ("values", "sigma"))
+                file.write(f"{empty}{case_name},{output},{value:.8g},{error:.4e}\n")
+        texts[f"{label}.csv"] = file.getvalue()
+    return texts
+
+
+def _described(
+    specimen: Specimen,
+    method: Synthesize,
+    label: str,
+    where: tuple[FloatArray, FloatArray],
+    arrays: dict[str, NDArray[Any]],
+    truth: Mapping[str, float],
+) -> dict[str, str]:
+    """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are.
+
+    Parameters
+    ----------
+    label
+        With which names begin.
+    where
+        Places (m, 3) of all outputs on the body (m), and in the unit and the frame of the files.
+    arrays
+        As of `_arrays`, in the unit of the files.
+    truth
+        What is known, by path.
+    """
+    number = arrays.pop("number")
+    on_body, places = (one[number] for one in where)
+    if method.format == "stl":
+        motions = {case.name: arrays[f"displacement_{case.name}"] for case in specimen.cases}
+        more = {"units": method.units, "sigma": method.noise.absolute, "truth": truth}
+        return surfaces(label, places, motions, facets_among(specimen.body, on_body), more)
+    file = f"{label}.{method.format}"
+    said = tomli_w.dumps({"file": file, "units": method.units, "truth": truth})
+    return {file: _cloud(places, arrays, method.format), f"{label}.toml": said}
+
+
+def _arrays(
+    specimen: Specimen, method: Synthesize, values: FloatArray, sigma: FloatArray, where: tuple[NDArray[np.int64], ...]
+) -> dict[str, NDArray[Any]]:
+    """Return displacements of each load case at the points of a cloud, their errors, and `number`, a row of each."""
+    points, cases, axes = where
+    measured = np.unique(points[np.isfinite(values)])
+    number = np.array([np.flatnonzero(points == point)[0] for point in measured])
+    found: dict[str, NDArray[Any]] = {"number": number}
+    for case, name in enumerate(one.name for one in specimen.cases):
+        rows = np.flatnonzero((cases == case) & np.isin(points, measured))
+        motion, errors = np.full((len(measured), 3), np.nan), np.full(len(measured), np.nan)
+        at = np.searchsorted(measured, points[rows])
+        motion[at, axes[rows]] = values[rows]
+        errors[at] = sigma[rows]
+        if method.format == "ply":
+            found |= {f"u{axis}_{name}": motion[:, k] for k, axis in enumerate("xyz")} | {f"sigma_{name}": errors}
+        else:
+            found |= {f"displacement_{name}": motion, f"sigma_{name}": errors}
+    return found
+
+
+def _cloud(places: FloatArray, arrays: Mapping[str, NDArray[Any]], form: str) -> str:
+    """Return the text of a file with points (n, 3) and arrays at them."""
+    import meshio
+
+    mesh = meshio.Mesh(places, [("vertex", np.arange(len(places))[:, None])], point_data=dict(arrays))
+    if form == "ply":
+        mesh.cells = []
+    how: dict[str, Any] = {"data_format": "XML"} if form == "xdmf" else {"binary": False}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"cloud.{form}"
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # that text takes more room
+            meshio.write(path, mesh, **how)
+        return path.read_text(encoding="utf-8")
