@@ -25,7 +25,7 @@ from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load
-from workflows.studies.output_inversion import OutputInversion
+from workflows.studies.inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,15 +43,15 @@ TRUTH, LEVELS = (450.0, 350.0), (0.01, 0.03, 0.1)
 FILE = Path("results/calibration-forces.csv")
 
 
-def study(changes: list[str]) -> OutputInversion:
+def study(changes: list[str]) -> Inversion:
     """Return the shipped study with changes, and data that are never used."""
     given = [change.replace("LOAD", LOAD) for change in changes]
     found = load(STUDY, [*given, 'data={ outputs = { "force.1" = 1e-3 }, noise = { relative = 0.03 } }'])
-    assert isinstance(found, OutputInversion)
+    assert isinstance(found, Inversion)
     return found
 
 
-def expanded() -> tuple[OutputInversion, SharedExpansion, SharedExpansion]:
+def expanded() -> tuple[Inversion, SharedExpansion, SharedExpansion]:
     """Return the study, the expansions that all specimens share, and that of the other mesh."""
     own, other = study(OWN), study(OTHER)
     names = own.inputs.names

@@ -31,7 +31,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from workflows.config.study import load
 from workflows.studies.finer import solved_on
-from workflows.studies.specimen_inversion import Inversion
+from workflows.studies.inversion import Inversion
 
 OWN, OTHER = (CONFIG.parent / f"{name}.toml" for name in ("palpation", "synthesize-palpation"))
 NOISE, SEED, FEW = 0.03, 23, 16

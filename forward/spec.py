@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from forward.model import ModelError
 from forward.registry import Kinds, OfKind
@@ -282,5 +282,5 @@ def usual_kind(block: Mapping[str, Any]) -> str:
     return "hyperelastic" if "outputs" in block and "cases" not in block else "specimen"
 
 
-Measured = Annotated[ModelSpec, OfKind(MODELS, usual_kind)]
-"""A model that data are of: displacements of a specimen, or outputs of any other."""
+MEASURED = OfKind(MODELS, usual_kind)
+"""Of a field that holds a model that data are of: displacements of a specimen, or outputs of any other."""

@@ -57,6 +57,11 @@ class OutputData:
     outputs: tuple[str, ...] = ()
     parts: tuple[str, ...] = ()
 
+    @property
+    def data(self) -> OutputData:
+        """Itself: what is compared with a model."""
+        return self
+
     def of(self, outputs: Sequence[str], parts: Sequence[str]) -> OutputData:
         """Return the same as data of a model with these outputs."""
         return replace(self, outputs=tuple(outputs), parts=tuple(parts))

@@ -14,7 +14,6 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.scalars import Mistake
 from forward.settings import UNKNOWN_KIND, cut, nearest, one_line, shown
 from uq.inputs.distributions import Distribution
-from workflows.studies.study import SAMPLING, STUDIES
 
 LISTED = 50  # mistakes that are shown
 
@@ -50,7 +49,6 @@ def not_installed(key: str, given: str, packages: Sequence[str]) -> Iterator[Mis
             yield ("method", key), f"needs {package}, which is not installed: pip install {package}", given
 
 
-_APART = [kind for kind in STUDIES.own if kind != SAMPLING]  # kinds of studies whose files have other blocks
 # What pydantic adds to the locations of mistakes besides keys: the members of a union, in TOML's words.
 _MEMBERS = {
     "str": "a text",
@@ -67,8 +65,11 @@ _INNER = re.compile(
 )
 
 
-def lines(error: ValidationError, place: str = "") -> list[str]:
-    """Say the mistakes of a block at a place: where, what was given, what was expected."""
+def lines(error: ValidationError, place: str = "", apart: Sequence[str] = ()) -> list[str]:
+    """Say the mistakes of a block at a place: where, what was given, what was expected.
+
+    Kinds of studies whose files have other blocks, `apart`, may be meant where a kind of method is not known.
+    """
     items = error.errors(include_url=False)
     members: dict[str, list[str]] = {}  # what would have been right, by where
     deeper = set[str]()
@@ -81,7 +82,7 @@ def lines(error: ValidationError, place: str = "") -> list[str]:
     for item in items:
         where, member, rest = _around_member(item["loc"], place)
         if member is None or rest:
-            found.append(_line(item, _place(item["loc"], place)))
+            found.append(_line(item, _place(item["loc"], place), apart))
         elif where not in deeper:
             words = list(dict.fromkeys(members[where]))
             found.append(f"{where}: expected {' or '.join(words)}; given {shown(item['input'])}")
@@ -108,7 +109,7 @@ def _place(steps: Sequence[str | int], place: str) -> str:
     return place
 
 
-def _line(item: Any, place: str) -> str:
+def _line(item: Any, place: str, apart: Sequence[str]) -> str:
     message, given = item["msg"], item["input"]
     elsewhere = _ELSEWHERE.get(place.rpartition(".")[2])
     if item["type"] == "unknown_key" and elsewhere is not None and elsewhere != place:
@@ -116,7 +117,7 @@ def _line(item: Any, place: str) -> str:
     if item["type"] in {"missing", "unknown_key"}:
         return f"{place}: {message}"
     if item["type"] == UNKNOWN_KIND and place == "method.kind" and "." not in given:
-        message = f"unknown kind; {nearest(given, [*item['ctx']['known'], *_APART])}"
+        message = f"unknown kind; {nearest(given, [*item['ctx']['known'], *apart])}"
     message = f"{place}: {message[:1].lower()}{message[1:]}"
     if isinstance(given, Mapping) and not message.endswith(
         ("a table, { key = value }", "a word")

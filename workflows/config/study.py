@@ -67,7 +67,8 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         another = isinstance(kind, str) and kind not in METHODS.own and kind in STUDIES
         found: StudyKind = STUDIES[str(kind) if another else SAMPLING].made(blocks, folder)
     except ValidationError as error:
-        raise StudyError(*lines(error)) from None
+        apart = [kind for kind in STUDIES.own if kind != SAMPLING]
+        raise StudyError(*lines(error, apart=apart)) from None
     return found
 
 

@@ -19,8 +19,8 @@ from inverse.designs.fields import of_field
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.kept import KeptModel
 from workflows.studies.design_values import of_outputs
+from workflows.studies.inversion_plan import derivable
 from workflows.studies.job import MethodJob, TasksJob
-from workflows.studies.output_inversion import derivable
 from workflows.studies.predictions import has_mesh
 
 if TYPE_CHECKING:

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
     from inverse.criticism.doubts import Doubt
     from uq.inputs.distributions import Distribution
-    from workflows.studies.inversion import InversionStudy
+    from workflows.studies.inversion import Inversion
 
 NEITHER, DOUBTFUL = 2, 3  # values of `trust`, see docs/results.md
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
 
-def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
+def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
     """Look for everything that makes the posteriors of an inversion doubtful; return the results with verdicts."""
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
@@ -69,7 +69,7 @@ def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Doubt]:
     return reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
 
 
-def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
+def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
     """Say what is doubtful about one data set, given by its number."""
     from inverse.criticism import doubts as criticism
     from uq.inputs.distributions import Normal
@@ -97,7 +97,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         found += criticism.too_large_errors(
             *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
         )
-    labels = study.labels(number)
+    labels = study.measurements[number].data_labels()
     found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
     if "points_moved" in one and int(one["points_moved"]):
         count, farthest, rms = int(one["points_moved"]), float(one["largest_move"]), float(one["rms_move"])
@@ -122,7 +122,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     return found + _of_mesh(one, study, number)
 
 
-def _of_mesh(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
+def _of_mesh(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
     """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
     from inverse.criticism import doubts_of_meshes as of_meshes
 

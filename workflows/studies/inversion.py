@@ -1,35 +1,41 @@
-"""What inversions have in common, whatever was measured: displacements of a specimen, or outputs of any model."""
+"""Studies that infer what is unknown of a model from data: displacements of a specimen, or outputs of any model."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from forward.bodies.inclusions import log_factor
 from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake
-from forward.settings import nearest
+from forward.settings import Settings, nearest
+from forward.spec import MEASURED, usual_kind
+from forward.specimen import Specimen
 from inverse.criticism.assessment import NEEDED
-from inverse.data.files import distinct, files
-from inverse.data.table import DataError
-from inverse.methods.invert import Invert, names_of
+from inverse.methods.invert import ByReduced, Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import StudyError, not_installed, refused
+from workflows.config.mistakes import not_installed, refused
 from workflows.config.predict import Predict
-from workflows.config.priors import mistakes_of_factor, mistakes_of_priors
+from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_priors, ranges
 from workflows.config.report import Report
-from workflows.studies.measured import DataSet, digest_of
-from workflows.studies.predictions import has_mesh, meshes_of
-from workflows.studies.study import StudyKind, measures_outputs
+from workflows.studies.measured import DataFiles
+from workflows.studies.measured_outputs import MeasuredOutputs
+from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
+from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
+    from forward.hyperelastic import Hyperelastic
+    from forward.model import FloatArray
+    from forward.reduced.spec import Reduced
     from forward.spec import ModelSpec
     from inverse.methods.record import Data
     from uq.evaluation.checkpoint import Checkpoint
@@ -37,18 +43,51 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 SOLVES_OF_FIELD = 12  # for a mode
-OF_SPECIMEN = "workflows.studies.specimen_inversion:Inversion"
-OF_OUTPUTS = "workflows.studies.output_inversion:OutputInversion"
 PREDICTED = "predicted"  # name of the solves for what is predicted
+SPECIMEN = "specimen"
+OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
-class InversionStudy(StudyKind):
-    """What inversions of all kinds of models have in common; each kind says what its blocks mean."""
+@dataclass(frozen=True)
+class _Given:
+    """What stands in a study as data, and the block that it is of."""
 
-    model: Any
+    block: type[Settings]
+    table: Any
+
+
+def _as_block(given: Any) -> Any:
+    return given.block.model_validate(given.table) if isinstance(given, _Given) else given
+
+
+class Inversion(StudyKind):
+    """What to invert: displacements of a specimen, or outputs of any other model.
+
+    Parameters
+    ----------
+    model
+        The specimen (body, material, inclusions or a field, load cases), or a model with outputs, of which some were
+        measured.
+    parameters
+        Priors by the paths of the unknown numbers of the model; none for a field of nodal values.
+    correlations
+        Correlations between them.
+    data
+        What was measured.
+    method
+        How it is inverted.
+    parallel
+        Use of ranks.
+    report
+        Your own sections of the report.
+    predict
+        What else is to be known by the posterior; by default nothing.
+    """
+
+    model: Annotated[Any, MEASURED]
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
-    data: Any
+    data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(_as_block)]
     method: Invert = Invert()
     parallel: Parallel = Parallel()
     report: Report | None = None
@@ -56,7 +95,6 @@ class InversionStudy(StudyKind):
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     stopped: ClassVar[str] = "all data sets inverted"
-    quantity: ClassVar[str]  # what was measured
 
     def __eq__(self, other: object) -> bool:
         """Whether the same is asked of the same files."""
@@ -64,10 +102,23 @@ class InversionStudy(StudyKind):
 
     __hash__ = None  # type: ignore[assignment]
 
+    # --- the model ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        found: ModelSpec = self.model.over(ranges(self.parameters))
+        return found
+
+    @property
+    def specimen(self) -> Specimen | None:
+        """The model, if it is a specimen, of which displacements were measured."""
+        return self.spec if isinstance(self.spec, Specimen) else None
+
     @property
     def field(self) -> bool:
         """Whether values of a field at the vertices are what is unknown."""
-        return False
+        return self.specimen is not None and any(field.basis == "nodes" for field in self.model.fields)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -78,23 +129,110 @@ class InversionStudy(StudyKind):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters in results."""
+        """Names of the parameters in results; for a field, its mean."""
+        if self.field:
+            label = f"fields.{self.model.fields[0].label}.mean"
+            return names_of(Inputs({label: Normal(mean=0.0, std=1.0)}), self.method)
         return names_of(self.inputs, self.method)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings about the model before anything is solved."""
-        raise NotImplementedError
+    def sampled(self) -> Sampled | None:
+        """A model with outputs, with its priors."""
+        return None if self.specimen is not None else Sampled(self.inputs, self.spec)
+
+    @property
+    def meshes(self) -> tuple[ModelSpec, ...]:
+        """The model: there are no others."""
+        return (self.spec,)
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model, what is predicted, and the model on the finer meshes that it is looked at on."""
+        spec, beside = self.spec, () if self.predict is None else (self.predicted,)
+        looked = has_mesh(spec) and self.method.treatment is not None
+        try:
+            return spec, *beside, *(meshes_of(spec) if looked else ())
+        except ValueError:  # there are none, which is said elsewhere
+            return spec, *beside
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the model."""
+        found: tuple[str, ...] = self.model.modules
+        return found if self.predict is None else tuple(dict.fromkeys((*found, *self.predicted.modules)))
+
+    @cached_property
+    def predicted(self) -> ModelSpec:
+        """The model of what is predicted."""
+        found: ModelSpec = named("workflows.studies.predicted:spec")(self)
+        return found
+
+    @cached_property
+    def reduced(self) -> dict[str, Reduced]:
+        """The reduced models that stand for the load cases of a specimen, by name, or for the model, as "".
+
+        None where the model is asked itself.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If a file cannot be used.
+        """
+        asked = self.method.reduced
+        if asked is None:
+            return {}
+        made: Any = named("forward.reduced.spec:Reduced")
+        if not isinstance(asked.file, dict):
+            return {"": made(file=asked.file, digest=asked.digest)}
+        digests = asked.digest if isinstance(asked.digest, dict) else {}
+        return {name: made(file=asked.file[name], digest=digests.get(name)) for name in self.parts}
+
+    def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
+        return log_factor(self.model.inclusions, self.inputs.names, points, places)
+
+    # --- the data ----------------------------------------------------------------------------------------------------
 
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts of the data (load cases, outputs) for which results of each alone are given."""
-        raise NotImplementedError
+        if self.specimen is not None:
+            return tuple(case.name for case in self.model.cases)
+        return next((found.parts for found in self.measurements if found is not None), ())
+
+    def measured(self, number: int) -> Data:
+        """Return a data set that can be used."""
+        found: Data = self.measurements[number].data
+        return found
+
+    def not_estimable(self, number: int) -> tuple[str, ...]:
+        """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
+        return () if self.specimen is not None else never_estimable(self.model, self.measurements[number].names)
+
+    @property
+    def recorded(self) -> bool:
+        """As in every study: its data sets are named, and not read."""
+        return bool(self.data.sets) and not self.measurements
+
+    def with_data(self, folder: Path) -> Self:
+        """Return the same with its data read; a StudyError if no file can be used."""
+        if self.data.sets:
+            return self
+        sets, found = self.data.read(folder, self.model)
+        return self.model_copy(update={"data": self.data.model_copy(update={"sets": sets}), "measurements": found})
+
+    # --- what is done ------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Inversion:
+        """Check the blocks of an inversion, and read its data."""
+        return cls.model_validate(blocks).with_data(folder)
 
     @property
     def together(self) -> bool:
         """Whether all groups of ranks work on one data set, point by point."""
-        return len(self.data.sets) == 1 and self.parallel.ranks_per_model == 1 and self.method.expansion is None
+        alone = self.specimen is None or not self.model.fields
+        return alone and len(self.data.sets) == 1 == self.parallel.ranks_per_model and self.method.expansion is None
 
     @property
     def planned(self) -> int:
@@ -115,38 +253,10 @@ class InversionStudy(StudyKind):
         count = sum(measurement is not None for measurement in self.measurements)
         return (each + more) * count + more
 
-    @cached_property
-    def predicted(self) -> ModelSpec:
-        """The model of what is predicted."""
-        found: ModelSpec = named("workflows.studies.predicted:spec")(self)
+    def plan(self, rank_groups: int) -> list[str]:
+        """Say what is inverted, and how long that will take."""
+        found: list[str] = named("workflows.studies.inversion_plan:plan")(self)
         return found
-
-    @classmethod
-    def forms(cls) -> Iterator[type[StudyKind]]:
-        """Inversions of displacements, and of outputs."""
-        yield named(OF_SPECIMEN)
-        yield named(OF_OUTPUTS)
-
-    @classmethod
-    def made(cls, blocks: Mapping[str, Any], folder: Path) -> InversionStudy:
-        """Check the blocks of an inversion of displacements of a specimen, or of outputs of any model."""
-        kind: type[InversionStudy] = named(OF_OUTPUTS if measures_outputs(blocks.get("model")) else OF_SPECIMEN)
-        return kind.model_validate(blocks).with_data(folder)
-
-    def _with_finer(self, spec: Any) -> tuple[ModelSpec, ...]:
-        """A model, and the same on the finer meshes that it is looked at on."""
-        looked = has_mesh(spec) and self.method.treatment is not None
-        beside = () if self.predict is None else (self.predicted,)
-        try:
-            return spec, *beside, *(meshes_of(spec) if looked else ())
-        except ValueError:  # there are none, which is said elsewhere
-            return spec, *beside
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model."""
-        found: tuple[str, ...] = self.model.modules
-        return found if self.predict is None else tuple(dict.fromkeys((*found, *self.predicted.modules)))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and what is done for each data set; collective."""
@@ -167,60 +277,52 @@ class InversionStudy(StudyKind):
             found["method"] = found["method"] | {"reduced": {**found["method"]["reduced"], "file": ""}}
         return found
 
-    def measured(self, number: int) -> Data:
-        """Return a data set that can be used."""
-        raise NotImplementedError
-
-    def labels(self, number: int) -> list[str]:
-        """Say of each datum of a data set where it stands."""
-        raise NotImplementedError
-
-    def not_estimable(self, number: int) -> tuple[str, ...]:
-        """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
-        return ()
-
-    def read(self, path: Path) -> Any:
-        """Read a file of data.
-
-        Raises
-        ------
-        DataError
-            With every kind of mistake in the file.
-        """
-        raise NotImplementedError
+    # --- what is said ------------------------------------------------------------------------------------------------
 
     @property
-    def recorded(self) -> bool:
-        """As in every study: its data sets are named, and not read."""
-        return bool(self.data.sets) and not self.measurements
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about the model before anything is solved."""
+        reach = ranges(self.parameters)
+        found = (*self.model.findings_over(reach), *findings_of_materials(self.inputs))
+        if self.specimen is not None:
+            return *found, *self._ratios_alone()
+        return *found, *(said for one in self.reduced.values() for said in one.outside(reach))
 
-    def with_data(self, folder: Path) -> Self:
-        """Return the same with its files read.
+    def _ratios_alone(self) -> Iterator[Finding]:
+        """Find that no force acts or is measured: then displacements do not change if all stiffnesses are doubled."""
+        pressed = any(not load.contact for case in self.model.cases for load in case.loads)
+        units = self.model.measurable
+        seen = [found.observations.readings for found in self.measurements if found is not None]
+        names = {(self.parts[case], name) for one in seen for case, name in zip(one.case, one.names, strict=True)}
+        if pressed or any(units[case][name] not in OF_GEOMETRY for case, name in names):
+            return
+        moduli = [
+            path
+            for path, number in self.model.scalars.items()
+            if number.unit == "Pa" and path.startswith(("material.", "regions."))
+        ]
+        unknown = [path for path in moduli if path in self.parameters]
+        fields = [field.label for field in self.model.fields if field.of == "stiffness"]
+        known = [path for path in moduli if path not in self.parameters]
+        if not unknown and not fields:
+            return
+        sought = ", ".join([*unknown, *(f"the mean of the field '{label}'" for label in fields)])
+        source = f"{', '.join(known)} as stated" if known and not fields else "the prior alone"
+        yield Finding(
+            "warning",
+            "No force acts on the specimen or is among the data, so displacements tell ratios of stiffnesses only: "
+            f"the absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case).",
+        )
 
-        Raises
-        ------
-        StudyError
-            If no file can be used.
-        """
-        if self.data.sets:
-            return self
-        try:
-            paths = files(self.data.files, [folder, Path()])
-        except DataError as error:
-            raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
-        sets, found, lines = [], [], []
-        for path, name in zip(paths, distinct(paths), strict=True):
-            try:
-                measurement, wrong = self.read(path), ""
-            except DataError as error:
-                measurement, wrong = None, "; ".join(error.args)
-                lines += [f"data: {line}" for line in error.args]
-            sets.append(DataSet(name=name, file=path.name, digest=digest_of(path), refused=wrong))
-            found.append(measurement)
-        if all(measurement is None for measurement in found):
-            raise StudyError(*lines)
-        data = self.data.model_copy(update={"sets": tuple(sets)})
-        return self.model_copy(update={"data": data, "measurements": tuple(found)})
+    @model_validator(mode="before")
+    @classmethod
+    def _data_of_model(cls, blocks: Any) -> Any:
+        """Choose the block of the data by the model."""
+        if not isinstance(blocks, Mapping) or "data" not in blocks or isinstance(blocks["data"], Settings | _Given):
+            return blocks
+        model = blocks.get("model")
+        kind = model.get("kind", usual_kind(model)) if isinstance(model, Mapping) else getattr(model, "kind", SPECIMEN)
+        return {**blocks, "data": _Given(DataFiles if kind == SPECIMEN else MeasuredOutputs, blocks["data"])}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -228,7 +330,11 @@ class InversionStudy(StudyKind):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        """Find mistakes common to all inversions."""
+        if self.specimen is not None:
+            yield from self._of_specimen(self.specimen)
+        else:
+            yield from self._of_outputs()
+            yield from cast("MeasuredOutputs", self.data).mistakes(self.model)
         if self.method.chains is not None:
             yield from not_installed("chains", self.method.chains, NEEDED[self.method.chains])
         if self.method.chains == "hmc" and self.method.reduced is not None:
@@ -242,3 +348,83 @@ class InversionStudy(StudyKind):
                 yield ("data", "truth", name), message, value
         if self.predict is not None:
             yield from named("workflows.studies.predicted:mistakes")(self)
+
+    def _of_specimen(self, specimen: Specimen) -> Iterator[Mistake]:
+        """Find mistakes of the inversion of displacements."""
+        nodal = [i for i, field in enumerate(self.model.fields) if field.basis == "nodes"]
+        if nodal and (len(self.model.fields) > 1 or self.parameters):
+            message = "a field of nodal values is inverted alone, expected no other fields and no parameters"
+            yield ("model", "fields", nodal[0], "basis"), message, "nodes"
+        if nodal and self.model.fields[nodal[0]].of != "stiffness":
+            yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
+        if nodal and self.method.chains in {"emcee", "hmc"}:
+            yield ("method", "chains"), "expected 'pcn', the chains for fields", self.method.chains
+        if nodal and self.method.noise is not None and self.data.errors.kind != "normal":
+            message = "the size of such errors is not inferred with a field, expected { kind = 'normal' } or no noise"
+            yield ("data", "errors"), message, self.data.errors.kind
+        if not self.parameters and not self.model.fields:
+            yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
+        if self.method.expansion is not None:
+            message = "data sets of a specimen are observed at places of their own, expected outputs of another model"
+            yield ("method", "expansion"), message, self.method.expansion
+        if self.method.reduced is not None:
+            yield from self._of_reduced_cases(self.method.reduced, specimen)
+
+    def _of_outputs(self) -> Iterator[Mistake]:
+        """Find mistakes of the inversion of outputs."""
+        yield from self.model.mistakes_of_mesh()
+        for i, field in enumerate(getattr(self.spec, "fields", ())):
+            if field.basis == "nodes":
+                message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
+            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        if self.method.reduced is not None:
+            yield from self._of_reduced(self.method.reduced)
+        if not self.parameters and not self.model.coefficients:
+            yield ("parameters",), "nothing is unknown, expected at least one prior", {}
+
+    def _of_reduced_cases(self, given: ByReduced, specimen: Specimen) -> Iterator[Mistake]:
+        if self.field:
+            message = "a field of nodal values has no reduced model, expected few parameters, or the modes of a field"
+            yield ("method", "reduced"), message, given.files
+            return
+        if not isinstance(given.file, dict) or set(given.file) != set(self.parts):
+            example = ", ".join(f'{name} = "FILE"' for name in self.parts)
+            message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
+            yield ("method", "reduced", "file"), message, given.file
+            return
+        try:
+            found = self.reduced
+        except ValidationError as error:
+            yield ("method", "reduced"), str(error.errors()[0]["msg"]), given.files
+            return
+        object.__setattr__(given, "digest", {name: one.digest for name, one in found.items()})
+        unknown = (*self.parameters, *self.model.coefficients)
+        for case in specimen.cases:
+            body = specimen.loaded(case)
+            known = {*body.scalars, *body.coefficients}
+            for said in found[case.name].differences(body, [path for path in unknown if path in known]):
+                yield ("method", "reduced", "file", case.name), said, given.file[case.name]
+
+    def _of_reduced(self, reduced: ByReduced) -> Iterator[Mistake]:
+        if self.method.expansion is not None:
+            message = "stands for the body in place of a reduced model, expected one of both"
+            yield ("method", "expansion"), message, self.method.expansion
+        if not isinstance(reduced.file, str):
+            yield ("method", "reduced", "file"), "a body has one reduced model, expected a file", reduced.files
+            return
+        if self.model.kind != "hyperelastic":
+            message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
+            yield ("method", "reduced"), message, reduced.file
+            return
+        unknown = (*self.parameters, *self.model.coefficients)
+        try:
+            found = self.reduced[""]
+        except ValidationError as error:
+            yield ("method", "reduced"), str(error.errors()[0]["msg"]), reduced.file
+            return
+        object.__setattr__(reduced, "digest", found.digest)
+        for said in found.differences(cast("Hyperelastic", self.spec), unknown):
+            yield ("method", "reduced"), said, reduced.file

@@ -25,12 +25,11 @@ from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.findings_solves import of_answers
 from workflows.studies.finer import FINER, finer_meshes, solved_by
-from workflows.studies.inversion import PREDICTED, InversionStudy
+from workflows.studies.inversion import PREDICTED, Inversion
+from workflows.studies.inversion_plan import derivable
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
-from workflows.studies.output_inversion import OutputInversion, derivable
 from workflows.studies.predictions import has_mesh
-from workflows.studies.specimen_inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
+    from forward.specimen import Specimen
     from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import Shared, SharedMotion
     from inverse.methods.predict import Band
@@ -51,13 +51,11 @@ BY_REDUCED = "an inversion of the body itself with method.reduced corrects that,
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
-def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
+def job(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
-    if isinstance(study, OutputInversion):
-        made: _Made = _Outputs.of(study, ensemble)
-    else:
-        assert isinstance(study, Inversion)
-        made = _Specimen.of(study, ensemble)
+    made: _Made = (
+        _Outputs.of(study, ensemble) if study.specimen is None else _Specimen.of(study, study.specimen, ensemble)
+    )
     derivable(made.model, study.model.kind)
     return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
@@ -105,14 +103,14 @@ class _Made(Protocol):
 class _Outputs:
     """A model with outputs."""
 
-    study: OutputInversion
+    study: Inversion
     model: ForwardModel
     there: There
     vertices: None = None
     look: None = None
 
     @classmethod
-    def of(cls, study: OutputInversion, ensemble: Ensemble) -> _Outputs:
+    def of(cls, study: Inversion, ensemble: Ensemble) -> _Outputs:
         model = study.spec.build(ensemble.group, study.inputs.names)
         if not has_mesh(study.spec):
             hidden = study.spec.hidden
@@ -145,9 +143,9 @@ class _Specimen:
     why: str
 
     @classmethod
-    def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
+    def of(cls, study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Specimen:
         names = study.model.coefficients if study.field else study.inputs.names
-        model: SpecimenModel = study.specimen.build(ensemble.group, names)
+        model: SpecimenModel = spec.build(ensemble.group, names)
         vertices = (model.vertices.coordinates, *model.vertices.cells())
 
         def look(points: FloatArray) -> FloatArray:
@@ -158,30 +156,30 @@ class _Specimen:
 
     def observing(self, number: int) -> SpecimenModel:
         """Return the model of the displacements of a data set; errors as for every model."""
-        data = self.study.measured(number)
+        data = self.study.measurements[number].data
         try:
-            return self.model.observing(data.places, data.axes, data.cases, data.along)  # type: ignore[arg-type]
+            return self.model.observing(data.places, data.axes, data.cases, data.along)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
 
     def shared(self, number: int) -> tuple[SharedMotion, ForwardModel] | None:
         """Return the uncertain motions of a data set, and the model that tells what they do; None if nothing is."""
-        found = self.study.motion(number)
-        return None if found is None else (found, self.model.observing(*found.observed))  # type: ignore[arg-type]
+        found = self.study.measurements[number].motion(self.study.model.body)
+        return None if found is None else (found, self.model.observing(*found.observed))
 
     def finer(self, observed: ForwardModel) -> There:
         """Return the model of what is observed on finer meshes."""
         return None if self.meshes is None else self.meshes.observing(cast("SpecimenModel", observed)), self.why
 
 
-def _meshes(study: InversionStudy, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked
     return finer_meshes(model, start)
 
 
-def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset:
+def _judged(study: Inversion, made: _Made, found: xr.Dataset) -> xr.Dataset:
     """Add what is to be said of the results; on rank 0."""
     found = judged(found, study)
     if isinstance(made, _Outputs) and not has_mesh(study.model):
@@ -189,7 +187,7 @@ def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset
     return found
 
 
-def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
+def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
     method, errors = study.method, study.data.errors
     names = [one.name for one in study.data.sets]
@@ -267,7 +265,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
 
 
 def _expanded(
-    study: InversionStudy, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint
+    study: Inversion, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint
 ) -> tuple[SharedExpansion, list[Evaluations]]:
     """Solve for the expansion that all data sets share; every group does so, or reads what others have solved."""
 
@@ -282,7 +280,7 @@ def _expanded(
     return shared_expansion(study.inputs, own, fine, samples, why), own.log
 
 
-def _by_expansion(study: InversionStudy, found: SharedExpansion, number: int, say: Callable[[str], None]) -> xr.Dataset:
+def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Callable[[str], None]) -> xr.Dataset:
     """Invert a data set with the expansion, whose errors are among those of the data."""
     data = cast("OutputData", study.measured(number))
     missed = found.error[list(data.which)]
@@ -294,7 +292,7 @@ def _by_expansion(study: InversionStudy, found: SharedExpansion, number: int, sa
 
 
 def _inverting_field(
-    study: InversionStudy, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
+    study: Inversion, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
 ) -> _InvertField:
     """Return what inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
@@ -319,7 +317,7 @@ def _inverting_field(
 
 
 def _predicting(
-    study: InversionStudy, ensemble: Ensemble, beside: Callable[[str, ForwardModel], Evaluate]
+    study: Inversion, ensemble: Ensemble, beside: Callable[[str, ForwardModel], Evaluate]
 ) -> Callable[[str, xr.Dataset], Record]:
     """Return what predicts from the name of a data set and its results."""
     model: ForwardModel = named("workflows.studies.predicted:build")(study, ensemble)
@@ -355,21 +353,19 @@ def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | No
     return Finer(None, why) if model is None else solved(model)
 
 
-def _reduced(study: InversionStudy) -> Callable[[ForwardModel], ForwardModel] | None:
+def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
     """Load what stands for a model with which data are compared; None where that is asked itself.
 
     What it returns is collective over the ranks of that model.
     """
     if study.method.reduced is None:
         return None
-    if isinstance(study, OutputInversion):
-        assert study.reduced is not None
-        alone: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
+    if study.specimen is None:
+        alone: ForwardModel = study.reduced[""].standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
         return lambda observed: alone
-    assert isinstance(study, Inversion)
     bodies = [study.specimen.loaded(case) for case in study.specimen.cases]
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
-    found = zip(study.reduced, bodies, acting, strict=True)
+    found = zip(study.reduced.values(), bodies, acting, strict=True)
     models = tuple(one.standing_for(body, paths) for one, body, paths in found)
     specimen = named("forward.reduced.specimen:ReducedSpecimen")
     return lambda observed: cast("ForwardModel", specimen.of(observed, models))
@@ -388,7 +384,7 @@ def _alone(shared: Shared | None) -> None:
         raise SolveError(message)
 
 
-def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
+def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     say = ensemble.say
     observed, data = made.observing(0), study.measured(0)

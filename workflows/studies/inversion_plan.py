@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.fem.cost import REPORT, START
+from forward.model import ModelError
 from forward.readable import told
 from inverse.criticism.assessment import own_seconds
 from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
-    from workflows.studies.inversion import InversionStudy
+    from forward.model import ForwardModel
+    from forward.specimen import Specimen
+    from workflows.studies.inversion import Inversion
     from workflows.studies.measured import Measurement
-    from workflows.studies.output_inversion import OutputInversion
-    from workflows.studies.specimen_inversion import Inversion
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
 LISTED = 8  # outputs that are named
@@ -25,9 +26,13 @@ PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from 
 
 def plan(study: Inversion) -> list[str]:
     """Say what is inverted, and how long that will take."""
+    return _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
+
+
+def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
     from workflows.studies.inversion import SOLVES_OF_FIELD
 
-    spec, sets = study.specimen, study.data.sets
+    sets = study.data.sets
     usable = [m for m in study.measurements if m is not None]
     counts = [int(m.observations.measured.sum()) + len(m.observations.readings) for m in usable]
     moved = [int((m.moved > 0).sum()) for m in usable]
@@ -61,7 +66,7 @@ def plan(study: Inversion) -> list[str]:
     ]
 
 
-def _predicted(study: InversionStudy) -> list[str]:
+def _predicted(study: Inversion) -> list[str]:
     """Say what is predicted, and by how many solves."""
     if study.predict is None:
         return []
@@ -71,7 +76,7 @@ def _predicted(study: InversionStudy) -> list[str]:
     return [f"predicts    {', '.join(names[:LISTED])}{more}, by {solves} solves, and as many of the prior"]
 
 
-def _seconds_of_predictions(study: InversionStudy) -> float:
+def _seconds_of_predictions(study: Inversion) -> float:
     """Predict the processor time (s) of what is predicted."""
     cost = None if study.predict is None else study.predicted.cost()
     if cost is None or study.predict is None:
@@ -80,7 +85,7 @@ def _seconds_of_predictions(study: InversionStudy) -> float:
     return 2 * (cost.textbook + study.predict.solves(field=study.field) * (cost.sample + own))
 
 
-def _own_seconds(study: InversionStudy, data: int) -> float:
+def _own_seconds(study: Inversion, data: int) -> float:
     """Predict the most processor time (s) that an inversion of so many data takes besides solves."""
     if study.field:
         return 0.0
@@ -97,16 +102,13 @@ def _moved(count: int, usable: list[Measurement]) -> str:
     return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
 
 
-def plan_of_outputs(study: OutputInversion) -> list[str]:
-    """Say what is inverted, and how long that will take."""
-    from workflows.studies.output_inversion import derivable
-
+def _of_outputs(study: Inversion) -> list[str]:
     spec, sets, method = study.spec, study.data.sets, study.method
     counts = [len(found.values) for found in study.measurements if found is not None]
     lines = [
         f"method      {method.kind}",
         *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
-        *([] if study.reduced is None else [f"by          {study.reduced.description}"]),
+        *(f"by          {one.description}" for one in study.reduced.values()),
         f"unknown     {len(study.names)}: {', '.join(study.names)}",
         f"outputs     {', '.join(study.parts)}",
         f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
@@ -130,3 +132,19 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
             lines.append(f"mesh check  {NOT_ASKED}")
         lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")
     return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]
+
+
+def derivable(model: ForwardModel, kind: str) -> None:
+    """Refuse a model without derivatives.
+
+    Raises
+    ------
+    ModelError
+        If it has none.
+    """
+    if not model.differentiable:
+        message = (
+            f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "
+            "found: expected a jacobian of the Python function, or a server that has ApplyJacobian or Gradient"
+        )
+        raise ModelError(message)

@@ -16,14 +16,13 @@ from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, SOURCES, TRUST, stacked, usual_sizes
 from workflows.studies.findings_inversion import judged
-from workflows.studies.specimen_inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.bodies.random_fields import NodalPrior
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.inversion import InversionStudy
+    from workflows.studies.inversion import Inversion
     from workflows.studies.measured import Measurement
 
 BATCH = "batch.csv"
@@ -31,7 +30,7 @@ PRIOR_DRAWS = 1024
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
 
 
-def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
+def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
     """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
     Parameters
@@ -73,7 +72,6 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
                 true[k, study.names.index(name)] = value
     held["true"] = (("data_set", "parameter"), true)
     if vertices is not None:
-        assert isinstance(study, Inversion)
         held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices, prior)
         if prior is not None:  # the first unknown is the mean over the body
             true[:, 0] = held["stiffness_true"][1] @ prior.matern.mass / prior.matern.mass.sum()
@@ -90,7 +88,7 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
         coordinates["goal"] = [one.name for one in goals]
         held["goal_unit"] = ("goal", [one.unit for one in goals])
     # Displacements of a specimen are what is meant where nothing is said.
-    return xr.Dataset(held, coordinates, {} if vertices is not None else {"quantity": study.quantity})
+    return xr.Dataset(held, coordinates, {} if vertices is not None else {"quantity": study.data.quantity})
 
 
 def _of_specimen(
@@ -156,7 +154,7 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
     }
 
 
-def _prior_moments(study: InversionStudy, prior: NodalPrior | None) -> tuple[FloatArray, FloatArray]:
+def _prior_moments(study: Inversion, prior: NodalPrior | None) -> tuple[FloatArray, FloatArray]:
     """Prior mean and standard deviation (c,) of the parameters."""
     if prior is not None:
         field = study.model.fields[0]
@@ -179,7 +177,7 @@ def _prior_stiffness_std(study: Inversion, places: FloatArray, prior: NodalPrior
     return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
 
 
-def prior_draws(study: InversionStudy) -> FloatArray:
+def prior_draws(study: Inversion) -> FloatArray:
     """Prior draws (n, d) of the parameters."""
     rng = np.random.default_rng(study.method.seed)
     kept = np.zeros((0, len(study.inputs.names)))
@@ -335,7 +333,7 @@ class Rows:
         Writes the table.
     """
 
-    def __init__(self, study: InversionStudy, vertices: Vertices | None, write: Callable[[str], None]) -> None:
+    def __init__(self, study: Inversion, vertices: Vertices | None, write: Callable[[str], None]) -> None:
         self._study, self._vertices, self._write = study, vertices, write
         self._rows: dict[int, list[Any]] = {}
         self._head = _head(study.names, study.parts)
@@ -356,7 +354,7 @@ class Rows:
         self._write(_table([self._head, *(self._rows[number] for number in sorted(self._rows))]))
 
 
-def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Dataset]:
+def arviz_groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
     import xarray as xr
 
@@ -375,7 +373,7 @@ def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Datas
         return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
 
     left: dict[str, xr.Dataset] = {}
-    observed = {study.quantity: of_set["measured"]}
+    observed = {study.data.quantity: of_set["measured"]}
     left["observed_data"] = xr.Dataset(observed).drop_vars("parameter", errors="ignore")
     if study.field:
         left["posterior"] = xr.Dataset({"stiffness": draws("stiffness_draw")})
@@ -389,7 +387,7 @@ def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Datas
         columns[NOISE] = (("chain", "draw"), study.method.noise.from_normal(z)[0][None])
     left["prior"] = xr.Dataset(columns)
     dense = draws("draw_log_likelihood")
-    left["log_likelihood"] = xr.Dataset({study.quantity: dense})
+    left["log_likelihood"] = xr.Dataset({study.data.quantity: dense})
     seen = np.isfinite(found["measured"].to_numpy())
     # For different numbers of data: one variable for each, without padding.
     if len(seen) > 1 and not seen.all():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
@@ -20,13 +20,13 @@ from forward.files import meshes
 from forward.settings import Settings, one_line
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.files import SCANS
-from inverse.data.observations import Observations, Placed
+from inverse.data.files import SCANS, distinct, files
+from inverse.data.observations import Components, Observations, Placed
 from inverse.data.readings import Readings, Units
 from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
-from workflows.config.mistakes import lines
+from workflows.config.mistakes import StudyError, lines
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
@@ -92,10 +92,51 @@ class DataFiles(Reading):
         The files as they were when the study ran; written by the run.
     """
 
+    quantity: ClassVar[str] = "displacement"
+
     files: FileNames = Field(min_length=1)
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
+
+    def read(self, folder: Path, model: Specimen) -> Found:
+        """Read the files, in a folder or in the working directory, of displacements of a specimen.
+
+        Raises
+        ------
+        StudyError
+            If no file can be used.
+        """
+        return read_files(self.files, folder, lambda path: read_measurement(path, model, self))
+
+
+Found = tuple[tuple[DataSet, ...], tuple[Any, ...]]  # what was read, and what it holds; None of what is refused
+
+
+def read_files(names: Sequence[str], folder: Path, read: Callable[[Path], Any]) -> Found:
+    """Read each of some files, or folders or patterns of them, as a data set; errors as of `DataFiles.read`.
+
+    Parameters
+    ----------
+    read
+        Reads a file; it raises a `DataError` with every kind of mistake in it.
+    """
+    try:
+        paths = files(names, [folder, Path()])
+    except DataError as error:
+        raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
+    sets, found, lines = [], [], []
+    for path, name in zip(paths, distinct(paths), strict=True):
+        try:
+            measurement, wrong = read(path), ""
+        except DataError as error:
+            measurement, wrong = None, "; ".join(error.args)
+            lines += [f"data: {line}" for line in error.args]
+        sets.append(DataSet(name=name, file=path.name, digest=digest_of(path), refused=wrong))
+        found.append(measurement)
+    if all(measurement is None for measurement in found):
+        raise StudyError(*lines)
+    return tuple(sets), tuple(found)
 
 
 def scan_of(path: Path, usual: Reading) -> Scan:
@@ -179,6 +220,15 @@ class Measurement:
     on_surface: bool = False
     between: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def data(self) -> Components:
+        """The components that were measured."""
+        return self.observations.components()
+
+    def data_labels(self) -> list[str]:
+        """Say of each datum where it stands."""
+        return self.observations.data_labels()
+
     def motion(self, body: Body) -> SharedMotion | None:
         """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
         from inverse.data.shared_motion import SharedMotion
@@ -186,7 +236,7 @@ class Measurement:
         motion = UncertainMotion.of(self.registered, self.between)
         if motion is None:
             return None
-        data = self.observations.components()
+        data = self.data
         project = onto(body) if self.on_surface else None
         return SharedMotion.of(data.places, data.along, data.cases, motion, project)
 

@@ -22,10 +22,10 @@ from inverse.data.measured_model import MeasuredModel
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
+from workflows.studies.inversion_plan import derivable
 from workflows.studies.material_tests import WHOLE
 from workflows.studies.measured import check_signs
 from workflows.studies.model_selection import ModelSelection, Positive
-from workflows.studies.output_inversion import derivable
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:

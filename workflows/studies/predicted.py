@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
     from workflows.config.predict import Predict
-    from workflows.studies.inversion import InversionStudy
+    from workflows.studies.inversion import Inversion
 
 FieldPredictions = Callable[["LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
 ACTING = ("clamp", "displacements", "loads")
@@ -42,7 +42,7 @@ LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 # --- what is asked ---------------------------------------------------------------------------------------------------
 
 
-def spec(study: InversionStudy) -> ModelSpec:
+def spec(study: Inversion) -> ModelSpec:
     """Return the model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
     asked = _asked(study)
     if isinstance(study.model, Specimen):
@@ -56,7 +56,7 @@ def spec(study: InversionStudy) -> ModelSpec:
     return made.over(ranges({name: one for name, one in study.parameters.items() if name in made.scalars}))
 
 
-def _asked(study: InversionStudy) -> Predict:
+def _asked(study: Inversion) -> Predict:
     assert study.predict is not None
     return study.predict
 
@@ -68,18 +68,18 @@ def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:
     return known[case.name].model_copy(update={"outputs": case.outputs})
 
 
-def parameters(study: InversionStudy) -> tuple[str, ...]:
+def parameters(study: Inversion) -> tuple[str, ...]:
     """Names of the unknowns that act in what is predicted."""
     made = study.predicted
     known = {*made.scalars, *made.coefficients}
     return tuple(name for name in _unknown(study) if name in known)
 
 
-def _unknown(study: InversionStudy) -> tuple[str, ...]:
+def _unknown(study: Inversion) -> tuple[str, ...]:
     return study.model.coefficients if study.field else study.inputs.names
 
 
-def mistakes(study: InversionStudy) -> Iterator[Mistake]:
+def mistakes(study: Inversion) -> Iterator[Mistake]:
     """Find what cannot be predicted."""
     asked, specimen = _asked(study), isinstance(study.model, Specimen)
     if specimen and asked.model:
@@ -128,7 +128,7 @@ def _of_shared_paths(measured: ModelSpec, made: ModelSpec, unknown: tuple[str, .
             yield ("predict", "cases"), in_words(path, values), path
 
 
-def _of_cases(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
+def _of_cases(study: Inversion, asked: Predict) -> Iterator[Mistake]:
     known = tuple(case.name for case in study.model.cases)
     if not asked.cases and not asked.observed:
         yield ("predict",), "nothing is predicted, expected predict.cases or predict.observed", {}
@@ -143,7 +143,7 @@ def _of_cases(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
             yield ("predict", "cases", i), message, case.name
 
 
-def _of_model(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
+def _of_model(study: Inversion, asked: Predict) -> Iterator[Mistake]:
     known = tuple(name for name in type(study.model).model_fields if name != "kind")
     if asked.model.get("kind", study.model.kind) != study.model.kind:
         yield ("predict", "model", "kind"), f"expected '{study.model.kind}', as what was measured", asked.model["kind"]
@@ -155,14 +155,14 @@ def _of_model(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
 # --- what is done ----------------------------------------------------------------------------------------------------
 
 
-def build(study: InversionStudy, ensemble: Ensemble) -> ForwardModel:
+def build(study: Inversion, ensemble: Ensemble) -> ForwardModel:
     """Make the model of what is predicted; collective over the group."""
     model: ForwardModel = study.predicted.build(ensemble.group, parameters(study))
     return model
 
 
 def of_few(
-    study: InversionStudy, found: xr.Dataset, evaluate: Evaluate, of_mesh: Evaluate, before: Callable[[], Band]
+    study: Inversion, found: xr.Dataset, evaluate: Evaluate, of_mesh: Evaluate, before: Callable[[], Band]
 ) -> Record:
     """Return what the posterior of few parameters, in the dataset of its inversion, says on what is predicted.
 
@@ -189,7 +189,7 @@ def of_few(
     return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
 
 
-def prior_band(study: InversionStudy, evaluate: Evaluate) -> Band:
+def prior_band(study: Inversion, evaluate: Evaluate) -> Band:
     """Return what the prior says, which is solved for once for all data sets."""
     names, every = parameters(study), study.inputs.names
     points = study.inputs.points(sobol_points(study.method.seed, 0, 0, POINTS, len(every)))
@@ -198,7 +198,7 @@ def prior_band(study: InversionStudy, evaluate: Evaluate) -> Band:
     return predict.of_draws(draws, evaluate, _asked(study).solves(field=False), study.method.seed)
 
 
-def of_field(study: InversionStudy, model: Callable[[str], ForwardModel]) -> Callable[[str], FieldPredictions]:
+def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> Callable[[str], FieldPredictions]:
     """Return what predicts from the posterior of a field of a data set, by its name.
 
     Parameters
@@ -228,7 +228,7 @@ def of_field(study: InversionStudy, model: Callable[[str], ForwardModel]) -> Cal
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-def keep_unknown_meshes(study: InversionStudy, dataset: xr.Dataset) -> None:
+def keep_unknown_meshes(study: Inversion, dataset: xr.Dataset) -> None:
     """Keep which predictions have an error of a mesh that nobody knows, of any data set."""
     spec = study.predicted
     if not has_mesh(spec):

@@ -205,7 +205,7 @@ STUDIES = Kinds(
     {
         SAMPLING: "workflows.studies.sampling:Study",
         "select": "workflows.studies.selection:Comparison",
-        "invert": "workflows.studies.inversion:InversionStudy",
+        "invert": "workflows.studies.inversion:Inversion",
         "synthesize": "workflows.studies.synthesis:Synthesis",
         "population": "workflows.studies.population:PopulationStudy",
         "design": "workflows.studies.design:DesignStudy",

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
 
 from forward.registry import named
 from forward.scalars import Mistake
-from forward.spec import Measured
+from forward.spec import MEASURED, ModelSpec
 from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import Finding
-    from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
@@ -59,7 +58,7 @@ class Synthesis(StudyKind):
     stopped: ClassVar[str] = "all data made"
     explains: ClassVar[bool] = False
 
-    model: Measured
+    model: Annotated[ModelSpec, MEASURED]
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Synthesize

@@ -234,7 +234,7 @@ def test_synthetic_tables_hold_forces_with_errors_of_their_own(folder):
     np.testing.assert_array_equal(found.cases[forces], [0, 1])
     assert np.isnan(found.places[forces]).all()
     np.testing.assert_allclose(found.sigma[forces] / found.values[forces], 0.02, rtol=0.1)
-    assert study.labels(0)[int(np.flatnonzero(forces)[0])].endswith(", pull, grip")
+    assert study.measurements[0].data_labels()[int(np.flatnonzero(forces)[0])].endswith(", pull, grip")
 
 
 def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(folder, looked_at):
@@ -299,7 +299,7 @@ def test_forces_stand_beside_points_of_uncertain_registration(folder):
     uncertain = '["data"]\nregistration = { kind = "given", rotation_std = 2.0, translation_std = 1e-3 }'
     (folder / "moved.toml").write_text(FEW.replace('["data"]', uncertain))
     study = load(folder / "moved.toml")
-    motion, forces = study.motion(0), study.measured(0).axes >= 3
+    motion, forces = study.measurements[0].motion(study.model.body), study.measured(0).axes >= 3
     model = study.specimen.build(MPI.COMM_SELF, study.inputs.names).observing(*motion.observed)
     rows = motion.errors(model.solve(study.inputs.mean).outputs)
     assert rows.shape == (6, len(forces))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from forward.spec import ModelSpec
-    from workflows.studies.inversion import InversionStudy
+    from workflows.studies.inversion import Inversion
 
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
@@ -254,7 +254,7 @@ def _shown(value: Any, digits: int = 4) -> str:
     return number(float(value), digits)
 
 
-def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
+def prior_densities(study: Inversion) -> dict[str, plots.Density]:
     """Curves (values, density) of the priors by the name of the parameter."""
     known = dict(study.inputs.marginals)
     if study.method.noise is not None:
