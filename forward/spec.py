@@ -274,12 +274,17 @@ MODELS = Kinds(
 )
 
 
-def usual_kind(block: Mapping[str, Any]) -> str:
-    """Return the kind of a measured model whose block has none.
+SPECIMEN = "specimen"  # the kind of model whose displacements are measured; of others outputs are
+
+
+def usual_kind(model: Any) -> str:
+    """Return the kind of a measured model, of which a block may say nothing.
 
     One that has outputs of its own, and no load cases, is a body; others are specimens.
     """
-    return "hyperelastic" if "outputs" in block and "cases" not in block else "specimen"
+    if not isinstance(model, Mapping):
+        return str(getattr(model, "kind", SPECIMEN))
+    return str(model.get("kind", "hyperelastic" if "outputs" in model and "cases" not in model else SPECIMEN))
 
 
 MEASURED = OfKind(MODELS, usual_kind)

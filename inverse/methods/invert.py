@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from forward.model import ForwardModel, ModelError
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, solves_of
 from inverse.criticism.chains import FIELD
@@ -125,3 +126,19 @@ class Invert(MeshTreatment, Settings):
 def names_of(inputs: Inputs, method: Invert) -> tuple[str, ...]:
     """Return the names of the parameters, and of the noise if it is inferred."""
     return (*inputs.names, *((NOISE,) if method.noise is not None else ()))
+
+
+def derivable(model: ForwardModel, kind: str) -> None:
+    """Refuse a model without derivatives.
+
+    Raises
+    ------
+    ModelError
+        If it has none.
+    """
+    if not model.differentiable:
+        message = (
+            f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "
+            "found: expected a jacobian of the Python function, or a server that has ApplyJacobian or Gradient"
+        )
+        raise ModelError(message)

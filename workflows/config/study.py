@@ -200,9 +200,8 @@ def schema() -> dict[str, Any]:
     any_form: Any = Union[*forms]
     found = TypeAdapter(any_form).json_schema(ref_template=_REFERENCE)
     for form in forms:  # a file may name a table instead of containing the data
-        if form.data_in_file is not None:
-            table = TypeAdapter(form.data_in_file).json_schema(ref_template=_REFERENCE)
-            name = form.data_in_file.__name__
+        for of_file in form.data_in_file:
+            table, name = TypeAdapter(of_file).json_schema(ref_template=_REFERENCE), of_file.__name__
             found["$defs"] |= table.pop("$defs", {}) | {name: table}
             data = found["$defs"][form.__name__]["properties"]
             data["data"] = {"anyOf": [data["data"], {"$ref": _REFERENCE.format(model=name)}]}

@@ -16,10 +16,10 @@ from forward.model import ModelError, SolveError
 from forward.specimen import Specimen
 from inverse.designs.candidates import NEAR, Values
 from inverse.designs.fields import of_field
+from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.kept import KeptModel
 from workflows.studies.design_values import of_outputs
-from workflows.studies.inversion_plan import derivable
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import has_mesh
 

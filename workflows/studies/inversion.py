@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
@@ -15,8 +14,8 @@ from forward.bodies.inclusions import log_factor
 from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake
-from forward.settings import Settings, nearest
-from forward.spec import MEASURED, usual_kind
+from forward.settings import nearest
+from forward.spec import MEASURED, SPECIMEN, usual_kind
 from forward.specimen import Specimen
 from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced, Invert, names_of
@@ -27,7 +26,7 @@ from workflows.config.mistakes import not_installed, refused
 from workflows.config.predict import Predict
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_priors, ranges
 from workflows.config.report import Report
-from workflows.studies.measured import DataFiles
+from workflows.studies.measured import DataFiles, as_block, data_as
 from workflows.studies.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
 from workflows.studies.study import Sampled, StudyKind
@@ -44,20 +43,7 @@ if TYPE_CHECKING:
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted
-SPECIMEN = "specimen"
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
-
-
-@dataclass(frozen=True)
-class _Given:
-    """What stands in a study as data, and the block that it is of."""
-
-    block: type[Settings]
-    table: Any
-
-
-def _as_block(given: Any) -> Any:
-    return given.block.model_validate(given.table) if isinstance(given, _Given) else given
 
 
 class Inversion(StudyKind):
@@ -87,7 +73,7 @@ class Inversion(StudyKind):
     model: Annotated[Any, MEASURED]
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
-    data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(_as_block)]
+    data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(as_block)]
     method: Invert = Invert()
     parallel: Parallel = Parallel()
     report: Report | None = None
@@ -318,11 +304,9 @@ class Inversion(StudyKind):
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
-        if not isinstance(blocks, Mapping) or "data" not in blocks or isinstance(blocks["data"], Settings | _Given):
+        if not isinstance(blocks, Mapping):
             return blocks
-        model = blocks.get("model")
-        kind = model.get("kind", usual_kind(model)) if isinstance(model, Mapping) else getattr(model, "kind", SPECIMEN)
-        return {**blocks, "data": _Given(DataFiles if kind == SPECIMEN else MeasuredOutputs, blocks["data"])}
+        return data_as(blocks, DataFiles if usual_kind(blocks.get("model")) == SPECIMEN else MeasuredOutputs)
 
     @model_validator(mode="after")
     def _check(self) -> Self:

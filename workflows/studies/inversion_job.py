@@ -13,6 +13,7 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
@@ -26,7 +27,6 @@ from workflows.studies.findings_inversion import judged
 from workflows.studies.findings_solves import of_answers
 from workflows.studies.finer import FINER, finer_meshes, solved_by
 from workflows.studies.inversion import PREDICTED, Inversion
-from workflows.studies.inversion_plan import derivable
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
 from workflows.studies.predictions import has_mesh

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.fem.cost import REPORT, START
-from forward.model import ModelError
 from forward.readable import told
 from inverse.criticism.assessment import own_seconds
+from inverse.methods.invert import derivable
 from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
-    from forward.model import ForwardModel
     from forward.specimen import Specimen
     from workflows.studies.inversion import Inversion
     from workflows.studies.measured import Measurement
@@ -132,19 +131,3 @@ def _of_outputs(study: Inversion) -> list[str]:
             lines.append(f"mesh check  {NOT_ASKED}")
         lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")
     return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]
-
-
-def derivable(model: ForwardModel, kind: str) -> None:
-    """Refuse a model without derivatives.
-
-    Raises
-    ------
-    ModelError
-        If it has none.
-    """
-    if not model.differentiable:
-        message = (
-            f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "
-            "found: expected a jacobian of the Python function, or a server that has ApplyJacobian or Gradient"
-        )
-        raise ModelError(message)

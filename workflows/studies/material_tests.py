@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -234,6 +234,8 @@ class Measurements(Settings):
     source
         Their source, line by line.
     """
+
+    quantity: ClassVar[str] = "stress"
 
     tests: tuple[MeasuredTest, ...] = Field(min_length=1)
     source: tuple[str, ...] = ()

@@ -61,6 +61,25 @@ class DataSet(Settings):
     refused: str = ""
 
 
+@dataclass(frozen=True)
+class _Given:
+    """What stands in a study as data, and the block that it is of."""
+
+    block: type[Settings]
+    table: Any
+
+
+def data_as(blocks: Mapping[str, Any], block: type[Settings]) -> dict[str, Any]:
+    """Return the blocks of a study whose `data`, if it is a table, is of a block that was chosen by the model."""
+    data = blocks.get("data", _Given)
+    return dict(blocks) if data is _Given or isinstance(data, Settings) else {**blocks, "data": _Given(block, data)}
+
+
+def as_block(data: Any) -> Any:
+    """Return the block of data that `data_as` has chosen; others are returned as they are."""
+    return data.block.model_validate(data.table) if isinstance(data, _Given) else data
+
+
 def _one_alone(given: Any) -> Any:
     return (given,) if isinstance(given, str) else given
 

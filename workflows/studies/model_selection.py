@@ -1,21 +1,23 @@
-"""Studies that compare models: what those by displacements and those by outputs have in common."""
+"""A study that compares models: of a specimen by displacements, or any others by their outputs."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 
 from forward.fem.finer import finer
+from forward.model import Finding, ForwardModel
 from forward.scalars import Mistake
 from forward.settings import Settings, one_line
-from forward.spec import ModelSpec
-from inverse.criticism.comparison import Candidate
+from forward.spec import MEASURED, SPECIMEN, ModelSpec, usual_kind
+from forward.specimen import Specimen
+from inverse.criticism.comparison import Candidate, Data
+from inverse.criticism.doubts_of_meshes import not_estimable
 from inverse.methods.selection import SelectSpecimens
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
@@ -23,13 +25,19 @@ from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
+from workflows.studies.listed_displacements import ListedDisplacements
+from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE
+from workflows.studies.measured import as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison
 
 if TYPE_CHECKING:
-    from forward.model import Finding
+    from forward.fem.specimen import SpecimenModel
+    from inverse.data.shared_motion import SharedMotion
 
+SECONDS = 1e-3  # of a solve about which nothing is known
+_SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
 Positive = Annotated[float, Field(gt=0)]
 
 
@@ -91,33 +99,17 @@ class ModelSelection(Comparison):
         Use of ranks.
     report
         Your own sections of the report.
-
-    Attributes
-    ----------
-    listed_by
-        The key of `data` that is there once the data are listed, and no file is to be read any more.
     """
 
     model: dict[str, Any]
-    data: Any
+    data: Annotated[ListedDisplacements | ListedOutputs, BeforeValidator(as_block)]
     candidates: dict[str, ModelCandidate] = Field(min_length=1)
     method: SelectSpecimens
     parallel: Parallel = Parallel()
     report: Report | None = None
 
     costly: ClassVar[bool] = True
-    listed_by: ClassVar[str]
-
-    @classmethod
-    @abstractmethod
-    def spec_of(cls, block: Mapping[str, Any]) -> ModelSpec:
-        """Return the model that a block describes.
-
-        Raises
-        ------
-        pydantic.ValidationError
-            For mistakes in it.
-        """
+    data_in_file: ClassVar[tuple[type[Settings], ...]] = (ListedDisplacements.in_file, ListedOutputs.in_file)
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
@@ -126,30 +118,38 @@ class ModelSelection(Comparison):
 
     @classmethod
     def _expanded(cls, blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        data, candidates = blocks.get("data"), blocks.get("candidates")
-        if not isinstance(data, Mapping) or cls.listed_by in data or not isinstance(candidates, Mapping):
+        data, candidates, listed = blocks.get("data"), blocks.get("candidates"), block_of(blocks.get("model"))
+        if not isinstance(data, Mapping) or not isinstance(candidates, Mapping) or not candidates:
             return dict(blocks)
-        if not candidates:
+        if next(iter(listed.model_fields)) in data:  # nothing is to be read any more
             return dict(blocks)
-        of_file: Any = cls.data_in_file
         try:
-            file = of_file.model_validate(dict(data))
+            file: Any = listed.in_file.model_validate(dict(data))
         except ValidationError as error:
             raise StudyError(*lines(error, "data")) from None
         name, first = next(iter(candidates.items()))
         changes = first.get("model", {}) if isinstance(first, Mapping) else {}
         try:
-            spec = cls.spec_of(changed(blocks["model"], changes))
+            spec = spec_of(changed(blocks["model"], changes))
         except ValidationError as error:
             raise StudyError(*lines(error, f"candidates.{name}.model")) from None
         return {**blocks, "data": file.read(folder, spec)}
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """The model of each candidate, in the form that suits all values of its parameters."""
+        """The model of each candidate, in a form that suits all values of its parameters.
+
+        Forms differ a little on a mesh: if one specimen needs pressures, all that can have them do.
+        """
+        given = {name: spec_of(changed(self.model, one.model)) for name, one in self.candidates.items()}
+        of_inputs = {name: ranges(one.parameters) for name, one in self.candidates.items()}
+        free = {name: one for name, one in given.items() if isinstance(one, Specimen) and one.formulation == "auto"}
+        mixed = {name: one for name, one in free.items() if one.mixable}
+        if not any(one.decision(of_inputs[name]).mixed for name, one in free.items()):
+            mixed = {}
         return {
-            name: self.spec_of(changed(self.model, one.model)).over(ranges(one.parameters))
-            for name, one in self.candidates.items()
+            name: one.model_copy(update={"formulation": "mixed"}) if name in mixed else one.over(of_inputs[name])
+            for name, one in given.items()
         }
 
     @property
@@ -209,7 +209,14 @@ class ModelSelection(Comparison):
             for name, one in self.of_candidates.items()
             for finding in one.findings_over(ranges(self.candidates[name].parameters))
         )
-        return tuple(dict.fromkeys([*of_models, *super().findings]))
+        return tuple(dict.fromkeys([*of_models, *super().findings, *self._of_outputs()]))
+
+    def _of_outputs(self) -> Iterator[Finding]:
+        """Say of which measured outputs nothing tells the error of the mesh."""
+        never = (self.data.not_estimable(spec) for spec in self.of_candidates.values())
+        names = tuple(dict.fromkeys(name for several in never for name in several))
+        for one in not_estimable(names) if names and self.unchecked else ():
+            yield Finding(one.severity, f"{one.text[0].upper()}{one.text[1:]}.")
 
     @property
     def models(self) -> dict[str, Candidate]:
@@ -220,15 +227,58 @@ class ModelSelection(Comparison):
         }
 
     @property
-    def source(self) -> tuple[str, ...]:
-        """Where the data are from."""
-        found: tuple[str, ...] = self.data.source
-        return found
-
-    @property
     def group_names(self) -> tuple[str, ...]:
         """Names of the groups: there is one."""
         return (WHOLE,)
+
+    @property
+    def data_groups(self) -> dict[str, Data]:
+        """Data by group."""
+        return {WHOLE: self.data.data}
+
+    def tests(self, group: str) -> tuple[str, ...]:
+        """Names of the tests that were measured in a group."""
+        return self.data.tests
+
+    def measured_in(self, test: str) -> str:
+        """Say what was measured in a test, in the unit of the first candidate."""
+        return self.data.measured_in(test, next(iter(self.of_candidates.values())))
+
+    @property
+    def seconds_of_solves(self) -> float:
+        """Processor time of all solves and their derivatives, roughly: searches for modes have no reference."""
+        seconds = 0.0
+        for name, spec in self.of_candidates.items():
+            cost, solves = spec.cost(), self.searches(name) + self.method.samples
+            if cost is None:
+                seconds += SECONDS * solves
+                continue
+            derivatives = cost.tangents_of_sample(len(self.candidates[name].parameters))
+            seconds += self.searches(name) * (cost.textbook if isinstance(spec, Specimen) else cost.sample)
+            seconds += self.method.samples * cost.sample + solves * derivatives
+        return seconds * self.evidences / len(self.of_candidates)
+
+    def described(self, name: str) -> str:
+        """A candidate in words: of a specimen its material and mesh."""
+        spec = self.of_candidates[name]
+        if not isinstance(spec, Specimen):
+            return spec.description
+        body, loaded = spec.body, spec.loaded(spec.cases[0])
+        mixed = ", mixed" if loaded.mixed else ""
+        return f"{loaded.energy} on {body.cells_in_words} cells ({body.cell}, degree {body.degree}{mixed})"
+
+    def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
+        """Make the model of a candidate; collective."""
+        spec = self.of_candidates[name]
+        return self.data.observed(spec, spec.build(comm, tuple(self.candidates[name].parameters)))
+
+    def shared(self, name: str, group: str) -> SharedMotion | None:
+        """Return the errors that the data share, as a candidate sees them; None if they are independent."""
+        return self.data.shared(self.of_candidates[name])
+
+    def moved(self, model: ForwardModel, motion: SharedMotion) -> ForwardModel:
+        """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
+        return cast("SpecimenModel", model).observing(*motion.observed)  # type: ignore[arg-type]
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the numbers of a candidate's model."""
@@ -239,24 +289,39 @@ class ModelSelection(Comparison):
         refused(type(self).__name__, list(self._mistakes()))
         return self
 
+    @model_validator(mode="before")
+    @classmethod
+    def _data_of_model(cls, blocks: Any) -> Any:
+        """Choose the block of the data by the model."""
+        return data_as(blocks, block_of(blocks.get("model"))) if isinstance(blocks, Mapping) else blocks
+
     def _mistakes(self) -> Iterator[Mistake]:
-        for place, spec, mistakes in described(self.candidates, self.model, self.spec_of):
+        if isinstance(self.data, ListedDisplacements) and self.method.check is not None:
+            message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
+            yield ("method", "check"), message, self.method.check
+        for place, spec, mistakes in described(self.candidates, self.model, spec_of):
             yield from mistakes
             if spec is None:
                 continue
             if spec.coefficients:
                 message = "random fields, expected numbers only: evidences are of few parameters"
                 yield (*place, "model", "fields"), message, len(spec.coefficients)
-            for where, message, given in self.unobserved(spec):
+            for where, message, given in self.data.unobserved(spec):
                 yield (*place, "model", *where), message, given
             if self.parallel.ranks_per_model > 1 and not spec.shareable:
                 message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
                 yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
         yield from self.mistakes_of_method()
 
-    @abstractmethod
-    def unobserved(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what was measured that a model does not have."""
+
+def spec_of(block: Mapping[str, Any]) -> ModelSpec:
+    """Return the model that a block describes; a ValidationError for mistakes in it."""
+    return _SPEC.validate_python(dict(block))
+
+
+def block_of(model: Any) -> type[ListedDisplacements | ListedOutputs]:
+    """Return the block of the data of a model."""
+    return ListedDisplacements if usual_kind(model) == SPECIMEN else ListedOutputs
 
 
 def _bytes(specs: Iterable[Any]) -> float:
@@ -269,13 +334,13 @@ def _bytes(specs: Iterable[Any]) -> float:
 def described(
     candidates: Mapping[str, ModelCandidate],
     block: Mapping[str, Any],
-    spec_of: Callable[[Mapping[str, Any]], ModelSpec],
+    make: Callable[[Mapping[str, Any]], ModelSpec],
 ) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
     """Find the place of each candidate in a study, its model (None if it is none), and what is wrong with it."""
     for name, candidate in candidates.items():
         place = ("candidates", name)
         try:
-            spec = spec_of(changed(block, candidate.model))
+            spec = make(changed(block, candidate.model))
         except ValidationError as error:
             lines = error.errors(include_url=False)
             yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]

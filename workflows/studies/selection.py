@@ -27,7 +27,7 @@ from workflows.config.mistakes import StudyError, not_installed, refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
-from workflows.studies.study import StudyKind, measures_outputs
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
 
+OF_MODELS = "workflows.studies.model_selection:ModelSelection"
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 
 
@@ -130,17 +131,12 @@ class Comparison(StudyKind):
     """What studies that compare models have in common: candidates by name, groups of data, the method."""
 
     stopped: ClassVar[str] = "all evidences found"
-    quantity: ClassVar[str]  # what was measured
     costly: ClassVar[bool]  # whether solves are worth a file
+    data: Any
     candidates: Mapping[str, Any]
     method: Select
     parallel: Parallel = Parallel()
     report: Report | None = None
-
-    @property
-    def source(self) -> tuple[str, ...]:
-        """Where the data are from, line by line."""
-        raise NotImplementedError
 
     @property
     def seconds_of_solves(self) -> float:
@@ -216,7 +212,7 @@ class Comparison(StudyKind):
 
     def measured_in(self, test: str) -> str:
         """Say what was measured in a test, with its unit."""
-        return "displacement (m)"
+        raise NotImplementedError
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -249,10 +245,9 @@ class Comparison(StudyKind):
 
     @classmethod
     def forms(cls) -> Iterator[type[StudyKind]]:
-        """Comparisons by stresses, by displacements, and by outputs."""
+        """Comparisons of materials, and of models."""
         yield Selection
-        yield named("workflows.studies.specimen_selection:SpecimenSelection")
-        yield named("workflows.studies.output_selection:OutputSelection")
+        yield named(OF_MODELS)
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
@@ -260,11 +255,8 @@ class Comparison(StudyKind):
         if not isinstance(blocks.get("model", {}), Mapping):
             message = f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}"
             raise StudyError(message)
-        if measures_outputs(blocks.get("model")):
-            other: type[Comparison] = named("workflows.studies.output_selection:OutputSelection")
-            return other.made(blocks, folder)
         if "model" in blocks:
-            other = named("workflows.studies.specimen_selection:SpecimenSelection")
+            other: type[Comparison] = named(OF_MODELS)
             return other.made(blocks, folder)
         return Selection.model_validate(expanded(blocks, folder))
 
@@ -340,14 +332,8 @@ class Selection(Comparison):
     parallel: Parallel = Parallel()
     report: Report | None = None
 
-    data_in_file: ClassVar[type[Settings] | None] = DataFile
-    quantity: ClassVar[str] = "stress"
+    data_in_file: ClassVar[tuple[type[Settings], ...]] = (DataFile,)
     costly: ClassVar[bool] = False
-
-    @property
-    def source(self) -> tuple[str, ...]:
-        """Where the data are from."""
-        return self.data.source
 
     @property
     def group_names(self) -> tuple[str, ...]:

@@ -69,7 +69,7 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         return method.run(study.models, study.data_groups, recorded, free, look, ensemble.say, shared or None, itself)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = found.assign_attrs(quantity=study.quantity)
+        found = found.assign_attrs(quantity=study.data.quantity)
         if "mesh_checked" in found:
             found = found.assign(mesh_of_file=("model", [str(name) in study.of_files for name in found.model.values]))
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}

@@ -37,7 +37,7 @@ def plan(study: Comparison) -> list[str]:
     data = study.data_groups.values()
     tests = sum(len(study.tests(group)) for group in study.group_names)
     among = f" in {len(data)} groups" if len(data) > 1 else ""
-    kind, parts = DATA[study.quantity]
+    kind, parts = DATA[study.data.quantity]
     count = f"{sum(one.values.size for one in data)} {kind} of {tests} {parts}"
     return [
         f"method      {method.kind}",

@@ -27,17 +27,6 @@ SAMPLING = "sampling"  # the kind of study whose methods solve at points
 WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 
 
-def measures_outputs(model: Any) -> bool:
-    """Whether the block of a model is one whose outputs are measured, not the displacements of a specimen.
-
-    A block without a kind that has outputs of its own, and no load cases, is a body.
-    """
-    if not isinstance(model, Mapping):
-        return False
-    body = "outputs" in model and "cases" not in model
-    return bool(model.get("kind", "hyperelastic" if body else "specimen") != "specimen")
-
-
 class Sampled(NamedTuple):
     """A model with random parameters."""
 
@@ -54,14 +43,14 @@ class StudyKind(Settings):
     Attributes
     ----------
     data_in_file
-        The block that may stand in a file in place of `data`, which is read before the study is made.
+        The blocks that may stand in a file in place of `data`, which is read before the study is made.
     stopped
         Why it ends, in words, if the results do not say so.
     explains
         Whether it explains data: then parameters without a model have zero likelihood, which is a valid answer.
     """
 
-    data_in_file: ClassVar[type[Settings] | None] = None
+    data_in_file: ClassVar[tuple[type[Settings], ...]] = ()
     stopped: ClassVar[str] = ""
     explains: ClassVar[bool] = True
 

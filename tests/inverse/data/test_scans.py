@@ -21,8 +21,8 @@ from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from tests.fuzz import damaged_bytes
 from workflows.config.study import load
+from workflows.studies.listed_displacements import DisplacementFile, ListedDisplacements
 from workflows.studies.measured import digest_of, read_on, scan_of
-from workflows.studies.specimen_selection import DisplacementFile, MeasuredDisplacements
 
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 POINTS = 50 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1.0]])  # mm
@@ -422,7 +422,7 @@ def test_comparisons_take_scans_in_their_own_frame(tmp_path):
         row[:3] = map(repr, map(float, (inside + 0.1 * np.array(row[:3], dtype=float)) @ R))
     (tmp_path / "scan.csv").write_text("\n".join([text[0], *(", ".join(row) for row in rows)]))
     how = {"file": "scan.csv", "registration": {"kind": "given", "matrix": whole}}
-    data = MeasuredDisplacements.model_validate(DisplacementFile.model_validate(how).read(tmp_path, specimen))
+    data = ListedDisplacements.model_validate(DisplacementFile.model_validate(how).read(tmp_path, specimen))
     np.testing.assert_allclose(data.axes, R.T, atol=1e-12)
     places = np.array(data.places)
     expected = {tuple(x) for x in ((inside + 0.1 * POINTS) / 1e3).round(9).tolist()}
@@ -435,5 +435,5 @@ def test_comparisons_take_scans_in_their_own_frame(tmp_path):
     np.testing.assert_allclose(seen, [(u @ R)[axis] for u, axis in zip(vectors, axes, strict=True)], atol=1e-12)
     how["registration"] = {"kind": "given", "rotation_std": 1.0}
     read = DisplacementFile.model_validate(how | {"tolerance": 1.0}).read(tmp_path, specimen)
-    motion = MeasuredDisplacements.model_validate(read).motion
+    motion = ListedDisplacements.model_validate(read).motion
     np.testing.assert_allclose(motion.root, np.diag([np.radians(1.0)] * 3 + [0.0] * 3), atol=1e-15)

@@ -31,8 +31,8 @@ from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies.findings_selection import doubts_of_selection, trusted_on_meshes
 from workflows.studies.finer import solved_on
+from workflows.studies.model_selection import ModelSelection
 from workflows.studies.predictions import meshes_of
-from workflows.studies.specimen_selection import SpecimenSelection
 
 pytestmark = pytest.mark.fem
 STUDY = """
@@ -144,12 +144,12 @@ def test_motions_that_are_uncertain_are_integrated_out(study):
 def test_studies_are_complete_in_themselves(study):
     it = load(study)
     assert parse(tomllib.loads(dump(it))) == it
-    assert it.source == ("made up",)
+    assert it.data.source == ("made up",)
     assert it.described("stiff") == "neo-hookean on 1 × 1 × 1 cells (hexahedron, degree 1)"
     assert any("12 displacements of 1 load cases" in line for line in plan(it))
     shipped = load(CONFIGS / "inclusion-material.toml")
     assert len(shipped.candidates) == 5
-    assert any("truth: material.C20 = 400.0" in line for line in shipped.source)
+    assert any("truth: material.C20 = 400.0" in line for line in shipped.data.source)
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
 def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatch):
     """And what they correct is said."""
     alive, made, before = weakref.WeakSet(), [], []
-    mesh, build = OtherMesh._mesh.fget, SpecimenSelection.build_finer
+    mesh, build = OtherMesh._mesh.fget, ModelSelection.build_finer
 
     def remembered(self):
         found = mesh(self)
@@ -289,7 +289,7 @@ def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatc
         return build(self, *given)
 
     monkeypatch.setattr(OtherMesh, "_mesh", property(remembered))
-    monkeypatch.setattr(SpecimenSelection, "build_finer", built)
+    monkeypatch.setattr(ModelSelection, "build_finer", built)
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
     main(["run", str(study), "--out", str(study.parent / "once"), "--quiet"])
     assert made == [(2, 2, 2), (1, 1, 1)] * 2

@@ -48,9 +48,9 @@ class Constants(Section):
         )
         yield Heading("Candidates and priors", level=3)
         yield priors(results)
-        if study.source:
+        if study.data.source:
             yield Heading("Data", level=3)
-            yield Text("\n".join(study.source))
+            yield Text("\n".join(study.data.source))
 
 
 def constants(results: Results) -> Table:
