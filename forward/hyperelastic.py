@@ -24,8 +24,9 @@ from forward.fem.affordable import finer, own_estimate
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate
+from forward.findings import Finding
 from forward.materials.material import splits
-from forward.model import Finding, FloatArray, ModelError
+from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
@@ -189,7 +190,7 @@ class Hyperelastic(Solid):
         """Findings about the body before anything is solved."""
         points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
         return (
-            *(Finding("warning", text) for text in self.body.warnings),
+            *(Finding("body-unusual", "warning", {"text": text}) for text in self.body.warnings),
             *too_narrow(self.body, self.inclusions),
             *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
             *moved_points(self.body, points),
@@ -201,12 +202,7 @@ class Hyperelastic(Solid):
         """What the stability test cannot see under loads that follow the body."""
         followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
         if followers and not self.solver.accept_unstable:
-            text = (
-                f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. "
-                "Stability is judged by the symmetric part, in which divergence (buckling) shows; "
-                "flutter shows in no static test."
-            )
-            yield Finding("note", text)
+            yield Finding("followers", "note", {"loads": ", ".join(followers)})
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from itertools import repeat
-from typing import Literal, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,24 +120,6 @@ class SolveError(Exception):
 
 class InadmissibleError(SolveError):
     """The material is inadmissible, or its energy undefined: there is nothing to solve, and the likelihood is zero."""
-
-
-Severity = Literal["note", "warning", "error"]
-
-
-class Finding(NamedTuple):
-    """What a user has to know about a result besides its numbers.
-
-    Parameters
-    ----------
-    severity
-        "note" is worth knowing; with "warning" a number may be off; with "error" a number cannot be trusted.
-    text
-        A sentence or two: what, where, by how much, what to do.
-    """
-
-    severity: Severity
-    text: str
 
 
 class ModelError(ValueError):

@@ -17,8 +17,8 @@ from pydantic_core import CoreSchema
 
 from forward.fem.cost import Times, sum_of
 from forward.fem.mesh_error_cost import Estimate
+from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
-from forward.model import Finding
 from forward.readable import scale
 from forward.registry import named
 from forward.scalars import Mistake, Scalar

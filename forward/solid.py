@@ -14,10 +14,10 @@ from forward.bodies.geometry import AXES, Body, Vector, extent
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.findings import Finding
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
-from forward.model import Finding
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
     from forward.fem.locking import Ranges
     from forward.fem.mesh_error_cost import Estimate
+    from forward.findings import Finding
     from forward.materials.admissible import Materials
-    from forward.model import Finding, FloatArray, ForwardModel, NamedOutput
+    from forward.model import FloatArray, ForwardModel, NamedOutput
 
 UNREFINED = (
     "meshes are refined by studies that sample a model; run one, and name the mesh that it leaves: "

@@ -16,8 +16,9 @@ from forward.fem.affordable import own_estimate
 from forward.fem.cost import Times, sum_of
 from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate
+from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
-from forward.model import Finding, ModelError, SolveError
+from forward.model import ModelError, SolveError
 from forward.observables.displacement import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
@@ -189,11 +190,7 @@ class Specimen(Solid):
         """Say which paths stand for several numbers, none of which is a parameter."""
         paths = shared_paths(self.cases)
         if paths:
-            text = (
-                f"Without names, different numbers of several load cases share a path: {', '.join(paths)}. Each keeps "
-                "its own value, but none can be a parameter: a name for each tells them apart."
-            )
-            yield Finding("note", text)
+            yield Finding("paths-shared", "note", {"paths": ", ".join(paths)})
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
         """Find that outputs are not known, and random fields whose coefficients cannot be drawn."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from forward.model import Finding, Severity
+from forward.findings import Entry, Finding, Severity
 
 if TYPE_CHECKING:
     import xarray as xr
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most severe first
-NUMBER = r"−?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?"
 MANY = 3  # steps at which a list says the same
 UNKNOWN = "mesh_unknown"  # attribute of results, see `keep_unknown`
 NOT_KNOWN = "mesh not known"  # beside every error that is of sampling alone
@@ -23,17 +22,14 @@ DIGITS = 2  # of numbers whose error of the mesh was to be known, and is not
 def add(dataset: xr.Dataset, *found: Finding, first: bool = False) -> None:
     """Keep findings in ``dataset.attrs["findings"]``, each once, after those that are there, or before them."""
     there = _kept(dataset)
-    kept = list(dict.fromkeys([*found, *there] if first else [*there, *found]))
-    if kept:
-        dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
+    if found or there:
+        _keep(dataset, dict.fromkeys([*found, *there] if first else [*there, *found]))
 
 
 def withdraw(dataset: xr.Dataset, names: Collection[str]) -> None:
-    """Forget findings that speak of one of these outputs: "the expansion of NAME", "the 64 samples of NAME"."""
-    about = re.compile(rf"\bof ({'|'.join(map(re.escape, names))})(?![\w.,])")
-    dataset.attrs["findings"] = json.dumps(
-        [one._asdict() for one in _kept(dataset) if not about.search(one.text)], ensure_ascii=False
-    )
+    """Forget what findings say of these outputs, and findings that say nothing of others."""
+    left = [(one, tuple(entry for entry in one.about if entry.name not in names)) for one in _kept(dataset)]
+    _keep(dataset, [replace(one, about=about) for one, about in left if about or not one.about])
 
 
 def once_for_steps(dataset: xr.Dataset) -> None:
@@ -45,70 +41,59 @@ def once_for_steps(dataset: xr.Dataset) -> None:
         str(name): (str(of), int(step))
         for name, of, step in zip(*(dataset[key].values for key in ("output", "output_of", "step")), strict=True)
     }
-    known = re.compile(rf"(?<![\w.])({'|'.join(map(re.escape, places))})(?!\d|\.\d)")
-    groups: dict[tuple[str, ...], list[tuple[Finding, int]]] = {}
-    for i, long in enumerate(_kept(dataset)):
-        one = long._replace(text=_shorter(long.text, known, places))
-        named = set(known.findall(one.text))
-        of, step = places[named.pop()] if len(named) == 1 else ("", 0)
-        said = _alike(known.sub(of, one.text)) if of else str(i)
-        groups.setdefault((one.severity, of, said), []).append((one, step))
-    kept = []
-    for (first, _), *others in groups.values():
-        also = f" The same, with other numbers, at {_steps([step for _, step in others])}." if others else ""
-        kept.append(first._replace(text=first.text + also))
-    if kept:
-        dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
+    shorter = [replace(one, about=_shorter(one.about, places)) for one in _kept(dataset)]
+    said = [
+        replace(first, also=f"at {_steps([places[name][1] for name in others])}") if others else first
+        for first, others in _alike(shorter, {name: of for name, (of, _) in places.items()})
+    ]
+    if said:
+        _keep(dataset, said)
 
 
-def once_for_outputs(texts: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Say once what texts say of several outputs, given by their names, in the words of the first of them."""
-    known = re.compile(rf"(?<![\w.])({'|'.join(map(re.escape, names)) or '(?!)'})(?!\w|\.\w)")
-    groups: dict[str, list[tuple[str, str]]] = {}
-    for text in texts:
-        of = set(known.findall(text))
-        alike = _alike(known.sub("…", text)) if len(of) == 1 else text
-        groups.setdefault(alike, []).append((text, "".join(of)))
-    said = []
-    for (first, _), *others in groups.values():
-        also = f" The same, with other numbers, of {', '.join(name for _, name in others)}." if others else ""
-        said.append(first + also)
-    return said
+def once_for_outputs(found: Iterable[Finding], names: Iterable[str]) -> list[Finding]:
+    """Say once what findings say of several outputs, given by their names, in the words of the first of them."""
+    groups = _alike(found, dict.fromkeys(names, ""))
+    return [replace(first, also=f"of {', '.join(others)}") if others else first for first, others in groups]
 
 
-def _shorter(text: str, known: re.Pattern[str], places: Mapping[str, tuple[str, int]]) -> str:
-    """Shorten the lists of a text: "F.1 2%, F.2 5%, F.3 4%" to "F 5% (step 2, the largest of steps 1 to 3)"."""
-    parts = re.split(r"(  |, |; |: |\. |\.$)", re.sub(rf" ({known.pattern}), (?={known.pattern})", r"  \1, ", text))
-    entries: list[list[str]] = []  # each with what separates it from the next
-    for piece, mark in zip(parts[::2], [*parts[1::2], ""], strict=True):
-        if entries and known.match(entries[-1][0]) and entries[-1][1] == ", " and not known.match(piece):
-            entries[-1] = [", ".join([entries[-1][0], piece]), mark]  # F.1 = 2 N, there 3 N; F.2 = …
-        else:
-            entries.append([piece, mark])
-    alike: dict[tuple[str, str], list[int]] = {}
-    for i, (piece, _) in enumerate(entries):
-        if found := known.match(piece):
-            alike.setdefault((places[found[1]][0], _alike(piece[found.end() :])), []).append(i)
-    for (of, said), where in alike.items():
-        if len(where) < MANY:
+def _alike(found: Iterable[Finding], kinds: Mapping[str, str]) -> list[tuple[Finding, list[str]]]:
+    """Return findings, and the outputs of which later ones say the same with other numbers.
+
+    That is, of one output each, of the same kind by `kinds`; findings of other outputs or several stay alone.
+    """
+    groups: dict[object, tuple[Finding, list[str]]] = {}
+    for one in found:
+        name = one.about[0].name if len(one.about) == 1 else ""
+        if name not in kinds:
+            groups[object()] = one, []
             continue
-        rests = {i: known.sub("", entries[i][0], count=1) for i in where}
-        steps = {i: places[known.findall(entries[i][0])[0]][1] for i in where}
-        most = max(where, key=lambda i: float((re.findall(NUMBER, rests[i]) or ["0"])[0].strip("−").replace(",", "")))
-        all_steps = _steps(list(steps.values()))
-        largest = f"{of}{rests[most]} (step {steps[most]}, the largest of {all_steps})"
-        entries[where[0]][0] = largest if "#" in said else f"{of} at {all_steps}{said}"
-        for i in where[1:]:
-            before = next(j for j in range(i - 1, -1, -1) if entries[j][0])
-            if entries[i][1] not in (", ", "; "):
-                entries[before][1] = entries[i][1]
-            entries[i] = ["", ""]
-    return "".join(piece + mark for piece, mark in entries).replace("  ", " ")
+        words = tuple((key, value) for key, value in one.values.items() if isinstance(value, str))
+        key = one.code, one.severity, one.subject, words, kinds[name]
+        if key in groups:
+            groups[key][1].append(name)
+        else:
+            groups[key] = one, []
+    return list(groups.values())
 
 
-def _alike(text: str) -> str:
-    """Leave numbers out of a text."""
-    return re.sub(NUMBER, "#", text)
+def _shorter(about: Sequence[Entry], places: Mapping[str, tuple[str, int]]) -> tuple[Entry, ...]:
+    """Shorten a list of outputs: F.1 2%, F.2 5%, F.3 4% to F 5% (step 2, the largest of steps 1 to 3)."""
+    alike: dict[object, list[Entry]] = {}
+    for entry in about:
+        alike.setdefault(places[entry.name][0] if entry.name in places else object(), []).append(entry)
+    short = []
+    for of, several in alike.items():
+        if len(several) < MANY:
+            short += several
+            continue
+        steps = _steps([places[entry.name][1] for entry in several])
+        if any(entry.size is None for entry in several):
+            short.append(Entry(f"{of} at {steps}", several[0].words))
+            continue
+        most = max(several, key=lambda entry: abs(entry.size or 0.0))
+        where = f" (step {places[most.name][1]}, the largest of {steps})"
+        short.append(Entry(str(of), most.words + where, most.size))
+    return tuple(short)
 
 
 def _steps(steps: Collection[int]) -> str:
@@ -149,4 +134,9 @@ def meshes_unknown(dataset: xr.Dataset) -> dict[str, bool]:
 
 
 def _kept(dataset: xr.Dataset) -> list[Finding]:
-    return [Finding(**one) for one in json.loads(dataset.attrs.get("findings", "[]"))]
+    return [Finding.read(one) for one in json.loads(dataset.attrs.get("findings", "[]"))]
+
+
+def _keep(dataset: xr.Dataset, found: Iterable[Finding]) -> None:
+    kept = [one.kept() for one in found]
+    dataset.attrs["findings"] = json.dumps(kept, ensure_ascii=False, default=lambda number: number.item())

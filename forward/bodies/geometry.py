@@ -16,7 +16,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from forward.bodies.elements import default_quadrature
 from forward.bodies.mesh_file import MeshFile
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from forward.readable import told
 from forward.settings import Settings
 
@@ -444,8 +445,7 @@ def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...
     moved = (
         f"{len(far)} points lie outside the body and are" if len(far) > 1 else "1 point lies outside the body and is"
     )
-    text = f"{moved} moved to its surface, by up to {told(far[name], 'm')} ('{name}')."
-    return (Finding("note", text),)
+    return (Finding("points-moved", "note", {"moved": moved, "far": told(far[name], "m"), "name": name}),)
 
 
 def extent(body: Body) -> str:

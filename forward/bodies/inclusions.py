@@ -16,7 +16,8 @@ from annotated_types import Gt, Unit
 from pydantic import BeforeValidator, Field
 
 from forward.bodies.geometry import Body, Length
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from forward.readable import told
 from forward.settings import Named
 
@@ -148,11 +149,7 @@ def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]
     for inclusion in inclusions:
         if inclusion.width < edge:
             wide, cell = told(inclusion.width, "m", 6), told(edge, "m", 3)
-            text = (
-                f"inclusions.{inclusion.label}.width = {wide} is below a cell ({cell}): few "
-                "quadrature points see the transition, and derivatives by place and size are rough."
-            )
-            yield Finding("warning", text)
+            yield Finding("inclusion-narrow", "warning", {"label": inclusion.label, "wide": wide, "cell": cell})
 
 
 # --- what follows from the numbers -----------------------------------------------------------------------------------

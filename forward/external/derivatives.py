@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from forward.model import Finding, FloatArray, ForwardModel, Solution, SolveError
+from forward.findings import Finding
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
 
 STEP = 1e-2  # of a difference, in standard deviations
 SHORTER = 4  # ratio of the steps to those of the differences that confirm
@@ -89,12 +90,13 @@ def _unsteady(
         for i in wrong[:SHOWN]
     )
     more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-    text = (
-        f"The model answers differently when it is asked again {AT_MEAN}: {listed}{more}. What it adds by chance, or "
-        "keeps from call to call, counts as an effect of the parameters: fix the seed of its random numbers, or what "
-        "it remembers."
+    return (
+        Finding(
+            "answers-differ",
+            "error" if share is None or share[wrong].max() > SLOPE else "warning",
+            {"where": AT_MEAN, "listed": listed, "more": more},
+        ),
     )
-    return (Finding("error" if share is None or share[wrong].max() > SLOPE else "warning", text),)
 
 
 def contradicted(
@@ -150,14 +152,7 @@ def contradicted(
         for _, output, name, wrong, right in sorted(worst, reverse=True)[:SHOWN]
     )
     more = f" and {len(worst) - SHOWN} more" if len(worst) > SHOWN else ""
-    return (
-        Finding(
-            "error",
-            f"The derivatives that the model states are not those of its values {where}: {said}{more}. What follows "
-            "from derivatives (expansions, controls, local sensitivities, modes) is wrong: correct the "
-            "jacobian, or leave it out.",
-        ),
-    )
+    return (Finding("derivatives-contradicted", "error", {"where": where, "said": said, "more": more}),)
 
 
 def _against(

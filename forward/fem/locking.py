@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from forward.findings import Finding
 from forward.materials.admissible import Materials, admissible, moduli
 from forward.materials.material import splits
-from forward.model import Finding
 
 Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths
 Formulation = Literal["displacement", "mixed", "auto"]
@@ -124,11 +124,11 @@ def of_locking(decision: Decision, cell: str, degree: int, materials: Materials)
     else:
         cure = "an energy with a constant D1, which has a mixed form"
     times = " and ".join([", ".join(f"{size:.3g}" for size in sizes[:2]), f"{sizes[2]:.3g}"])
-    text = (
-        f"Displacements alone on {cells} lock at {where}: a cantilever, Cook's membrane and a pressed block, a few "
-        f"cells across, were too stiff by factors of {times}; with one cell across it is more. Take {cure}."
+    yield Finding(
+        "locking",
+        "warning" if max(sizes) >= WORTH_A_WARNING else "note",
+        {"cells": cells, "where": where, "times": times, "cure": cure},
     )
-    yield Finding("warning" if max(sizes) >= WORTH_A_WARNING else "note", text)
 
 
 def _number(ratio: float) -> str:

@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
-from forward.model import Finding, FloatArray, ModelError
+from forward.model import FloatArray, ModelError
 from forward.reduced.said import without_answer
 from forward.registry import named
 from forward.scalars import Scalar
@@ -205,9 +206,9 @@ class Reduced(ModelSpec):
             first, last = ranges[path]
             if first < low - margin or last > high + margin:
                 yield Finding(
+                    "reduced-extrapolates",
                     "warning",
-                    f"{path} goes from {first:.4g} to {last:.4g}, but the reduced model was trained from {low:.4g} to "
-                    f"{high:.4g}: beyond, it is an extrapolation; reduce the body over the range that is needed.",
+                    {"path": path, "first": first, "last": last, "low": low, "high": high},
                 )
 
     @property
@@ -220,20 +221,10 @@ class Reduced(ModelSpec):
     def _of_errors(self) -> Iterator[Finding]:
         errors = self._about.told.get("errors", {})
         if not errors:
-            yield Finding(
-                "warning",
-                "Nobody has measured how far the reduced model is from its body: it was made without unseen samples, "
-                "or without any that both could solve. Errors of all numbers are those of sampling alone; make it with "
-                "method.unseen, 32 by default.",
-            )
+            yield Finding("reduced-unmeasured", "warning")
         large = [f"{name} {100 * error:.2g} %" for name, error in errors.items() if error > DOUBTFUL]
         if large:
-            yield Finding(
-                "warning",
-                f"On unseen samples the reduced model errs by {', '.join(large)} of the spread of these outputs (root "
-                "mean square): more snapshots or modes help, or model.tolerance: then the full model is asked where "
-                "estimates are large.",
-            )
+            yield Finding("reduced-errs", "warning", {"large": ", ".join(large)})
 
     def differences(self, body: Hyperelastic, unknown: Collection[str]) -> Iterator[str]:
         """Say why it cannot stand for a body with these parameters, one line each."""

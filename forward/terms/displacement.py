@@ -9,7 +9,7 @@ from annotated_types import Unit
 from pydantic import model_validator
 
 from forward.bodies.geometry import AXES, Axis, Body
-from forward.model import Finding
+from forward.findings import Finding
 from forward.readable import told
 from forward.settings import Named
 
@@ -48,8 +48,4 @@ def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[F
         largest = max(ends, key=abs)
         if path.startswith("displacements.") and abs(largest) > extent:
             far, long = told(largest, "m", 3), told(extent, "m", 3)
-            text = (
-                f"{path} reaches {far}, more than the length of the body, {long}: is it given in "
-                "another unit than metres?"
-            )
-            yield Finding("warning", text)
+            yield Finding("displacement-far", "warning", {"path": path, "far": far, "long": long})

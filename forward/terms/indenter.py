@@ -21,7 +21,8 @@ from pydantic import model_validator
 
 from forward.bodies.geometry import Body, Direction, Vector, tolerance, unit_vector
 from forward.bodies.surface import edges, facets, points
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from forward.readable import told
 from forward.scalars import Scalar
 from forward.settings import Settings
@@ -426,21 +427,15 @@ class Indenter(Term):
         edge = float(edges(corners[[near]])[0])
         if 0 < self.size < edge:
             radius, cell = told(self.size, "m"), told(edge, "m")
-            text = (
-                f"loads.{self.label} touches '{self.on}' over a radius of about {radius}, which is below the "
-                f"edges of the cells there ({cell}): its force and pressure are rough. Refine the mesh there."
+            yield Finding(
+                "tool-small", "warning", {"label": self.label, "boundary": self.on, "radius": radius, "cell": cell}
             )
-            yield Finding("warning", text)
         rim = self.edge or SHARP * (self.radius or 0)
         if self.shape == "flat" and rim < edge / ALONG:
             over, apart = told(rim, "m"), told(edge / ALONG, "m")
-            text = (
-                f"The edge of loads.{self.label} is rounded over {over}, less than the distance of the points at "
-                f"which contact is looked for on '{self.on}' ({apart}): where these pass it there are "
-                "several equilibria, whose forces differ by up to 15 % on coarse meshes, and one of them is found. "
-                "Refine the mesh there, or give it a rounder edge."
+            yield Finding(
+                "tool-edge", "warning", {"label": self.label, "over": over, "boundary": self.on, "apart": apart}
             )
-            yield Finding("warning", text)
 
     def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         """Find samples, at the ends of ranges, in which it starts deep in the body, misses it or goes through it."""
@@ -467,7 +462,7 @@ class Indenter(Term):
                     found[what] = size, where
         for what, (size, where) in found.items():
             yield Finding(
-                "warning", f"In some samples loads.{self.label} {what.format(told(size, 'm', 3))}: at {where}."
+                "tool-misses", "warning", {"label": self.label, "what": what.format(told(size, "m", 3)), "where": where}
             )
 
     def holds(self, body: Body) -> list[tuple[Vector, Vector]]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Unit
 
 from forward.bodies.geometry import Body, Direction, unit_vector
-from forward.model import Finding
+from forward.findings import Finding
 from forward.readable import told
 from forward.terms.term import Place, Term
 from forward.words import listed
@@ -45,11 +45,7 @@ class Spot(Term):
         edge = body.longest_edge / body.degree
         if self.width < edge / 2:
             wide, apart = told(self.width, "m", 6), told(edge, "m", 3)
-            text = (
-                f"loads.{self.label}.width = {wide} is below half the distance of nodes ({apart}): the "
-                "mesh hardly sees the spot."
-            )
-            yield Finding("warning", text)
+            yield Finding("spot-narrow", "warning", {"label": self.label, "wide": wide, "apart": apart})
 
     def words(self, numbers: Mapping[str, str]) -> str:
         """Say what it is, for reports."""

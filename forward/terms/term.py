@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from forward.bodies.geometry import Body, Vector
-from forward.model import Finding
+from forward.findings import Finding
 from forward.registry import Kinds, OfKind
 from forward.scalars import Scalar, numbers
 from forward.settings import Named

@@ -1,6 +1,6 @@
 """What makes a posterior doubtful: its distance from the prior, ends of ranges, noise, outliers, a model's stand-in.
 
-Each function returns doubts: findings with a few words for the verdict. None of them needs a solve. Those of meshes are
+Each function returns findings that have a few words for the verdict. None of them needs a solve. Those of meshes are
 in `inverse.criticism.doubts_of_meshes`.
 """
 
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from forward.model import FloatArray, Severity
+from forward.findings import Finding
+from forward.model import FloatArray
 from forward.readable import place, told
 from uq.inputs.distributions import Distribution
 
@@ -29,14 +30,6 @@ EXPANDED = 0.3  # error of an expansion over that of a datum that makes interval
 GRID = np.linspace(-40.0, 40.0, 8001)
 
 
-class Doubt(NamedTuple):
-    """A finding, and its wording in a verdict."""
-
-    severity: Severity
-    text: str
-    short: str
-
-
 def scores(distribution: Distribution, values: FloatArray) -> FloatArray:
     """Return how many prior deviations values (n,) are from the median, in the coordinate where the prior is normal."""
     return np.interp(values, distribution.from_normal(GRID)[0], GRID)
@@ -49,7 +42,7 @@ def far_from_prior(
     square: float,
     degrees: float,
     units: Mapping[str, str] = MappingProxyType({}),
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt parameters whose mode or mean is far from the prior, each by name, and all of them together.
 
     Parameters
@@ -75,36 +68,28 @@ def far_from_prior(
         if abs(distance) > FAR:
             centre = float(prior.from_normal(np.zeros(1))[0][0])
             value = float((mode, mean)[int(np.abs(distances).argmax())][k])
-            text = (
-                f"the posterior of {name} ({told(value, units.get(name, '1'), 4)}) lies {abs(distance):.1f} prior "
-                f"deviations from the prior ({told(centre, units.get(name, '1'), 4)}): the prior, the data or the "
-                "model is wrong"
-            )
-            short = f"{name} is {abs(distance):.1f} prior deviations from its prior"
-            found.append(Doubt("error" if abs(distance) > FARTHER else "warning", text, short))
+            values = {
+                "name": name,
+                "value": told(value, units.get(name, "1"), 4),
+                "distance": abs(distance),
+                "centre": told(centre, units.get(name, "1"), 4),
+            }
+            found.append(Finding("far-from-prior", "error" if abs(distance) > FARTHER else "warning", values))
     chance = float(chdtrc(degrees, square)) if degrees >= 1 and np.isfinite(square) else 1.0
     if chance < UNLIKELY and not found:
-        text = (
-            f"all unknowns together lie farther from the prior than it allows: a squared distance of {square:.3g} in "
-            f"{degrees:.0f} directions that the data tell (probability {chance:.1g})"
-        )
-        found.append(Doubt("error" if chance < IMPOSSIBLE else "warning", text, "the prior does not allow it"))
+        values = {"square": square, "degrees": degrees, "chance": chance}
+        found.append(Finding("far-from-prior-together", "error" if chance < IMPOSSIBLE else "warning", values))
     return found
 
 
-def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> list[Doubt]:
+def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> list[Finding]:
     """Say where a field is what its prior says: deviations (n,) of posterior and prior at places (n, 3)."""
     left = np.divide(std, prior_std, out=np.ones_like(std), where=prior_std > 0)
     share = float((left > UNSEEN).mean())
     if share < SOME:
         return []
     best, least = (f"{left[k]:.2g} of it at {_at(places[k])}" for k in _ends(left))
-    text = (
-        f"at {100 * share:.0f} % of the vertices the data say next to nothing: there the standard deviation is above "
-        f"{UNSEEN:g} of the prior's, and the value follows from prior and neighbours (smallest: {best}; largest: "
-        f"{least})"
-    )
-    return [Doubt("note", text, "")]
+    return [Finding("little-seen", "note", {"share": 100 * share, "unseen": UNSEEN, "best": best, "least": least})]
 
 
 def _at(where: FloatArray) -> str:
@@ -121,7 +106,7 @@ def at_an_end(
     mode: FloatArray,
     draws: FloatArray,
     units: Mapping[str, str] = MappingProxyType({}),
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt parameters at an end of a bounded range, by name, from the mode (d,) or draws (n, d) of the posterior.
 
     Their SI units are given by name too, for the words.
@@ -136,15 +121,12 @@ def at_an_end(
         for end, share in zip(("lower", "upper"), (shares, 1 - shares), strict=True):
             if (share[:-1] < END).mean() > CROWDED * END or share[-1] < END / 4:
                 value = prior.support[end == "upper"]
-                text = (
-                    f"{name} is at the {end} end of its range ({told(value, units.get(name, '1'), 4)}): the data want "
-                    "it beyond, and its interval is cut off there; widen the range, or explain it"
-                )
-                found.append(Doubt("warning", text, f"{name} is at the {end} end of its range"))
+                values = {"name": name, "end": end, "value": told(value, units.get(name, "1"), 4)}
+                found.append(Finding("at-an-end", "warning", values))
     return found
 
 
-def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatArray) -> list[Doubt]:
+def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatArray) -> list[Finding]:
     """Doubt an inferred size of the errors.
 
     Parameters
@@ -158,21 +140,18 @@ def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatAr
     """
     size = float(np.sqrt((sigma**2).mean()) * factor / np.sqrt((values**2).mean())) if (values != 0).any() else np.inf
     if size >= NOTHING_SEEN:
-        text = f"the inferred errors are {100 * size:.0f} % of the data ({factor:.3g} times the stated ones)"
-        return [Doubt("error", f"{text}: the model does not explain these data", "the model explains no data")]
+        return [Finding("model-explains-nothing", "error", {"size": 100 * size, "factor": factor})]
     if not any(1 / NOISE_FAR <= factor / known <= NOISE_FAR for known in (1.0, expected)):
-        text = f"the inferred errors are {factor:.3g} times the stated ones"
         cause = "the model, or what is said of the errors, is wrong" if factor > 1 else "the stated ones are too large"
-        return [Doubt("warning", f"{text}: {cause}", text)]
+        return [Finding("noise-far", "warning", {"factor": factor, "cause": cause})]
     return []
 
 
-def too_large_errors(square: float, degrees: float, probability: float) -> list[Doubt]:
+def too_large_errors(square: float, degrees: float, probability: float) -> list[Finding]:
     """Doubt stated errors that are far larger than the residuals."""
     factor = float(np.sqrt(square / degrees)) if degrees > 0 else 1.0
     if factor < 1 / NOISE_FAR and probability > 1 - STRANGE:
-        text = f"residuals are {factor:.2g} times the stated errors: those are too large, and intervals too wide"
-        return [Doubt("warning", text, "the stated errors are too large")]
+        return [Finding("errors-too-large", "warning", {"factor": factor})]
     return []
 
 
@@ -181,7 +160,7 @@ REMEDY = 'or allow for them: data.errors = { kind = "student-t" }'
 
 def strangers(
     residual: FloatArray, resolution: FloatArray, labels: Sequence[str], *, heavy: bool, remedy: str = REMEDY
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt outliers among the data.
 
     Parameters
@@ -211,15 +190,18 @@ def strangers(
     listed = "; ".join(f"{labels[i]}: {z[i]:+.1f}".replace("-", "−") for i in first)
     more = f"; and {len(which) - len(first)} more" if len(which) > len(first) else ""
     data = "1 datum does" if len(which) == 1 else f"{len(which)} data do"
-    text = f"{data} not belong to the other {len(z) - len(which)}, by residuals in standard deviations: {listed}{more}"
-    if heavy:
-        return [Doubt("note", text, "")]
     them = "it" if len(which) == 1 else "them"
-    text += f". Look at {them}{', ' if remedy else ''}{remedy}"
-    return [Doubt("warning", text, f"{data} not belong to the others")]
+    values = {
+        "data": data,
+        "others": len(z) - len(which),
+        "listed": listed,
+        "more": more,
+        "advice": "" if heavy else f". Look at {them}{', ' if remedy else ''}{remedy}",
+    }
+    return [Finding("strangers", "note" if heavy else "warning", values)]
 
 
-def expansion_off(error: Any, solves: Any) -> list[Doubt]:
+def expansion_off(error: Any, solves: Any) -> list[Finding]:
     """Doubt an expansion that misses left-out samples by a large part of the errors of the data.
 
     Parameters
@@ -233,15 +215,10 @@ def expansion_off(error: Any, solves: Any) -> list[Doubt]:
     if error is None or not float(error) > EXPANDED:
         return []
     off = float(error)
-    text = (
-        f"the expansion that the data sets share, of {int(solves)} solves, misses a datum by {off:.2g} of its error, "
-        "to which that is added: intervals are wider than need be; raise method.expansion, or let every data set "
-        "have solves of its own"
-    )
-    return [Doubt("error" if off > 1 else "warning", text, "the expansion that the data sets share is not accurate")]
+    return [Finding("shared-expansion-off", "error" if off > 1 else "warning", {"solves": int(solves), "off": off})]
 
 
-def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[Doubt]:
+def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[Finding]:
     """Say how alike the posteriors by a reduced model and by the body are.
 
     Parameters
@@ -254,12 +231,7 @@ def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[D
         Full solves so far.
     """
     name = max(shift, key=lambda one: abs(shift[one]))
-    found = f"by {solves} full solves, draws of it have weights worth {100 * share:.0f} % of their number"
+    values = {"solves": solves, "share": 100 * share, "name": name, "shift": abs(shift[name])}
     if share >= SAME:
-        moved = f"no mean moves by more than {abs(shift[name]):.2g} standard deviations ({name})"
-        return [Doubt("note", f"the posterior by the reduced model is that of the body: {found}, and {moved}", "")]
-    moved = f"the mean of {name} moves by {abs(shift[name]):.2g} standard deviations"
-    advice = "reduce the body with more modes and snapshots, or leave method.reduced out"
-    text = f"the posterior by the reduced model is not quite that of the body: {found}, and {moved}; {advice}"
-    short = "the reduced model does not give the posterior of the body"
-    return [Doubt("error" if share < HALF else "warning", text, short)]
+        return [Finding("reduced-alike", "note", values)]
+    return [Finding("reduced-off", "error" if share < HALF else "warning", values)]

@@ -1,6 +1,6 @@
 """What the error of a mesh makes doubtful: a posterior, or the comparison of models on meshes of their own.
 
-Each function returns doubts as those of `inverse.criticism.doubts`, judging by finer meshes that were solved on before.
+Each function returns findings as those of `inverse.criticism.doubts`, judging by finer meshes that were solved on.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from forward.model import FloatArray, Severity
-from inverse.criticism.doubts import Doubt
+from forward.findings import Finding
+from forward.model import FloatArray
 
 LINEAR = 2.0  # posterior deviations up to which a first-order shift of ln Z is about right
 MOVED = 1.0  # by which a finer mesh moves ln Z, "not worth more than a bare mention" (Kass and Raftery 1995)
@@ -23,12 +23,11 @@ UNSETTLED = 3.0  # error of the mesh over the noise from which on a correction t
 OF_FIELD, OF_OTHERS = 4.0, 0.3
 # The same of few parameters of bodies from files, whose cells are divided: 92 % of intervals hold at 1.6, 78 % at 2.9.
 OF_FILES = 2.0
-ADVICE = "take a finer one, or thinner cells at held faces (body.grading)"
 
 
 def mesh_too_coarse(
     looked: bool, why: str, error: FloatArray, shifts: Mapping[str, float], nodes: FloatArray
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt the mesh, judging by a finer one.
 
     Parameters
@@ -43,28 +42,20 @@ def mesh_too_coarse(
         The same for a field at the vertices (N,), or None.
     """
     if not looked:
-        return [Doubt("warning", f"not checked for the mesh: {why}", "not checked for the mesh")]
+        return [Finding("mesh-not-checked", "warning", {"why": why})]
     size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
-    data = f"a finer mesh moves the data by {size:.2g} standard deviations of the noise (at most {most:.2g})"
     listed, worst = _moves(shifts, nodes)
-    text = f"{data} and the unknowns, in deviations of the posterior, by: {listed}"
+    values = {"size": size, "most": most, "listed": listed, "worst": worst}
     if worst <= BIASED:
-        return [Doubt("note", text, "")]
-    severity: Severity = "error" if worst > WRONG else "warning"
-    short = f"its mesh is too coarse: unknowns move by {worst:.2g} deviations"
-    return [Doubt(severity, f"{text}. The mesh is too coarse for the noise: {ADVICE}", short)]
+        return [Finding("mesh-moves-little", "note", values)]
+    return [Finding("mesh-too-coarse", "error" if worst > WRONG else "warning", values)]
 
 
-def not_estimable(names: Sequence[str]) -> list[Doubt]:
+def not_estimable(names: Sequence[str]) -> list[Finding]:
     """Doubt data of outputs, by name, whose error of the mesh nothing tells."""
     if not names:
         return []
-    listed = ", ".join(names)
-    text = (
-        f"what the mesh does to {listed} is not known: largest stresses and pressures and areas of contact follow "
-        "single cells, and finer meshes show no limit of them; leave them out, or give them larger errors"
-    )
-    return [Doubt("warning", text, f"the error of the mesh in {listed} is not known")]
+    return [Finding("mesh-not-estimable", "warning", {"names": ", ".join(names)})]
 
 
 def mesh_corrected(
@@ -76,7 +67,7 @@ def mesh_corrected(
     settled: bool,
     counted: bool = True,
     from_file: bool = False,
-) -> list[Doubt]:
+) -> list[Finding]:
     """Say what correcting the error of the mesh has done, and doubt it where it decides.
 
     Parameters
@@ -95,27 +86,17 @@ def mesh_corrected(
     size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
     listed, worst = _moves(shifts, nodes)
     uncertain = max([value for value in left.values() if np.isfinite(value)], default=0.0)
-    text = (
-        f"the error of the mesh, {size:.2g} standard deviations of the noise (at most {most:.2g}), was corrected, "
-        f"which moved the unknowns, in deviations of the posterior, by: {listed}; what is uncertain of it is among the "
-        f"errors of the data, and makes up to {uncertain:.2g} of these deviations"
-    )
+    values = {"size": size, "most": most, "listed": listed, "uncertain": uncertain}
     if not settled:
-        severity: Severity = "error" if worst > WRONG and size > UNSETTLED else "warning"
-        return [Doubt(severity, f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
+        bad = worst > WRONG and size > UNSETTLED
+        return [Finding("mesh-correction-unsettled", "error" if bad else "warning", values)]
     if decides(worst, uncertain):
-        return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
+        return [Finding("mesh-correction-decides", "warning", values)]
     if len(nodes) and size > (OF_FIELD if counted else OF_OTHERS):
-        why = "that is more than was tested of fields on such meshes: what the data determine best may be off"
-        short = "its mesh is too coarse for what the data determine best"
-        return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
+        return [Finding("mesh-correction-of-field", "warning", values)]
     if from_file and not len(nodes) and beyond_files(size):
-        why = (
-            "that is more than corrections of meshes from files were found to hold for: unknowns may be off by several"
-        )
-        short = "the error of its mesh is larger than corrections of files hold for"
-        return [Doubt("warning", f"{text}. But {why} of their deviations; take a finer one", short)]
-    return [Doubt("note", text, "")]
+        return [Finding("mesh-correction-of-file", "warning", values)]
+    return [Finding("mesh-corrected", "note", values)]
 
 
 def decides(shift: Any, left: Any) -> Any:
@@ -141,7 +122,7 @@ def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
 
 def meshes_too_coarse(
     log_evidence: Mapping[str, float], added: Mapping[str, float], shifts: Mapping[str, float]
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt the meshes of candidates, judging by the effect of finer ones on their evidences.
 
     Parameters
@@ -160,37 +141,25 @@ def meshes_too_coarse(
     best, other = max(log_evidence, key=log_evidence.__getitem__), max(there, key=there.__getitem__)
     listed = ", ".join(f"{name} {change_in_words(change, shifts[name])}" for name, change in known.items())
     settled = all(certain(change, shifts[name]) for name, change in known.items())
-    text = f"finer meshes move ln Z by: {listed}"
+    values = {"listed": listed, "best": best, "other": other, "limit": MOVED}
     if best != other:
-        found = f"{text}. On these {other} is the most probable, and not {best}"
-        return [Doubt("error", f"{found}: the meshes are too coarse to tell; {ADVICE}", "meshes decide")]
-    if settled:
-        return [Doubt("note", f"{text}; {best} stays the most probable", "")]
-    text = f"{text}; {best} stays the most probable. An evidence that moves by more than {MOVED:g} is not to be trusted"
-    return [Doubt("warning", f"{text}: {ADVICE}", "meshes too coarse")]
+        return [Finding("evidence-decided-by-meshes", "error", values)]
+    return [Finding("evidence-settled", "note", values) if settled else Finding("evidence-moves", "warning", values)]
 
 
-def meshes_of_files(which: Sequence[str]) -> list[Doubt]:
+def meshes_of_files(which: Sequence[str]) -> list[Finding]:
     """Doubt evidences of candidates, by name, on meshes of files which err by more than corrections hold for."""
     if not which:
         return []
-    text = (
-        f"the corrected errors of the meshes of {', '.join(which)} are more than {OF_FILES:g} standard deviations of "
-        "the noise, which is more than corrections of meshes from files were found to hold for: a mesh alone may make "
-        "a candidate win or lose; take finer ones"
-    )
-    return [Doubt("warning", text, "meshes of files too coarse")]
+    return [Finding("meshes-of-files", "warning", {"models": ", ".join(which), "limit": OF_FILES})]
 
 
-def meshes_not_alike(corrected: Sequence[str], unknown: Sequence[str]) -> list[Doubt]:
+def meshes_not_alike(corrected: Sequence[str], unknown: Sequence[str]) -> list[Finding]:
     """Doubt evidences of candidates, by name, of which some are corrected for their meshes and some not looked at."""
     if not corrected or not unknown:
         return []
-    text = (
-        f"the meshes of {', '.join(corrected)} are corrected, and those of {', '.join(unknown)} could not be looked "
-        "at: their evidences do not compare, since a mesh alone may make a candidate win or lose"
-    )
-    return [Doubt("warning", text, "meshes are not corrected alike")]
+    values = {"corrected": ", ".join(corrected), "unknown": ", ".join(unknown)}
+    return [Finding("meshes-not-alike", "warning", values)]
 
 
 def certain(change: Any, shift: Any) -> Any:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from uq.findings import add
 
 if TYPE_CHECKING:
@@ -38,15 +39,13 @@ def with_mesh_errors(found: xr.Dataset, mesh: FloatArray | None, *, noise: bool)
     if not off:
         return found
     worst = chosen[np.argmax(times[chosen])]
-    of_chosen = f"{int((times[chosen] > 1).sum())} of the {len(chosen)} chosen ones"
-    text = (
-        f"The mesh is estimated to err by more than the noise at {off:,} of {size:,} candidates, {of_chosen} among "
-        f"them; at {names[worst]} it errs by {times[worst]:.2g} times the noise"
-    )
-    if noise:
-        add(found, Finding("note", f"{text}. This is counted as noise."))
-    else:
-        remedy = "a finer mesh, or an inversion that corrects the error as invert does"
-        said = f"what they are said to tell needs {remedy}; method.mesh_error = 'noise' counts it as noise"
-        add(found, Finding("warning", f"{text}: {said}."))
+    values = {
+        "off": off,
+        "size": size,
+        "off_chosen": int((times[chosen] > 1).sum()),
+        "chosen": len(chosen),
+        "worst": names[worst],
+        "times": times[worst],
+    }
+    add(found, Finding("design-mesh-as-noise", "note", values) if noise else Finding("design-mesh", "warning", values))
     return found

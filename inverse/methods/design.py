@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from forward.model import Finding, FloatArray, ModelError, SolveError
+from forward.findings import Finding
+from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.designs.candidates import Candidates, Each, Values
 from inverse.designs.compared import compared, with_values
@@ -198,11 +199,7 @@ class Design(Settings):
         result = result.assign(field_variance_told=("choice", share), left_out=missed)
         known = float(result["information"][-1])
         if missed > MISSED * known:
-            text = (
-                f"The chosen observations tell up to {missed:.2g} nat in directions beyond the {self.rank} that are "
-                f"kept, of {known:.3g}. Take a larger method.rank."
-            )
-            add(result, Finding("warning", text))
+            add(result, Finding("design-rank", "warning", {"missed": missed, "rank": self.rank, "known": known}))
         return with_mesh_errors(with_values(result, values, sigma, candidates), mesh, noise=self.mesh_error == "noise")
 
     def whitened(self, number: int, size: int) -> FloatArray:
@@ -327,15 +324,19 @@ class Design(Settings):
             log_bayes_factor=(("model", "other"), after.pairs()),
         ).assign_coords(model=list(inputs), other=list(inputs))
         if lost:
-            text = f"There is no answer at some of {self.draws} draws, which are left out: {', '.join(lost)}."
-            add(result, Finding("warning", text))
+            add(
+                result, Finding("design-no-answer-of-models", "warning", {"draws": self.draws, "lost": ", ".join(lost)})
+            )
         few = [name for name, one in inputs.items() if len(outputs[name]) < 4 * (len(one.names) + 1)]
         if few:
-            text = (
-                f"What {', '.join(few)} predict is known by few draws for so many unknowns: take more method.draws, at "
-                f"least {4 * (max(len(inputs[name].names) for name in few) + 1)}."
+            add(
+                result,
+                Finding(
+                    "design-few-draws",
+                    "warning",
+                    {"models": ", ".join(few), "least": 4 * (max(len(inputs[name].names) for name in few) + 1)},
+                ),
             )
-            add(result, Finding("warning", text))
         return with_values(result, values, sigma, candidates)
 
     def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
@@ -382,16 +383,13 @@ class Design(Settings):
         doubts = []
         lost = self.draws - len(told.rows)
         if lost:
-            text = f"The model has no answer at {lost} of {self.draws} draws, which are left out."
-            doubts.append(Finding("warning", text))
+            doubts.append(Finding("design-no-answer", "warning", {"lost": lost, "draws": self.draws}))
         gain, n = found["gain"].to_numpy(), len(choice.order)
         little = np.flatnonzero(gain < LITTLE * gain.sum() / n)
         if len(little) and n > 1:
-            text = (
-                f"From observation {little[0] + 1} of {n} on, each adds less than "
-                f"{LITTLE * gain.sum() / n:.2g} nat: they repeat what is known."
+            doubts.append(
+                Finding("design-repeats", "note", {"first": little[0] + 1, "n": n, "least": LITTLE * gain.sum() / n})
             )
-            doubts.append(Finding("note", text))
         if self.criterion == "information" and len(told.rows) > 1:
             shared = found["information_of_draw"].to_numpy()[:, -1]
             costs = found["candidate_cost"].to_numpy()
@@ -399,10 +397,9 @@ class Design(Settings):
             shares = shared / np.maximum(own, shared)
             worst = int(shares.argmin())
             if shares[worst] < ALIKE:
-                text = (
-                    f"What is best depends on the unknowns: at one of {len(own)} draws the chosen observations tell "
-                    f"{shared[worst]:.3g} nat, those that are best there {own[worst]:.3g}. Measure some of them first, "
-                    "and choose the others with that posterior (parameters.from)."
+                doubts.append(
+                    Finding(
+                        "design-depends", "warning", {"draws": len(own), "shared": shared[worst], "own": own[worst]}
+                    )
                 )
-                doubts.append(Finding("warning", text))
         return doubts

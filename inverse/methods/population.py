@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from forward.settings import Settings, nearest
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, fitted
 from uq.findings import add
@@ -386,24 +387,15 @@ def _findings(reached: _Reached, names: list[str]) -> Iterator[Finding]:
     again = [f"{name} ({times})" if times > 1 else name for name, times in reached.times.items()]
     if again:
         often = " (how often, in parentheses)" if max(reached.times.values()) > 1 else ""
-        yield Finding(
-            "note",
-            f"Few draws of {', '.join(again)} lay where the population has its specimens, so they were drawn again "
-            f"under a prior like the population{often}.",
-        )
+        yield Finding("population-redrawn", "note", {"specimens": ", ".join(again), "often": often})
     sizes = zip(names, (size for _, size in reached.estimates), strict=True)
     low = {name: f"{name} ({size:.0f})" for name, size in sizes if size < LEAST}
     if low:
         reasons = dict.fromkeys(reached.refused[name] for name in low if name in reached.refused)
         why = f"They cannot be drawn again: {'; '.join(reasons)}. " if reasons else ""
-        yield Finding(
-            "warning",
-            f"Few draws of {', '.join(low.values())} lie where the population has its specimens (effective sizes in "
-            f"parentheses): their estimates, and what they say of the population, are rough. {why}More samples in "
-            "their own study, or a prior like the population there, help.",
-        )
+        yield Finding("population-few-draws", "warning", {"specimens": ", ".join(low.values()), "why": why})
     if reached.fit.effective < MIXED:
         worth = f"{reached.fit.effective:.0f} independent ones"
-        yield Finding("warning", f"The draws of the population are worth {worth}: its ends are rough.")
+        yield Finding("population-worth", "warning", {"worth": worth})
     if len(names) < FEW:
-        yield Finding("note", f"{len(names)} specimens say little on how wide the population is: its prior does.")
+        yield Finding("population-small", "note", {"specimens": len(names)})

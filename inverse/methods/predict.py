@@ -120,8 +120,8 @@ def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
         return Band.unknown(len(evaluate.outputs), error.reason)
     mean, mean_error, std, std_error = (found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error"))
     lower, upper = found["quantiles"].to_numpy()
-    texts = [one.text for one in findings(found) if one.severity != "note"]
-    said = tuple(once_for_outputs(texts, evaluate.outputs))
+    doubts = [one for one in findings(found) if one.severity != "note"]
+    said = tuple(one.text for one in once_for_outputs(doubts, evaluate.outputs))
     failed = int((~found["ok"]).sum())
     said += (f"{failed} of {samples} solves have no answer",) if failed else ()
     return Band(mean, mean_error, std, std_error, lower, upper, 1 + samples, said)

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
 from uq.accuracy.doubts import FEWEST_ANSWERS, Told, doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
@@ -104,18 +105,9 @@ def with_mesh_errors(
     add(dataset, *doubts(dataset, found.evaluations, told), first=True)
     left_out = [words for name, words in WITHOUT.items() if name in dataset]
     if "mesh_error" in dataset and left_out:
-        text = (
-            f"The error of the mesh is not estimated of {' and of '.join(left_out)}, which follow from more than "
-            "outputs; that of the outputs says how large it may be."
-        )
-        add(dataset, Finding("note", text))
+        add(dataset, Finding("mesh-error-left-out", "note", {"what": " and of ".join(left_out)}))
     if len(found.points) and not found.measured and np.isfinite(found.saturation).any():
-        text = (
-            "What part of the error of the mesh estimates see is not measured on a finer mesh, which would take too "
-            "long for so few solves or too much memory, but typical: they are multiplied by "
-            f"{np.nanmax(found.saturation):.2g}, and half of them is doubted (mesh_error_doubt)."
-        )
-        add(dataset, Finding("note", text))
+        add(dataset, Finding("mesh-error-uncalibrated", "note", {"factor": np.nanmax(found.saturation)}))
     return dataset
 
 

@@ -54,7 +54,7 @@ def averaged(found: Mapping[str, xr.Dataset], probabilities: Sequence[float], er
         of_nodes = {f"field_{name}": (("node", "component"), fields[name]) for name in (*KEPT, "between")}
         dataset = dataset.assign_coords(component=["x", "y", "z"]).assign(of_nodes)
     for name, one in found.items():
-        add(dataset, *(finding._replace(text=f"Candidate '{name}': {finding.text}") for finding in findings(one)))
+        add(dataset, *(finding.of(f"Candidate '{name}'") for finding in findings(one)))
     dataset.attrs["stopped"] = "; ".join(f"{name}: {one.attrs['stopped']}" for name, one in found.items())
     return dataset
 

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray, Stability
+from forward.findings import Finding
+from forward.model import FloatArray, Stability
 from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
 
@@ -33,48 +34,28 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
     count, total = int(refused.sum()), len(known)
     if count:
         where = separated(inputs, evaluations.points, refused, ok)
-        text = f"{count} of {total} samples have no stable equilibrium, the body buckles there: {where}. "
-        if continued:
-            text += (
-                "The expansion continues beyond the end of the stable branch: its moments, quantiles and indices "
-                "cannot be trusted. Keep the parameters where all samples have an answer, or give the body the "
-                "imperfection or the small load that decides how it buckles."
-            )
-        else:
-            text += "Estimates are of the stable branch only, that is, over the samples that have an answer."
-        yield Finding("error" if continued else "warning", text)
+        code = "no-stable-state-continued" if continued else "no-stable-state"
+        yield Finding(code, "error" if continued else "warning", {"count": count, "total": total, "where": where})
     yield from of_jumps([evaluations], inputs, continued=continued)
     failed = ~ok & ~refused
     count = int(failed.sum())
     if count:
-        text = f"{count} of {total} samples have no answer: {separated(inputs, evaluations.points, failed, ok)}. "
-        if continued:
-            text += (
-                "The expansion continues there smoothly, which neither samples nor errors cover: its moments, "
-                "quantiles and indices hold only if the outputs do so too."
-            )
-        else:
-            text += "They are missing from the estimates, or are assumed to follow the control."
-        yield Finding("warning", text)
+        where = separated(inputs, evaluations.points, failed, ok)
+        code = "no-answer-continued" if continued else "no-answer"
+        yield Finding(code, "warning", {"count": count, "total": total, "where": where})
     partly = ~ok & np.isfinite(evaluations.outputs).any(axis=1)
     count = int(partly.sum())
     if count:
         known_outputs = np.isfinite(evaluations.outputs[partly])
         least, outputs = int(known_outputs.sum(axis=1).min()), known_outputs.shape[1]
-        text = (
-            f"{count} of {total} samples stop on their way: at least the first {least} of {outputs} outputs of each "
-            "are known and kept (`values`), but no estimate of any step counts these samples."
-        )
-        yield Finding("warning", text)
+        values = {"count": count, "total": total, "least": least, "outputs": outputs}
+        yield Finding("stopped-on-the-way", "warning", values)
     missed = int((known == Stability.MISSED).sum())
     if missed:
         screened = int((known == Stability.SCREENED).sum())
-        text = (
-            f"The screen of stability passed {missed} unstable equilibri{'um' if missed == 1 else 'a'} that counting "
-            f"found: of the {screened} states that were only screened, some may be unstable too. "
-            'Count all of them with model.solver.kind = "newton".'
-        )
-        yield Finding("error" if screened else "warning", text)
+        equilibria = "equilibrium" if missed == 1 else "equilibria"
+        values = {"missed": missed, "equilibria": equilibria, "screened": screened}
+        yield Finding("screen-missed", "error" if screened else "warning", values)
 
 
 def of_jumps(
@@ -97,25 +78,11 @@ def of_jumps(
         if inputs is not None and count < answered:
             (found,), (jumped,) = evaluations, snapped
             where = f": {separated(inputs, found.points, jumped, found.ok & ~jumped)}"
-        text = (
-            f"At {_share(count, total, what)} the branch of equilibria from rest ends before the whole load, and the "
-            f"body jumps{where}. The state taken there is stable, but where a body that jumps comes to rest is decided "
-            "by its motion, which no statics know; just before the jump it has both states."
-        )
-        if some:
-            text += (
-                " The expansion is smooth where outputs jump: its moments, quantiles and indices cannot be trusted. "
-                'Take plain samples (method.kind = "quasi-monte-carlo", control = "none").'
-            )
-        yield Finding("error" if some else "warning", text)
+        values = {"share": _share(count, total, what), "where": where}
+        yield Finding("jumps-continued" if some else "jumps", "error" if some else "warning", values)
     count = sum(int(one.sum()) for one in others)
     if count:
-        text = (
-            f"At {_share(count, total, what)} at least, the body has another stable equilibrium, which was found "
-            "first. The answers are those that raising the loads from zero leads to; a body with another history may "
-            "be in the other one."
-        )
-        yield Finding("warning", text)
+        yield Finding("other-states", "warning", {"share": _share(count, total, what)})
 
 
 def _share(count: int, total: int, what: str) -> str:

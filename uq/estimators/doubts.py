@@ -1,4 +1,4 @@
-"""Reasons to doubt estimates, found in the samples and expansions themselves: findings by output, in words."""
+"""Reasons to doubt estimates, found in the samples and expansions themselves: findings by output."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding, entries
+from forward.model import FloatArray
 from uq.estimators.tails import concentration, influences, missed, shown, spread
 
 if TYPE_CHECKING:
@@ -93,28 +94,13 @@ def of_tails(
         logarithmic = spread(values[:, i]) if relative[i] > SEEN else 0.0
         wider = (n / 64) ** WIDENS
         if logarithmic > HOPELESS[0] * wider and kappa > HOPELESS[1] / TAILS * largest:
-            yield Finding(
-                "error",
-                f"The standard deviation of {name} cannot be trusted: its {n} samples look log-normal, their "
-                f"logarithms have a standard deviation of {logarithmic:.2g}, and most sets of so few samples miss the "
-                "large values that determine it. Take many times more samples, or the logarithm as output.",
-            )
+            yield Finding("tails-hopeless", "error", {"n": n, "spread": logarithmic}, about=entries([name]))
         elif logarithmic > SPREAD * wider and kappa <= largest:
-            yield Finding(
-                "warning",
-                f"The {n} samples of {name} look log-normal, their logarithms have a standard deviation of "
-                f"{logarithmic:.2g}: few of them determine the standard deviation, and its 95 % interval may contain "
-                "the true value less often. Take more samples.",
-            )
+            yield Finding("tails-log-normal", "warning", {"n": n, "spread": logarithmic}, about=entries([name]))
         elif kappa > largest or beyond[i] > most * variance:
             kurtosis = (deviations[:, i] ** 4).mean() / variance**2
             kappa = max(kappa, concentration(plain[:, i], variance))
-            yield Finding(
-                "warning",
-                f"The standard deviation of {name} rests on few of its {n} samples, which count as {n / kappa:.0f} "
-                f"(their kurtosis is {kurtosis:.3g}): its 95 % interval may contain the true value less often, since "
-                "larger values may be missing. Take more samples.",
-            )
+            yield Finding("tails", "warning", {"n": n, "worth": n / kappa, "kurtosis": kurtosis}, about=entries([name]))
 
 
 def of_differences(
@@ -140,11 +126,10 @@ def of_differences(
             kappa = concentration(one[:, i], std[i] ** 2)
             if kappa > largest or tails[i] > most * std[i] ** 2:
                 yield Finding(
+                    "tails-of-difference",
                     "warning",
-                    f"The standard deviation of {names[i]} rests on few of the {n} samples of the difference between "
-                    f"meshes {level - 1} and {level}, which count as {n / max(kappa, 1.0):.0f}: its 95 % interval may "
-                    "contain the true value less often, since larger differences may be missing. Take more samples, "
-                    "or a finer coarsest mesh.",
+                    {"n": n, "coarser": level - 1, "level": level, "worth": n / max(kappa, 1.0)},
+                    about=entries([names[i]]),
                 )
 
 
@@ -153,11 +138,7 @@ def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
     n = len(values)
     for name, value, alike in zip(names, values[0].tolist(), equal(values).tolist(), strict=True):
         if alike:
-            yield Finding(
-                "warning",
-                f"All {n} samples of {name} are {_short(value)}. If it is no constant, its mean and standard deviation "
-                f"leave out what happens in up to {unmet(n):.2g} of all cases, and so do their errors.",
-            )
+            yield Finding("constant", "warning", {"n": n, "value": value, "unmet": unmet(n)}, about=entries([name]))
 
 
 def equal(values: FloatArray) -> NDArray[np.bool_]:
@@ -198,16 +179,7 @@ def of_field_tails(
     heavy = kurtosis > KURTOSIS * shown(n)
     share = float(np.average(heavy, weights=volumes))
     if share > PART:
-        yield Finding(
-            "warning",
-            f"The standard deviation of the displacements rests on few of the {n} samples in {share:.0%} of the body "
-            f"(their kurtosis is up to {kurtosis.max():.3g}): its 95 % intervals there may hold the truth less often, "
-            "since larger values may be missing. More samples tell.",
-        )
-
-
-def _short(number: float) -> str:
-    return f"{number:.6g}"
+        yield Finding("tails-of-field", "warning", {"n": n, "share": share, "kurtosis": kurtosis.max()})
 
 
 def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator[Finding]:
@@ -220,10 +192,10 @@ def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator
         ]
         if dropped and found.relative_std_error[i] > MATTERS:
             yield Finding(
+                "control-dropped",
                 "note",
-                f"The {control} control of {name} increases the scatter, or hides more than it explains: its "
-                f"{' and '.join(dropped)} "
-                f"{'are' if len(dropped) > 1 else 'is'} estimated without it.",
+                {"control": control, "dropped": " and ".join(dropped), "be": "are" if len(dropped) > 1 else "is"},
+                about=entries([name]),
             )
 
 
@@ -234,19 +206,10 @@ def of_expansion(
     for name, error in zip(names, relative.tolist(), strict=True):
         if error > nothing:
             yield Finding(
-                "error",
-                f"The expansion of {name} explains nothing: its error at samples left out of the fit is {error:.3g} of "
-                f"the standard deviation. Mean, standard deviation and quantiles are those of the {samples} samples; "
-                "there are no Sobol' indices, and the expansion must not be used. Take more samples, or a method "
-                "without an expansion.",
+                "expansion-explains-nothing", "error", {"error": error, "samples": samples}, about=entries([name])
             )
         elif error > trusted:
-            yield Finding(
-                "warning",
-                f"The error of the expansion of {name} is {error:.3g} of the standard deviation at samples left out of "
-                f"the fit. Mean, standard deviation and quantiles are those of the {samples} samples, with the "
-                "expansion as control; Sobol' indices and the expansion itself are rough.",
-            )
+            yield Finding("expansion-rough", "warning", {"error": error, "samples": samples}, about=entries([name]))
 
 
 def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samples: int) -> Iterator[Finding]:
@@ -262,13 +225,7 @@ def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samp
     for i, (name, error) in enumerate(zip(names, relative.tolist(), strict=True)):
         kappa = concentration(moved[:, i], float(deviations[:, i].var())) if error > ROUGH else 0.0
         if kappa > largest:
-            yield Finding(
-                "warning",
-                f"According to the expansion, the standard deviation of {name} is decided in a small part of the range "
-                f"(where the variance counts as if it came from 1 of {kappa:.2g} samples), and its error at samples "
-                f"left out of the fit is {error:.2g} of the standard deviation: there it may be off by more than its "
-                "error says. Take more samples.",
-            )
+            yield Finding("expansion-shape", "warning", {"kappa": kappa, "error": error}, about=entries([name]))
 
 
 def of_reach(
@@ -282,10 +239,10 @@ def of_reach(
         error = max(left, whole) if share > MOSTLY else left
         if share > BEYOND_SAMPLES and error > SEEN:
             yield Finding(
+                "expansion-reach",
                 "warning",
-                f"According to the expansion, {share:.0%} of the variance of {name} comes from parameters beyond all "
-                f"{samples} samples, and what it leaves out is about {error:.2g} of the standard deviation, which may "
-                "be further off than its interval says. Take more samples.",
+                {"share": share, "samples": samples, "error": error},
+                about=entries([name]),
             )
 
 
@@ -297,29 +254,15 @@ def of_centre(
     limits = np.maximum(np.maximum(CENTRE * loo, SEEN * std), rounding)
     for name, error, left, limit in zip(names, np.abs(errors).tolist(), loo.tolist(), limits.tolist(), strict=True):
         if error > limit:
-            yield Finding(
-                "warning",
-                f"At the mean parameters, which are not part of the fit, the error of the expansion of {name} is "
-                f"{error:.2g}, but its leave-one-out error is {left:.2g}. The output may vary more between the samples "
-                "than they show: take more.",
-            )
+            yield Finding("expansion-at-mean", "warning", {"error": error, "left": left}, about=entries([name]))
 
 
 def of_field(rest: float, trusted: float, nothing: float) -> Iterator[Finding]:
     """Find whether the error of the expansion of the displacement field is too large, over the standard deviation."""
     if rest > nothing:
-        yield Finding(
-            "error",
-            f"The expansion of the displacement field explains nothing: its error at samples left out of the fit is "
-            f"{rest:.2g} of the standard deviation. There are no Sobol' indices of the field, and its moments must not "
-            "be used. Take more samples, or a method without an expansion.",
-        )
+        yield Finding("field-expansion-explains-nothing", "error", {"rest": rest})
     elif rest > trusted:
-        yield Finding(
-            "warning",
-            f"The error of the expansion of the displacement field is {rest:.2g} of its standard deviation: its "
-            "moments, its Sobol' indices and fields predicted with it are rough. Take more samples.",
-        )
+        yield Finding("field-expansion-rough", "warning", {"rest": rest})
 
 
 def of_indices(dataset: xr.Dataset) -> Iterator[Finding]:
@@ -346,15 +289,19 @@ def of_indices(dataset: xr.Dataset) -> Iterator[Finding]:
         )
         for what, value, error, sign, excess, limit in checks:
             for i in np.flatnonzero(sign * (value - limit) > BEYOND * error + ROUNDING):
-                times = min(abs(value[i] - limit[i]) / max(error[i], 1e-300), 999)
-                here = f"{what} of {names[i]} for {of}, {value[i]:.3g}, is {excess} {limit[i]:.3g}"
                 yield Finding(
-                    "error", f"{here}, by {times:.0f} standard errors. It is wrong: do not use it, and report it."
+                    "index-out-of-bounds",
+                    "error",
+                    {
+                        "what": what,
+                        "parameter": names[i],
+                        "value": value[i],
+                        "excess": excess,
+                        "limit": limit[i],
+                        "times": min(abs(value[i] - limit[i]) / max(error[i], 1e-300), 999),
+                    },
+                    about=entries([of]),
                 )
         together = float(np.sqrt((S_error**2).sum()))
         if S.sum() > 1 + BEYOND * together + ROUNDING:
-            yield Finding(
-                "error",
-                f"The first-order indices for {of} add up to {S.sum():.3g} ± {together:.2g}, more than 1. They are "
-                "wrong: do not use them, and report it.",
-            )
+            yield Finding("indices-add-up", "error", {"total": S.sum(), "together": together}, about=entries([of]))

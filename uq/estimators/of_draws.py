@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding, entries
+from forward.model import FloatArray
 from uq.estimators.quantiles import quantiles_worth
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -72,11 +73,7 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
             dataset = dataset.assign({f"field_{name}_error": (("node", "component"), whole_error)})
     outputs = [str(one) for one, few in zip(dataset["output"].values, dominated[0], strict=True) if few]
     if outputs:
-        text = (
-            f"The draws are worth {draws.effective:,.0f} independent ones, which decides the error of the mean of "
-            f"{', '.join(outputs)}: more draws reduce it, more samples hardly."
-        )
-        add(dataset, Finding("note", text))
+        add(dataset, Finding("draws-decide", "note", {"worth": draws.effective}, about=entries(outputs)))
     return dataset
 
 
@@ -86,15 +83,16 @@ def findings_of_source(inputs: Inputs) -> Iterator[Finding]:
         yield from findings_of_few(inputs.draws)
 
 
-def findings_of_few(draws: Draws, whose: str = "") -> Iterator[Finding]:
-    """Say that draws are worth few."""
+def findings_of_few(draws: Draws, *whose: str) -> Iterator[Finding]:
+    """Say that draws, of these specimens if any, are worth few."""
     if draws.effective < FEW:
-        yield Finding(
-            "warning",
-            f"The {len(draws.values):,} draws of {', '.join(draws.names)}{whose} are worth {draws.effective:.0f} "
-            f"independent ones, fewer than {FEW:.0f}: errors count that, but tails of the distribution are hardly "
-            "known. More solves in the study that they come from, or a longer chain, help.",
-        )
+        values = {
+            "n": len(draws.values),
+            "names": ", ".join(draws.names),
+            "worth": draws.effective,
+            "fewest": FEW,
+        }
+        yield Finding("draws-few-of" if whose else "draws-few", "warning", values, about=entries(whose))
 
 
 def _share(inputs: Inputs, points: FloatArray, values: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding
+from forward.findings import Finding, entries
 from uq.findings import add, withdraw
 
 if TYPE_CHECKING:
@@ -49,5 +49,6 @@ def settled(dataset: xr.Dataset, units: Mapping[str, str]) -> None:
         withdraw(dataset, names)
         be = "is" if len(names) == 1 else "are"
         add(
-            dataset, Finding("note", f"{', '.join(names)} {be} zero but for rounding, beside outputs of the same unit.")
+            dataset,
+            Finding("only-rounding", "note", {"be": be}, about=entries(names)),
         )

@@ -11,13 +11,14 @@ Points that several methods or budgets ask for are solved once, and charged to e
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
 
-from forward.model import Finding, FloatArray, Severity
+from forward.findings import Finding, Severity
+from forward.model import FloatArray
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 from uq.estimators.moments import ESTIMATES
@@ -383,7 +384,7 @@ def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[Trial]]
         runs = sum(len(trials[i]) for i in own)
         for severity, told_as in TOLD:
             told = [
-                (rows[i][1], next(one.text for one in trial.doubts if one.severity in told_as))
+                (rows[i][1], next(one for one in trial.doubts if one.severity in told_as))
                 for i in own
                 for trial in trials[i]
                 if told_as & {one.severity for one in trial.doubts}
@@ -391,7 +392,7 @@ def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[Trial]]
             if told:
                 budgets = ", ".join(str(budget) for budget in dict.fromkeys(budget for budget, _ in told))
                 who = f"{label} with {budgets} samples, {len(told)} of {runs} runs"
-                yield Finding(severity, f"{who}: {told[0][1]}")
+                yield replace(told[0][1], severity=severity).of(who)
 
 
 def _compared(

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, correlations
@@ -188,10 +189,9 @@ class ByChoice:
         labels = [team.members[k].label for k in self._pair]
         least, most = (f(found.expected) / len(found.predicted) for f in (np.min, np.max))
         yield Finding(
+            "solves-chosen",
             "note",
-            f"Full solves were chosen where cheap models differ: {chosen:,} of {points:,} points, with probabilities "
-            f"from {least:.2g} to {most:.2g} that grow with the difference of '{labels[0]}' and '{labels[1]}', and "
-            "weighted by their inverse. Another choice would change the errors, but not what is estimated.",
+            {"chosen": chosen, "points": points, "least": least, "most": most, "first": labels[0], "second": labels[1]},
         )
         values = team.offsets[0] + found.predicted
         moved = found.rest[1] * len(found.rows)

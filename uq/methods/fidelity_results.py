@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from uq.estimators.fidelities import Found, correlations
 from uq.estimators.moments import ESTIMATES
 from uq.findings import add
@@ -104,12 +105,7 @@ def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bo
         few = int((failed & asked[:, 0]).sum())
         if failed.any() and few < KNOWN:
             lost, of = int(failed.sum()), int(asked[:, k].sum())
-            yield Finding(
-                "warning",
-                f"The cheap model '{one.label}' has no answer at {lost} of {of} samples, and the study's model was "
-                f"asked at {few} of these: so few tell little of what is missed there, and errors may be too small. "
-                "Leave it out, or take more samples.",
-            )
+            yield Finding("cheap-model-fails", "warning", {"model": one.label, "lost": lost, "asked": of, "few": few})
 
 
 def plain_correlations(team: Team) -> FloatArray:
@@ -129,24 +125,18 @@ def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool
     }
     needed = {name: float(np.nanmax(found, initial=0.0)) for name, found in others.items()}
     told = ", ".join(words[name].format(f"{number:,.0f}") for name, number in needed.items())
-    text = f"The errors of the means took the work of {spent:,.0f} solves; others are predicted to need: {told}."
+    values = {"spent": spent, "needed": told}
     least = min(needed, key=lambda name: needed[name])
     if needed[least] < spent and not expanded_used:
         instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least
-        text += f" The cheap models are not worth their cost here: take {instead}."
-    elif expanded_used:
-        text += " The expansion was taken in place of the cheap models."
-    return Finding("note", text)
+        return Finding("fidelities-not-worth", "note", values | {"instead": instead})
+    return Finding("fidelities-expansion-taken" if expanded_used else "fidelities-compared", "note", values)
 
 
 def preferred(by_models: float, by_expansion: float) -> Finding:
     """Say that an expansion takes the place of the cheap models."""
     times = f"{by_models / by_expansion:.3g} times" if by_expansion > 0 else "infinitely"
-    return Finding(
-        "note",
-        f"An expansion of the pilot leaves so little that, by prediction, the variance of the worst mean is {times} "
-        "smaller than with the cheap models for the same cost: it is taken in their place.",
-    )
+    return Finding("expansion-instead", "note", {"times": times})
 
 
 def useless(team: Team, found: Found) -> Iterator[Finding]:
@@ -156,7 +146,5 @@ def useless(team: Team, found: Found) -> Iterator[Finding]:
         if (squares[:, k] <= UNRELATED).all():
             beside = "what the tangents leave of it" if team.controlled else "it"
             yield Finding(
-                "note",
-                f"The cheap model '{one.label}' does not follow {beside} (squared correlations up to "
-                f"{squares[:, k].max():.2g} in the pilot): it is of no use for these outputs.",
+                "cheap-model-useless", "note", {"model": one.label, "beside": beside, "square": squares[:, k].max()}
             )

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from forward.model import Finding, FloatArray, SolveError
+from forward.findings import Finding
+from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated, gains

@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray, ForwardModel, Solution, SolveError, scattered
+from forward.findings import Finding
+from forward.model import FloatArray, ForwardModel, Solution, SolveError, scattered
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
 from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray, ForwardModel, SolveError, scattered
+from forward.findings import Finding
+from forward.model import FloatArray, ForwardModel, SolveError, scattered
 from uq.estimators.doubts import of_field_tails, of_tails
 from uq.estimators.indices import (
     ExchangedVariances,

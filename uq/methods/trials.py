@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding, FloatArray, SolveError
+from forward.findings import Finding
+from forward.model import FloatArray, SolveError
 from uq.estimators.moments import ESTIMATES, half_width
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import OfEvaluate, Recorder

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import Finding, FloatArray
+from forward.findings import Finding
+from forward.model import FloatArray
 from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_shape, of_tails
 from uq.estimators.indices import Analysis, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.findings import Finding
 from forward.materials.admissible import Materials
-from forward.model import Finding, FloatArray
+from forward.model import FloatArray
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
 from uq.inputs.distributions import Distribution
@@ -54,11 +55,7 @@ def findings_of_impossible(
     for name, values in zip(draws.names, draws.values.T, strict=True):
         share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
         if share > 0:
-            text = (
-                f"{100 * share:.2g} % of the draws of '{name}' are where the model is impossible ({objection}): these "
-                "samples count as failed, and results are over the others."
-            )
-            yield Finding("warning", text)
+            yield Finding("draws-impossible", "warning", {"share": 100 * share, "name": name, "objection": objection})
 
 
 def _impossible(number: Scalar, values: FloatArray, draws: Draws) -> tuple[float, str]:
@@ -137,24 +134,16 @@ def mistakes_of_priors(
             yield from mistakes_of_materials(found.within(materials), materials)
 
 
-def findings_of_materials(inputs: Inputs, where: str = "") -> Iterator[Finding]:
+def findings_of_materials(inputs: Inputs) -> Iterator[Finding]:
     """Say how much of a prior is inadmissible, and that the rest is rescaled."""
     if inputs.admitted < 1:
-        text = (
-            f"{where}{_share(inputs)} of the prior is of materials that are not stable at rest (μ or κ is not "
-            "positive): it has no weight, and the prior is scaled up where there is a material."
-        )
-        yield Finding("note", text)
+        yield Finding("prior-inadmissible", "note", {"share": _share(inputs)})
 
 
 def findings_of_draws(inputs: Inputs) -> Iterator[Finding]:
     """Say how many of the samples will be inadmissible, and that they fail."""
     if inputs.admitted < 1:
-        text = (
-            f"{_share(inputs)} of the samples are of materials that are not stable at rest (μ or κ is not positive): "
-            "they count as failed, and results are over the others. A bounded distribution leaves them out."
-        )
-        yield Finding("warning", text)
+        yield Finding("samples-inadmissible", "warning", {"share": _share(inputs)})
 
 
 def _share(inputs: Inputs) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from forward.fem.cost import ADDRESSES_OF_PROGRAM, BYTES_OF_PROGRAM
+from forward.findings import Finding
 from forward.machine import MIB, Headroom, limits
-from forward.model import Finding
 from workflows.run import own_code
 
 if TYPE_CHECKING:
@@ -22,14 +22,12 @@ def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
         wanted = need + of_program(limit)
         wanted *= 1 if limit.of_each_process else rank_groups
         if wanted > limit.size:
-            text = f"memory may run out: about {wanted / MIB:,.0f} MiB are needed, {limit}"
-            return Finding("warning", text)
+            return Finding("memory", "warning", {"needed": wanted / MIB, "limit": limit})
         largest, what = study.growth
         wanted = largest + of_program(limit)
         if wanted > limit.size:
             needed = f"about {wanted / MIB:,.0f} MiB are needed for {what} says"
-            text = f"the mesh is refined as far as memory allows: {needed}, {limit}"
-            return Finding("warning", text)
+            return Finding("memory-of-refinement", "warning", {"needed": needed, "limit": limit})
     return None
 
 

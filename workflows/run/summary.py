@@ -51,7 +51,7 @@ def summarised(
         "status": "partial" if done["failed"] else "complete",
         "stopped": dataset.attrs.get("stopped", study.stopped),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
-        "findings": [one._asdict() for one in findings(dataset)],
+        "findings": [{"severity": one.severity, "text": one.text, "code": one.code} for one in findings(dataset)],
         **done,
         **({"stability": stability} if stability else {}),
         **({"joined": joined} if joined else {}),

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.findings import Finding
 from forward.machine import write_whole
-from forward.model import Finding
 from forward.registry import named
 from uq.findings import add
 from workflows.results.directory import write_text
@@ -130,10 +130,8 @@ def _finding(study: Study, told: dict[str, Any]) -> Finding:
         elif name in named:
             size = max(abs(value + error), abs(error))
             left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
-    text = (
-        f"The mesh was refined at the mean of the parameters, from {first['unknowns']:,} to {last['unknowns']:,} "
-        f"unknowns; the errors that it makes there are estimated to be {', '.join(left)}"
-    )
+    values = {"first": first["unknowns"], "last": last["unknowns"], "left": ", ".join(left)}
     if told["stopped"] is None:
-        return Finding("note", f"{text}.")
-    return Finding("warning", f"{text}, above model.adapt.tolerance = {adapt.tolerance:g}: {told['stopped']}.")
+        return Finding("mesh-refined", "note", values)
+    values |= {"tolerance": adapt.tolerance, "why": told["stopped"]}
+    return Finding("mesh-refined-too-little", "warning", values)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from pydantic import ValidationError
 
+from forward.findings import Finding
 from forward.materials.material import constants
-from forward.model import Finding
 from forward.scalars import Mistake
 from uq.estimators import branch
 from uq.estimators.averaged import averaged
@@ -116,14 +116,9 @@ class AveragedStudy(Study):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about each candidate, and about those that are left out."""
-        found = [
-            one._replace(text=f"Candidate '{name}': {one.text}")
-            for name, part in self.parts.items()
-            for one in part.findings
-        ]
+        found = [one.of(f"Candidate '{name}'") for name, part in self.parts.items() for one in part.findings]
         if self.model.meshed:
-            text = "The error of the mesh is not estimated of averaged predictions: a study of one candidate tells it."
-            found.append(Finding("note", text))
+            found.append(Finding("averaged-without-mesh", "note"))
         return tuple(found)
 
     def plan(self, rank_groups: int) -> list[str]:
@@ -163,7 +158,7 @@ class AveragedStudy(Study):
         """Say of each candidate where it has no answer."""
         for name, found in evaluations.items():
             told = branch.findings(self.parts[name].inputs, found, continued=False)
-            add(dataset, *(one._replace(text=f"Candidate '{name}': {one.text}") for one in told))
+            add(dataset, *(one.of(f"Candidate '{name}'") for one in told))
         return with_unknown_meshes(self, dataset)
 
     def summary(self, job: Job) -> dict[str, Any]:
@@ -203,6 +198,5 @@ def _told(dataset: xr.Dataset) -> xr.Dataset:
     """Say which part of the variances is which model it is."""
     shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])
     parts = [f"{name} {100 * float(share):.2g} %" for name, share in zip(dataset.output.values, shares, strict=True)]
-    text = f"Not to know which candidate is right makes up this share of the variance: {', '.join(parts)}."
-    add(dataset, Finding("note", text))
+    add(dataset, Finding("averaged-shares", "note", {"shares": ", ".join(parts)}))
     return dataset

@@ -23,7 +23,7 @@ from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from forward.model import Finding
+    from forward.findings import Finding
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs

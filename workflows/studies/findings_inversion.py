@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.fem.finer import counted as counted_on
-from forward.model import Finding, Severity
+from forward.findings import Finding, Severity
 from forward.readable import told
 from forward.registry import named
 from inverse.data.shared_motion import said
@@ -17,7 +17,6 @@ from workflows.studies.predictions import of_file
 if TYPE_CHECKING:
     import xarray as xr
 
-    from inverse.criticism.doubts import Doubt
     from uq.inputs.distributions import Distribution
     from workflows.studies.inversion import Inversion
 
@@ -33,12 +32,12 @@ def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
         named("workflows.studies.predicted:keep_unknown_meshes")(study, dataset)
     for k, name in enumerate(dataset.data_set.values):
         if not bool(dataset["ok"][k]):
-            said.append(Finding("warning", f"{name} could not be inverted: {words[k]}"))
+            said.append(Finding("not-inverted", "warning", {"name": name, "why": words[k]}))
             continue
         doubts = doubts_of(dataset.isel(data_set=k), study, k)
         words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
-        said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
-        said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
+        said.append(Finding("verdict", SEVERITY.get(int(trust[k]), "note"), {"verdict": words[k]}, subject=str(name)))
+        said += [one.of(str(name)) for one in doubts]
         if study.predict is not None:
             said += named("workflows.studies.predicted:findings")(dataset.isel(data_set=k), name)
     found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
@@ -46,7 +45,7 @@ def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
     return found
 
 
-def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
+def _verdict(words: str, trust: int, doubts: list[Finding]) -> tuple[str, int]:
     """Return the sentence and the number of a verdict, given those before any doubts."""
     errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
     warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
@@ -59,7 +58,7 @@ def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
     return words, trust
 
 
-def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Doubt]:
+def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Finding]:
     """Say how alike the posteriors by a reduced model and by the body are, where there is one."""
     from inverse.criticism.doubts import reduced_off
 
@@ -69,12 +68,12 @@ def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Doubt]:
     return reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
 
 
-def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
+def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
     """Say what is doubtful about one data set, given by its number."""
     from inverse.criticism import doubts as criticism
     from uq.inputs.distributions import Normal
 
-    found: list[Doubt] = []
+    found: list[Finding] = []
     names = [str(name) for name in one.parameter.values]
     mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
     square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
@@ -103,18 +102,16 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
         count, farthest, rms = int(one["points_moved"]), float(one["largest_move"]), float(one["rms_move"])
         points = "1 point" if count == 1 else f"{count} points"
         where = " outside the body" if not study.measurements[number].on_surface else ""
-        moved = (
-            f"{points}{where} moved to its surface, by up to {told(farthest, 'm')} (root mean square {told(rms, 'm')})"
-        )
-        found.append(criticism.Doubt("note", moved, ""))
+        values = {"points": points, "where": where, "farthest": told(farthest, "m"), "rms": told(rms, "m")}
+        found.append(Finding("data-moved", "note", values))
     if "points_moved" in one:
         measured = study.measurements[number]
         if measured.registered is not None:
-            found.append(criticism.Doubt("note", f"registered: {measured.registered.described}", ""))
-        found += [criticism.Doubt("note", line, "") for line in measured.warnings]
+            found.append(Finding("registered", "note", {"how": measured.registered.described}))
+        found += [Finding("data-unusual", "note", {"text": line}) for line in measured.warnings]
     if "motion_eigenvalue" in one:
-        values = one["motion_eigenvalue"].to_numpy()
-        found.append(criticism.Doubt("note", said(values[np.isfinite(values)]), ""))
+        motions = one["motion_eigenvalue"].to_numpy()
+        found.append(Finding("motions", "note", {"text": said(motions[np.isfinite(motions)])}))
     found += (
         criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
     )
@@ -122,7 +119,7 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
     return found + _of_mesh(one, study, number)
 
 
-def _of_mesh(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
+def _of_mesh(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
     """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
     from inverse.criticism import doubts_of_meshes as of_meshes
 

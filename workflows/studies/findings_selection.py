@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding
+from forward.findings import Finding
 from forward.readable import percent
 from forward.words import number, with_error
 from workflows.studies.findings_solves import of_answers
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import ForwardModel
-    from inverse.criticism.doubts import Doubt
     from uq.inputs.distributions import Distribution
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.selection import Comparison
@@ -79,30 +78,34 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     said: list[Finding] = []
     if len(order) > 1:
         ln_B, error = bayes_factor(dataset, best, order[1])
-        support = (
-            f"{best} is the most probable of the candidates, with {_by(P)}; ln of the Bayes factor over "
-            f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B) if ln_B >= 0 else AGAINST}."
-        )
+        values = {
+            "best": best,
+            "probability": _by(P),
+            "second": order[1],
+            "factor": with_error(ln_B, error),
+            "grade": grade(ln_B) if ln_B >= 0 else AGAINST,
+        }
+        said.append(Finding("most-probable", "note", values))
     else:
-        support = f"{best} is the only candidate."
-    said.append(Finding("note", support))
+        said.append(Finding("only-candidate", "note", {"best": best}))
     wrong = conflicts(dataset, best)
     if wrong:
-        said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
+        said.append(Finding("best-of-bad", "warning", {"best": best, "wrong": "; and ".join(wrong)}))
     said += _disagreement(dataset)
     said += _depends(dataset, order)
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
-        said.append(Finding("warning", f"Left-out data are predicted best by {predicts}."))
+        said.append(Finding("left-out-predicted", "warning", {"other": predicts}))
     said += _stacked(dataset, order)
     if "held_out_score" in dataset:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
-            said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
+            said.append(Finding("whole-tests-predicted", "warning", {"other": predicts}))
     if "motion_eigenvalue" in dataset:
         from inverse.data.shared_motion import said as determined
 
-        said.append(Finding("note", f"{best}: {determined(dataset['motion_eigenvalue'].sel(model=best).to_numpy())}."))
+        motions = determined(dataset["motion_eigenvalue"].sel(model=best).to_numpy())
+        said.append(Finding("motions", "note", {"text": motions}, subject=best))
     return said
 
 
@@ -122,12 +125,19 @@ def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
     (most, _), (fewer, theirs) = sides
     groups = [str(group) for group in dataset["group"].values[theirs]]
     listed = ", ".join([*groups[:LISTED], *([f"and {len(groups) - LISTED} more"] if len(groups) > LISTED else [])])
-    text = (
-        f"Specimens disagree: of {first.size}, {(~theirs).sum()} are rather {most} and {theirs.sum()} rather {fewer} "
-        f"({listed}); ln of the Bayes factor over one material for all: {number(found.log_bayes_factor, 3)}. "
-        "Probabilities of the candidates are for one material of all specimens: compare them apart, or in two studies."
+    yield Finding(
+        "specimens-disagree",
+        "warning",
+        {
+            "specimens": first.size,
+            "many": int((~theirs).sum()),
+            "most": most,
+            "few": int(theirs.sum()),
+            "fewer": fewer,
+            "listed": listed,
+            "factor": number(found.log_bayes_factor, 3),
+        },
     )
-    yield Finding("warning", text)
 
 
 def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> Iterator[Finding]:
@@ -147,15 +157,14 @@ def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> 
             one = found.sel(model=model, group=group)
             where = f"{model} in {group}" if found.sizes["group"] > 1 else model
             if not bool(one["trusted"]):
-                yield Finding("error", f"Evidences not to be trusted: {where} ({one['verdict'].item()}).")
+                yield Finding("evidence-untrusted", "error", {"where": where, "verdict": one["verdict"].item()})
             elif one["trust"].item() == "neither":
-                text = f"Constants are Laplace's, and not to be trusted: {where} ({one['verdict'].item()})."
-                yield Finding("warning", text)
+                yield Finding("constants-of-laplace", "warning", {"where": where, "verdict": one["verdict"].item()})
     looked = found["mesh_checked"] if "mesh_checked" in found else found["trusted"]
     by_mesh = (found["trusted"] & ~judged["trusted"] & looked).any("group")
     names = [str(name) for name in found["model"].values[by_mesh.to_numpy()] if name not in wrong]
     if names:
-        yield Finding("error", f"Evidences not to be trusted for what meshes do to them: {', '.join(names)}.")
+        yield Finding("evidence-untrusted-for-meshes", "error", {"models": ", ".join(names)})
 
 
 def _depends(dataset: xr.Dataset, order: list[str]) -> Iterator[Finding]:
@@ -166,9 +175,9 @@ def _depends(dataset: xr.Dataset, order: list[str]) -> Iterator[Finding]:
         if other[0] != best:
             changed.append(f"{other[0]} with {variant}")
         elif other != order:
-            yield Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+            yield Finding("order-depends", "note", {"variant": variant, "best": best, "order": ", ".join(other)})
     if changed:
-        yield Finding("warning", f"It depends: the most probable is {'; '.join(changed)}.")
+        yield Finding("winner-depends", "warning", {"changed": "; ".join(changed)})
 
 
 def doubts_of_selection(
@@ -220,11 +229,11 @@ def doubts_of_selection(
         if "mesh_checked" in dataset:
             found += _doubts_of_mesh(dataset, best, group)
         where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
-        said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
+        said += [one.of(where) for one in found]
     return said + _doubts_of_meshes(dataset, best)
 
 
-def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Doubt]:
+def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
     from inverse.criticism import doubts_of_meshes as of_meshes
 
@@ -258,13 +267,13 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
         for which in (dataset["mesh_corrected"].any("group"), ~dataset["mesh_checked"].all("group"))
     )
     said = [
-        Finding("warning", f"{model}: not checked for the mesh: {one['mesh_why'].item()}.")
+        Finding("mesh-not-checked", "warning", {"why": one["mesh_why"].item()}, subject=model)
         for model in map(str, dataset.model.values)
         for one in [dataset.isel(group=0).sel(model=model)]
         if model != best and not bool(one["mesh_checked"])
     ]
     said += [
-        Finding(doubt.severity, f"{model}: {doubt.text}.")
+        doubt.of(model)
         for model in map(str, dataset.model.values)
         for group in map(str, dataset.group.values)
         if model != best and bool(dataset["mesh_corrected"].sel(model=model, group=group))
@@ -274,10 +283,9 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
     coarse = _too_coarse_for_files(dataset).any("group")
-    doubts = of_meshes.meshes_not_alike(corrected, unknown)
-    doubts += of_meshes.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
-    doubts += of_meshes.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
-    return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
+    said += of_meshes.meshes_not_alike(corrected, unknown)
+    said += of_meshes.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
+    return said + of_meshes.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
 
 
 def contradictions(study: Comparison, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
@@ -286,7 +294,7 @@ def contradictions(study: Comparison, name: str, make: Callable[[], ForwardModel
     if name not in specs or specs[name].shareable:
         return []
     inputs = study.candidates[name].inputs
-    return [one._replace(text=f"Candidate '{name}': {one.text}") for one in of_answers(make(), inputs)]
+    return [one.of(f"Candidate '{name}'") for one in of_answers(make(), inputs)]
 
 
 def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Dataset:
@@ -330,8 +338,7 @@ def _stacked(dataset: xr.Dataset, order: list[str]) -> list[Finding]:
     parts = ", ".join(
         f"{name} {100 * float(weights.sel(model=name)):.2g} %" for name in ranking(weights) if weights.sel(model=name)
     )
-    text = f"Left-out data are predicted best by a mixture (stacking): {parts}. Probabilities say which candidate is"
-    return [Finding("note", f'{text} true, if one is; model = "stacked" of `from` predicts with the mixture.')]
+    return [Finding("mixture-predicted", "note", {"parts": parts})]
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:

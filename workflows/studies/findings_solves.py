@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.external.derivatives import mistrusted
-from forward.model import Finding, SolveError
+from forward.findings import Entry, Finding
+from forward.model import SolveError
 from forward.words import number, with_unit
 from uq.estimators.branch import of_jumps
 from uq.evaluation.block import merge
@@ -48,12 +49,15 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     found, right = (solution.outputs for solution in solutions)
     units = {output.name: output.unit for output in spec.returned}
     said = [
-        f"{name} = {with_unit(number(float(value)), units[name])}, there {with_unit(number(float(other)), units[name])}"
+        Entry(
+            name,
+            f" = {with_unit(number(float(value)), units[name])}, there {with_unit(number(float(other)), units[name])}",
+            float(value),
+        )
         for name, value, other in zip(model.outputs, found, right, strict=True)
     ]
     form = "quadratic cells and pressures" if better.mixed else "quadratic cells"
-    text = f"At the mean of the inputs, against {form} on the same mesh, which lock less: {'; '.join(said)}."
-    return [Finding("warning", text)]
+    return [Finding("locking-measured", "warning", {"form": form}, about=tuple(said))]
 
 
 def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations] = ()) -> tuple[Finding, ...]:
@@ -93,8 +97,7 @@ def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
     if not lost:
         return jumps
     solves = sum(len(found.points) for found in every)
-    text = (
-        f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
-        f"({lost[0].reason}): their likelihood is zero, and they count as answered."
-    )
-    return [Finding("note", text), *jumps]
+    return [
+        Finding("solves-inadmissible", "note", {"lost": len(lost), "solves": solves, "reason": lost[0].reason}),
+        *jumps,
+    ]

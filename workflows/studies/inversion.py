@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
-from forward.model import Finding
+from forward.findings import Finding
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
@@ -294,11 +294,7 @@ class Inversion(StudyKind):
             return
         sought = ", ".join([*unknown, *(f"the mean of the field '{label}'" for label in fields)])
         source = f"{', '.join(known)} as stated" if known and not fields else "the prior alone"
-        yield Finding(
-            "warning",
-            "No force acts on the specimen or is among the data, so displacements tell ratios of stiffnesses only: "
-            f"the absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case).",
-        )
+        yield Finding("ratios-only", "warning", {"sought": sought, "source": source})
 
     @model_validator(mode="before")
     @classmethod

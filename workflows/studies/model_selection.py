@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 
 from forward.fem.finer import finer
-from forward.model import Finding, ForwardModel
+from forward.findings import Finding
+from forward.model import ForwardModel
 from forward.scalars import Mistake
 from forward.settings import Settings, one_line
 from forward.spec import MEASURED, SPECIMEN, ModelSpec, usual_kind
@@ -215,8 +216,7 @@ class ModelSelection(Comparison):
         """Say of which measured outputs nothing tells the error of the mesh."""
         never = (self.data.not_estimable(spec) for spec in self.of_candidates.values())
         names = tuple(dict.fromkeys(name for several in never for name in several))
-        for one in not_estimable(names) if names and self.unchecked else ():
-            yield Finding(one.severity, f"{one.text[0].upper()}{one.text[1:]}.")
+        yield from not_estimable(names) if names and self.unchecked else ()
 
     @property
     def models(self) -> dict[str, Candidate]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import model_validator
 
-from forward.model import Finding
+from forward.findings import Finding
 from forward.registry import named
 from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.of_draws import findings_of_few
@@ -67,9 +67,8 @@ class PopulationStudy(StudyKind):
     def findings(self) -> tuple[Finding, ...]:
         """Say which specimens are known by few draws."""
         every = self.posteriors if self._there else {}
-        few = [found for name, draws in every.items() for found in findings_of_few(draws, f" of {name}")]
-        said = once_for_outputs([found.text for found in few], tuple(every))
-        return tuple(few[0]._replace(text=text) for text in said)
+        few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
+        return tuple(once_for_outputs(few, every))
 
     @property
     def _there(self) -> bool:

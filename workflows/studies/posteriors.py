@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from forward.model import Finding
+from forward.findings import Finding
 from forward.settings import nearest
 from inverse.low_dimensional.posterior import NOISE
 from uq.evaluation.hdf5 import variables
@@ -370,8 +370,7 @@ def findings(study: Study, source: Source) -> Iterator[Finding]:
             f"{name} = {here[name]:g}, there {v:g}" for name, v in fixed.items() if name in here and here[name] != v
         ]
         if other:
-            text = f"Constants are not those with which {source.file} was calibrated: {'; '.join(other)}."
-            yield Finding("warning", text)
+            yield Finding("constants-changed", "warning", {"source": source.file, "changed": "; ".join(other)})
 
 
 def _directory(file: str) -> Path:

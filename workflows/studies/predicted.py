@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import ValidationError
 
-from forward.model import Finding, FloatArray, ForwardModel
+from forward.findings import Entry, Finding, entries
+from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
 from forward.specimen import SHARED, LoadCase, Specimen, in_words, shared_paths
 from inverse.methods import predict
@@ -242,29 +243,35 @@ def keep_unknown_meshes(study: Inversion, dataset: xr.Dataset) -> None:
 
 def findings(one: xr.Dataset, name: str) -> Iterator[Finding]:
     """Say what is doubtful of the predictions of a data set."""
+    for found in _doubts(one):
+        yield found.of(f"{name}: predictions")
+
+
+def _doubts(one: xr.Dataset) -> Iterator[Finding]:
     why = str(one["prediction_why"].item())
     if why:
-        yield Finding("warning", f"{name}: predictions: {why}.")
+        yield Finding("prediction-doubtful", "warning", {"text": why})
     std, mesh = one["prediction_std"].to_numpy(), one["prediction_mesh_error"].to_numpy()
     off = _over(one, np.abs(mesh), std)
     if off:
-        text = f"the mesh is estimated to move {off} standard deviations, which the intervals do not hold: a finer mesh"
-        yield Finding("warning", f"{name}: predictions: {text} helps, or add what is said of it.")
+        yield Finding("prediction-mesh", "warning", about=off)
     rough = _over(one, one["prediction_mean_error"].to_numpy(), std)
     if rough:
-        text = f"the mean is known to {rough} standard deviations only: more predict.samples reduce that"
-        yield Finding("warning", f"{name}: predictions: {text}.")
+        yield Finding("prediction-rough", "warning", about=rough)
     unknown = meshes_unknown(one) if np.isfinite(std).any() else {}
     untold = [str(goal) for goal, error in zip(one["goal"].values, mesh, strict=True) if np.isnan(error)]
     failed, never = ([goal for goal in untold if unknown.get(goal) is planned] for planned in (True, False))
     if failed:
-        words = f"estimates of the error of the mesh failed of {', '.join(failed)}"
-        yield Finding("error", f"{name}: predictions: {words}.")
+        yield Finding("prediction-mesh-failed", "error", about=entries(failed))
     if never:
-        yield Finding("note", f"{name}: predictions: the error of the mesh is not estimated of {', '.join(never)}.")
+        yield Finding("prediction-mesh-unknown", "note", about=entries(never))
 
 
-def _over(one: xr.Dataset, errors: FloatArray, std: FloatArray) -> str:
-    """Name the outputs whose errors (k,) are large against their standard deviations (k,)."""
+def _over(one: xr.Dataset, errors: FloatArray, std: FloatArray) -> tuple[Entry, ...]:
+    """Return the outputs whose errors (k,) are large against their standard deviations (k,)."""
     parts = zip(one["goal"].values, errors, std, strict=True)
-    return ", ".join(f"{goal} by {error / width:.2g}" for goal, error, width in parts if error > LARGE * width > 0)
+    return tuple(
+        Entry(str(goal), f" by {error / width:.2g}", error / width)
+        for goal, error, width in parts
+        if error > LARGE * width > 0
+    )

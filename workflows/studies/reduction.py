@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from forward.model import Finding
+from forward.findings import Finding
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import Settings

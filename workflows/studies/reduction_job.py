@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import xarray as xr
 
-from forward.model import Finding, SolveError
+from forward.findings import Finding
+from forward.model import SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
@@ -260,11 +261,7 @@ class _Making:
         sizes = np.sqrt((errors**2).mean(axis=0))
         told = {"unseen without an estimate": missing, "errors": dict(zip(names, sizes.tolist(), strict=True))}
         if missing:
-            text = (
-                f"At {missing} of {len(errors)} unseen samples the larger model that estimates errors is not stable, "
-                "though the body is: there are no estimates, and with a tolerance the full model is asked."
-            )
-            add(found, Finding("note", text))
+            add(found, Finding("reduced-estimates-missing", "note", {"missing": missing, "samples": len(errors)}))
         if not known.any():
             return told
         errors, estimates = errors[known], estimates[known]
@@ -278,12 +275,7 @@ class _Making:
             if not (low <= share <= high and rest <= LEFT * size) and size > EXACT
         ]
         if off:
-            text = (
-                "Estimated errors of the reduced model are not its errors: estimated over true, and what corrections "
-                f"leave of the errors, on unseen samples, {'; '.join(off)}. The sizes of errors on these samples are "
-                "what can be trusted; with a larger method.more or more snapshots estimates may come closer."
-            )
-            add(found, Finding("warning", text))
+            add(found, Finding("reduced-estimates-off", "warning", {"off": "; ".join(off)}))
         return told | {
             "errors after correction": dict(zip(names, left.tolist(), strict=True)),
             "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError, model_validator
 
+from forward.findings import Finding
 from forward.machine import MIB
-from forward.model import Finding, ModelError
+from forward.model import ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
@@ -204,33 +205,17 @@ class Study(Sourced, StudyKind):
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self.accuracy.mesh_error and self.spec.hidden:
-            yield Finding(
-                "note", f"The error of the mesh is not estimated: {self.spec.hidden}; look at it with the body."
-            )
+            yield Finding("mesh-of-body", "note", {"why": self.spec.hidden})
         elif "mesh_error" in self.accuracy.model_fields_set and self.accuracy.mesh_error and not self.spec.meshed:
-            yield Finding(
-                "note",
-                "The error of the mesh is not estimated, as accuracy.mesh_error = true asks for: a model of kind "
-                f"'{self.model.kind}' has no mesh of its own.",
-            )
+            yield Finding("no-mesh", "note", {"kind": self.model.kind})
         if self._estimating and self._too_large is not None:
             yield Finding(
-                "warning",
-                f"The error of the mesh is not estimated: that would take about {self._too_large:,.0f} MiB for each "
-                f"group of ranks, more than accuracy.memory = {self.accuracy.memory:,.0f} MiB.",
+                "mesh-estimates-too-large", "warning", {"memory": self._too_large, "limit": self.accuracy.memory}
             )
         if self.accuracy.tolerance is None and 0 < self.estimates < FEWEST:  # a tolerance takes as many as it needs
-            yield Finding(
-                "note",
-                f"The error of the mesh is estimated at {self.estimates} points only: more would take over a fifth of "
-                "the study, by prediction. What so few leave open is counted (mesh_error_doubt); more solves pay "
-                "for more.",
-            )
+            yield Finding("mesh-estimates-few", "note", {"points": self.estimates})
         if self.accuracy.mesh_error and self.spec.meshed and self.spec.remembers:
-            yield Finding(
-                "note",
-                f"The error of the mesh is not estimated with {self.spec.remembers}: compare with a finer mesh.",
-            )
+            yield Finding("mesh-with-memory", "note", {"what": self.spec.remembers})
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:

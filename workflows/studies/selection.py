@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import Vector
+from forward.findings import Finding
 from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume, units
 from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
-from forward.model import Finding, ForwardModel
+from forward.model import ForwardModel
 from forward.registry import KindError, named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
@@ -146,7 +147,7 @@ class Comparison(StudyKind):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the study before anything is solved."""
-        of_all = (findings_of_materials(one.inputs, f"{name}: ") for name, one in self.models.items())
+        of_all = ([found.of(name) for found in findings_of_materials(one.inputs)] for name, one in self.models.items())
         return tuple(finding for found in of_all for finding in found)
 
     @property

@@ -13,7 +13,7 @@ from forward.settings import Settings
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import Finding
+    from forward.findings import Finding
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble

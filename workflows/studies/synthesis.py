@@ -28,7 +28,7 @@ from workflows.studies.study import StudyKind
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import Finding
+    from forward.findings import Finding
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate

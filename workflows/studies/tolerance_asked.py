@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from forward.model import Finding, ModelError
+from forward.findings import Finding, entries
+from forward.model import ModelError
 from forward.scalars import Mistake
 from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
@@ -117,17 +118,14 @@ def findings(study: Study) -> Iterator[Finding]:
         why = "accuracy.mesh_error = false"
         if study.accuracy.mesh_error:
             why = "it is not estimated, so that the tolerance will not be said to be kept"
-        yield Finding("warning", f"accuracy.tolerance does not count the error of the mesh: {why}.")
+        yield Finding("tolerance-without-mesh", "warning", {"why": why})
         return
     unknown = [output.name for output in study.spec.returned if not getattr(output, "estimable", True)]
     if unknown:
-        listed = ", ".join(unknown)
-        text = f"accuracy.tolerance does not count the error of the mesh in {listed}, of which there is no estimate."
-        yield Finding("warning", text)
+        yield Finding("tolerance-without-mesh-of", "warning", about=entries(unknown))
     how, words = refinement(study)
     if not how and not study.model.adaptive:
-        text = f"accuracy.tolerance: the mesh {words}. If its error is too large for the tolerance, that will be said."
-        yield Finding("note", text)
+        yield Finding("tolerance-mesh-fixed", "note", {"words": words})
 
 
 def plan(study: Study) -> Iterator[str]:

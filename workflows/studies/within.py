@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import Finding, FloatArray, SolveError
+from forward.findings import Finding, entries
+from forward.model import FloatArray, SolveError
 from uq.accuracy.consequences import has
 from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
@@ -198,43 +199,35 @@ def contradictions(meshes: Sequence[Mapping[str, Any]], outputs: Mapping[str, An
         seen, foreseen = value - its_value, its_error - error
         off = abs(seen - foreseen)
         if off > FAR_OFF * np.hypot(doubt, its_doubt) and off > outputs[name]["mean"]["error"]:
-            text = (
-                f"The estimates of the mesh error of {name} contradict each other: between meshes of "
-                f"{coarse['unknowns']:,} and {fine['unknowns']:,} unknowns its mean moved by {seen:.2g}, where they "
-                f"foresaw {foreseen:.2g}. The error of the corrected value may be larger than is said."
+            yield Finding(
+                "mesh-estimates-contradict",
+                "warning",
+                {"coarse": coarse["unknowns"], "fine": fine["unknowns"], "seen": seen, "foreseen": foreseen},
+                about=entries([name]),
             )
-            yield Finding("warning", text)
 
 
 def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
     """Say that the tolerance is not kept, and what keeps it from being so."""
     worst, shares = told["worst"], told["shares"]
-    of = f"the {worst['of']} of {worst['output']}"
-    taken = ", ".join(f"{source} {100 * shares[source]:.2g} %" for source in SOURCES[:-1] if shares[source] > 0)
     if told["kept"]:
         return
-    reached = f"{of} is known to {told['reached']:.2g}"
-    asked_for = f"accuracy.tolerance = {told['tolerance']:g}"
-    text = f"{asked_for} is not reached: {reached} (of the tolerance: {taken})."
+    asked = {"tolerance": told["tolerance"]}
     if told["unmet"]:
-        listed = ", ".join(told["unmet"])
-        share = max(told["unmet"].values())
-        yield Finding(
-            "error",
-            f"{asked_for} is not known to be reached: all samples of {listed} are the same, so that what happens in up "
-            f"to {share:.2g} of all cases may be missed, and with it any part of mean and standard deviation. Leave a "
-            "constant out of the outputs; to meet an event, give a [method] with many samples.",
-        )
+        values = asked | {"share": max(told["unmet"].values())}
+        yield Finding("tolerance-constants", "error", values, about=entries(told["unmet"]))
         if shares["total"] <= 1 and (told["mesh"] is None or told["mesh"]["estimated"]):
             return
+    taken = ", ".join(f"{source} {100 * shares[source]:.2g} %" for source in SOURCES[:-1] if shares[source] > 0)
+    values = asked | {"of": worst["of"], "reached": told["reached"], "taken": taken}
     if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
-        if told["mesh"] is not None and told["mesh"]["tried"]:
-            why = f" {told['reasons'][0]}"
-        else:
-            text, why = f"{asked_for} is not reached.", f" The error of the mesh is not known; but for it, {reached}."
+        tried = told["mesh"] is not None and told["mesh"]["tried"]
+        code = "tolerance-mesh-tried" if tried else "tolerance-mesh-unknown"
+        values |= {"why": told["reasons"][0]} if tried else {}
     else:
         limits = f"accuracy.solves = {study.accuracy.solves:,}"
         if most(study) < study.accuracy.solves:
             limits += f" and method.samples = {most(study):,}"
-        why = f" More solves than {limits} would be needed."
-    yield Finding("error", text + why)  # a script that asked for it would go on with less
+        code, values = "tolerance-solves", values | {"limits": limits}
+    # A script that asked for it would go on with less.
+    yield Finding(code, "error", values, about=entries([worst["output"]]))

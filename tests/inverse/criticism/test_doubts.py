@@ -44,7 +44,7 @@ def test_all_together_may_be_far_where_none_is():
     priors = {f"p{i}": Normal(mean=0.0, std=1.0) for i in range(30)}
     x = np.full(30, 1.9)
     (doubt,) = far_from_prior(priors, x, x, float(x @ x), 30.0)
-    assert "all unknowns together" in doubt.text
+    assert "All unknowns together" in doubt.text
     assert not far_from_prior(priors, 0 * x, 0 * x, 30.0, 30.0)
     assert not far_from_prior(priors, 0 * x, 0 * x, 0.0, 0.0)
 
@@ -88,7 +88,7 @@ def test_a_prior_of_the_noise_may_expect_it_elsewhere():
 
 
 def test_errors_that_are_said_too_large():
-    assert too_large_errors(1.0, 100.0, 1.0)[0].text.startswith("residuals are 0.1 times the stated errors")
+    assert too_large_errors(1.0, 100.0, 1.0)[0].text.startswith("Residuals are 0.1 times the stated errors")
     assert not too_large_errors(80.0, 100.0, 0.9)
     assert not too_large_errors(0.0, 0.0, 1.0)
 
@@ -125,7 +125,7 @@ def test_the_mesh_is_doubted_by_what_it_does_to_the_unknowns():
     assert mesh_too_coarse(True, "", error, {"x": 2.5}, none)[0].severity == "error"
     assert mesh_too_coarse(True, "", error, {"mean": 0.0}, np.full(9, 0.7))[0].severity == "warning"
     (doubt,) = mesh_too_coarse(False, "method.mesh_check = false", np.full(2, np.nan), {"x": np.nan}, none)
-    assert doubt.text == "not checked for the mesh: method.mesh_check = false"
+    assert doubt.text == "Not checked for the mesh: method.mesh_check = false."
     assert doubt.severity == "warning"
 
 
@@ -159,8 +159,8 @@ def test_where_a_field_is_its_prior_is_said():
     places = np.arange(12.0).reshape(4, 3)
     (doubt,) = little_seen(np.array([0.1, 0.49, 0.5, 0.3]), np.full(4, 0.5), places)
     assert doubt.severity == "note"
-    assert "at 50 % of the vertices" in doubt.text
+    assert "At 50 % of the vertices" in doubt.text
     assert "0.2 of it at (0, 1, 2) m" in doubt.text
     assert "1 of it at (6, 7, 8) m" in doubt.text
     assert little_seen(np.full(4, 0.1), np.full(4, 0.5), places) == []
-    assert little_seen(np.zeros(4), np.zeros(4), places)[0].text.startswith("at 100 %")
+    assert little_seen(np.zeros(4), np.zeros(4), places)[0].text.startswith("At 100 %")

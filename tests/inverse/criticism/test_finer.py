@@ -111,7 +111,7 @@ def test_candidates_of_which_only_some_are_corrected_do_not_compare():
     assert not meshes_not_alike([], ["stiff"])
     (doubt,) = meshes_not_alike(["soft"], ["stiff", "other"])
     assert doubt.severity == "warning"
-    assert "the meshes of soft are corrected, and those of stiff, other could not be looked at" in doubt.text
+    assert "The meshes of soft are corrected, and those of stiff, other could not be looked at" in doubt.text
 
 
 @pytest.mark.unit

@@ -596,7 +596,7 @@ def test_evidences_that_cannot_be_trusted_are_an_error():
     assert error.text == "Evidences not to be trusted: other (worth 3; run chains)."
     found = found.assign(trust=(by, [["laplace"], ["corrected"]]))
     (error,) = untrusted(found, few, ())  # its mesh was looked at afterwards
-    assert error == ("error", "Evidences not to be trusted for what meshes do to them: other.")
+    assert str(error) == "error: Evidences not to be trusted for what meshes do to them: other."
     assert not list(untrusted(found, few, ("other",)))
 
 
