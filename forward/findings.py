@@ -36,15 +36,16 @@ class Words:
 CATALOGUE: dict[str, Words] = {FREE: Words("{text}")}
 
 
-def register(table: Mapping[str, Words]) -> None:
-    """Add words of findings by their codes.
+def register(table: Mapping[str, str | Words]) -> None:
+    """Add words of findings by their codes; a text alone stands for `Words` of it.
 
     Raises
     ------
     ValueError
         A code stands for other words already.
     """
-    for code, words in table.items():
+    for code, said in table.items():
+        words = Words(said) if isinstance(said, str) else said
         if CATALOGUE.setdefault(code, words) != words:
             message = f"a finding with code '{code}' has other words already"
             raise ValueError(message)
@@ -98,13 +99,17 @@ class Finding:
     @property
     def text(self) -> str:
         """A sentence or two: what, where, by how much, what to do."""
-        words = CATALOGUE[self.code]
-        said = self._filled(words.text)
+        words, said = CATALOGUE[self.code], self.clause
         if words.short is not None:
             opens = not self.subject and not words.text.startswith("{")  # a name is not written with a capital letter
             said = f"{said[0].upper() + said[1:] if opens else said}."
         subject = f"{self.subject}: " if self.subject else ""
         return f"{subject}{said}" + (f" The same, with other numbers, {self.also}." if self.also else "")
+
+    @property
+    def clause(self) -> str:
+        """The words alone, as the table has them."""
+        return self._filled(CATALOGUE[self.code].text)
 
     @property
     def short(self) -> str:

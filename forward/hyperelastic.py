@@ -190,7 +190,7 @@ class Hyperelastic(Solid):
         """Findings about the body before anything is solved."""
         points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
         return (
-            *(Finding("body-unusual", "warning", {"text": text}) for text in self.body.warnings),
+            *self.body.findings,
             *too_narrow(self.body, self.inclusions),
             *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
             *moved_points(self.body, points),

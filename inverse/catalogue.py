@@ -19,35 +19,25 @@ DESIGN = (
 )
 FINER = "take a finer one, or thinner cells at held faces (body.grading)"
 
-TABLE = {
-    "design-rank": Words(
-        "The chosen observations tell up to {missed:.2g} nat in directions beyond the {rank} that are kept, of "
-        "{known:.3g}. Take a larger method.rank."
-    ),
-    "design-no-answer-of-models": Words("There is no answer at some of {draws} draws, which are left out: {lost}."),
-    "design-few-draws": Words(
-        "What {models} predict is known by few draws for so many unknowns: take more method.draws, at least {least}."
-    ),
-    "design-no-answer": Words("The model has no answer at {lost} of {draws} draws, which are left out."),
-    "design-repeats": Words(
-        "From observation {first} of {n} on, each adds less than {least:.2g} nat: they repeat what is known."
-    ),
-    "design-depends": Words(
-        "What is best depends on the unknowns: at one of {draws} draws the chosen observations tell {shared:.3g} "
-        "nat, those that are best there {own:.3g}. Measure some of them first, and choose the others with that "
-        "posterior (parameters.from)."
-    ),
-    "population-redrawn": Words(
-        "Few draws of {specimens} lay where the population has its specimens, so they were drawn again under a "
-        "prior like the population{often}."
-    ),
-    "population-few-draws": Words(
-        "Few draws of {specimens} lie where the population has its specimens (effective sizes in parentheses): "
-        "their estimates, and what they say of the population, are rough. {why}More samples in their own study, or "
-        "a prior like the population there, help."
-    ),
-    "population-worth": Words("The draws of the population are worth {worth}: its ends are rough."),
-    "population-small": Words("{specimens} specimens say little on how wide the population is: its prior does."),
+TABLE: dict[str, str | Words] = {
+    "design-rank": "The chosen observations tell up to {missed:.2g} nat in directions beyond the {rank} that are "
+    "kept, of {known:.3g}. Take a larger method.rank.",
+    "design-no-answer-of-models": "There is no answer at some of {draws} draws, which are left out: {lost}.",
+    "design-few-draws": "What {models} predict is known by few draws for so many unknowns: take more method.draws, at "
+    "least {least}.",
+    "design-no-answer": "The model has no answer at {lost} of {draws} draws, which are left out.",
+    "design-repeats": "From observation {first} of {n} on, each adds less than {least:.2g} nat: they repeat what is "
+    "known.",
+    "design-depends": "What is best depends on the unknowns: at one of {draws} draws the chosen observations tell "
+    "{shared:.3g} nat, those that are best there {own:.3g}. Measure some of them first, and choose the others with "
+    "that posterior (parameters.from).",
+    "population-redrawn": "Few draws of {specimens} lay where the population has its specimens, so they were drawn "
+    "again under a prior like the population{often}.",
+    "population-few-draws": "Few draws of {specimens} lie where the population has its specimens (effective sizes in "
+    "parentheses): their estimates, and what they say of the population, are rough. {why}More samples in their own "
+    "study, or a prior like the population there, help.",
+    "population-worth": "The draws of the population are worth {worth}: its ends are rough.",
+    "population-small": "{specimens} specimens say little on how wide the population is: its prior does.",
     "far-from-prior": Words(
         "the posterior of {name} ({value}) lies {distance:.1f} prior deviations from the prior ({centre}): the "
         "prior, the data or the model is wrong",
@@ -178,13 +168,15 @@ TABLE = {
         "do not compare, since a mesh alone may make a candidate win or lose",
         short="meshes are not corrected alike",
     ),
-    "design-mesh-as-noise": Words(DESIGN + ". This is counted as noise."),
-    "design-mesh": Words(
-        DESIGN
-        + (
-            ": what they are said to tell needs a finer mesh, or an inversion that corrects the error as invert "
-            "does; method.mesh_error = 'noise' counts it as noise."
-        )
+    "design-mesh-as-noise": DESIGN + ". This is counted as noise.",
+    "design-mesh": DESIGN
+    + (
+        ": what they are said to tell needs a finer mesh, or an inversion that corrects the error as invert "
+        "does; method.mesh_error = 'noise' counts it as noise."
+    ),
+    "motions": Words(
+        "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
+        short="",
     ),
 }
 register(TABLE)

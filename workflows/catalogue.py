@@ -12,115 +12,82 @@ NOT_REACHED = (
     "tolerance: {taken})."
 )
 
-TABLE = {
-    "draws-impossible": Words(
-        "{share:.2g} % of the draws of '{name}' are where the model is impossible ({objection}): these samples "
-        "count as failed, and results are over the others."
-    ),
-    "samples-inadmissible": Words(
-        "{share} of the samples are of materials that are not stable at rest (μ or κ is not positive): they count "
-        "as failed, and results are over the others. A bounded distribution leaves them out."
-    ),
-    "memory": Words("memory may run out: about {needed:,.0f} MiB are needed, {limit}"),
-    "memory-of-refinement": Words("the mesh is refined as far as memory allows: {needed}, {limit}"),
-    "averaged-without-mesh": Words(
-        "The error of the mesh is not estimated of averaged predictions: a study of one candidate tells it."
-    ),
-    "averaged-shares": Words("Not to know which candidate is right makes up this share of the variance: {shares}."),
-    "not-inverted": Words("{name} could not be inverted: {why}"),
-    "verdict": Words("{verdict}"),
-    "only-candidate": Words("{best} is the only candidate."),
-    "best-of-bad": Words("Best of bad models: the residuals of {best} {wrong}."),
-    "left-out-predicted": Words("Left-out data are predicted best by {other}."),
-    "whole-tests-predicted": Words("Whole tests are predicted best, from the others, by {other}."),
-    "specimens-disagree": Words(
-        "Specimens disagree: of {specimens}, {many} are rather {most} and {few} rather {fewer} ({listed}); ln of "
-        "the Bayes factor over one material for all: {factor}. Probabilities of the candidates are for one "
-        "material of all specimens: compare them apart, or in two studies."
-    ),
-    "evidence-untrusted": Words("Evidences not to be trusted: {where} ({verdict})."),
-    "constants-of-laplace": Words("Constants are Laplace's, and not to be trusted: {where} ({verdict})."),
-    "evidence-untrusted-for-meshes": Words("Evidences not to be trusted for what meshes do to them: {models}."),
-    "order-depends": Words("With {variant}, {best} stays first but the order changes: {order}."),
-    "winner-depends": Words("It depends: the most probable is {changed}."),
+TABLE: dict[str, str | Words] = {
+    "draws-impossible": "{share:.2g} % of the draws of '{name}' are where the model is impossible ({objection}): "
+    "these samples count as failed, and results are over the others.",
+    "samples-inadmissible": "{share} of the samples are of materials that are not stable at rest (μ or κ is not "
+    "positive): they count as failed, and results are over the others. A bounded distribution leaves them out.",
+    "memory": "memory may run out: about {needed:,.0f} MiB are needed, {limit}",
+    "memory-of-refinement": "the mesh is refined as far as memory allows: {needed}, {limit}",
+    "averaged-without-mesh": "The error of the mesh is not estimated of averaged predictions: a study of one "
+    "candidate tells it.",
+    "averaged-shares": "Not to know which candidate is right makes up this share of the variance: {shares}.",
+    "not-inverted": "{name} could not be inverted: {why}",
+    "verdict": "{verdict}",
+    "only-candidate": "{best} is the only candidate.",
+    "best-of-bad": "Best of bad models: the residuals of {best} {wrong}.",
+    "left-out-predicted": "Left-out data are predicted best by {other}.",
+    "whole-tests-predicted": "Whole tests are predicted best, from the others, by {other}.",
+    "specimens-disagree": "Specimens disagree: of {specimens}, {many} are rather {most} and {few} rather {fewer} "
+    "({listed}); ln of the Bayes factor over one material for all: {factor}. Probabilities of the candidates are for "
+    "one material of all specimens: compare them apart, or in two studies.",
+    "evidence-untrusted": "Evidences not to be trusted: {where} ({verdict}).",
+    "constants-of-laplace": "Constants are Laplace's, and not to be trusted: {where} ({verdict}).",
+    "evidence-untrusted-for-meshes": "Evidences not to be trusted for what meshes do to them: {models}.",
+    "order-depends": "With {variant}, {best} stays first but the order changes: {order}.",
+    "winner-depends": "It depends: the most probable is {changed}.",
     "locking-measured": Words(
         "At the mean of the inputs, against {form} on the same mesh, which lock less: {about}.", between="; "
     ),
-    "solves-inadmissible": Words(
-        "{lost:,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
-        "({reason}): their likelihood is zero, and they count as answered."
-    ),
-    "constants-changed": Words("Constants are not those with which {source} was calibrated: {changed}."),
-    "reduced-estimates-missing": Words(
-        "At {missing} of {samples} unseen samples the larger model that estimates errors is not stable, though the "
-        "body is: there are no estimates, and with a tolerance the full model is asked."
-    ),
-    "reduced-estimates-off": Words(
-        "Estimated errors of the reduced model are not its errors: estimated over true, and what corrections leave "
-        "of the errors, on unseen samples, {off}. The sizes of errors on these samples are what can be trusted; "
-        "with a larger method.more or more snapshots estimates may come closer."
-    ),
-    "mesh-of-body": Words("The error of the mesh is not estimated: {why}; look at it with the body."),
-    "no-mesh": Words(
-        "The error of the mesh is not estimated, as accuracy.mesh_error = true asks for: a model of kind '{kind}' "
-        "has no mesh of its own."
-    ),
-    "mesh-estimates-too-large": Words(
-        "The error of the mesh is not estimated: that would take about {memory:,.0f} MiB for each group of ranks, "
-        "more than accuracy.memory = {limit:,.0f} MiB."
-    ),
-    "mesh-estimates-few": Words(
-        "The error of the mesh is estimated at {points} points only: more would take over a fifth of the study, by "
-        "prediction. What so few leave open is counted (mesh_error_doubt); more solves pay for more."
-    ),
-    "mesh-with-memory": Words("The error of the mesh is not estimated with {what}: compare with a finer mesh."),
-    "ratios-only": Words(
-        "No force acts on the specimen or is among the data, so displacements tell ratios of stiffnesses only: the "
-        "absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case)."
-    ),
-    "tolerance-without-mesh": Words("accuracy.tolerance does not count the error of the mesh: {why}."),
-    "tolerance-without-mesh-of": Words(
-        "accuracy.tolerance does not count the error of the mesh in {about}, of which there is no estimate."
-    ),
-    "tolerance-mesh-fixed": Words(
-        "accuracy.tolerance: the mesh {words}. If its error is too large for the tolerance, that will be said."
-    ),
-    "mesh-estimates-contradict": Words(
-        "The estimates of the mesh error of {about} contradict each other: between meshes of {coarse:,} and "
-        "{fine:,} unknowns its mean moved by {seen:.2g}, where they foresaw {foreseen:.2g}. The error of the "
-        "corrected value may be larger than is said."
-    ),
-    "tolerance-constants": Words(
-        "accuracy.tolerance = {tolerance:g} is not known to be reached: all samples of {about} are the same, so "
-        "that what happens in up to {share:.2g} of all cases may be missed, and with it any part of mean and "
-        "standard deviation. Leave a constant out of the outputs; to meet an event, give a [method] with many "
-        "samples."
-    ),
-    "prior-inadmissible": Words(
-        "{share} of the prior is of materials that are not stable at rest (μ or κ is not positive): it has no "
-        "weight, and the prior is scaled up where there is a material."
-    ),
-    "mesh-refined": Words(REFINED + "."),
-    "mesh-refined-too-little": Words(REFINED + ", above model.adapt.tolerance = {tolerance:g}: {why}."),
-    "tolerance-solves": Words(NOT_REACHED + " More solves than {limits} would be needed."),
-    "tolerance-mesh-tried": Words(NOT_REACHED + " {why}"),
-    "tolerance-mesh-unknown": Words(
-        "accuracy.tolerance = {tolerance:g} is not reached. The error of the mesh is not known; but for it, the "
-        "{of} of {about} is known to {reached:.2g}."
-    ),
-    "most-probable": Words(
-        "{best} is the most probable of the candidates, with {probability}; ln of the Bayes factor over {second}: "
-        "{factor}, {grade}."
-    ),
-    "motions": Words("{text}", short=""),
-    "mixture-predicted": Words(
-        "Left-out data are predicted best by a mixture (stacking): {parts}. Probabilities say which candidate is "
-        'true, if one is; model = "stacked" of `from` predicts with the mixture.'
-    ),
+    "solves-inadmissible": "{lost:,} of {solves:,} solves were of parameters for which there is no model, as for the "
+    "first of them ({reason}): their likelihood is zero, and they count as answered.",
+    "constants-changed": "Constants are not those with which {source} was calibrated: {changed}.",
+    "reduced-estimates-missing": "At {missing} of {samples} unseen samples the larger model that estimates errors is "
+    "not stable, though the body is: there are no estimates, and with a tolerance the full model is asked.",
+    "reduced-estimates-off": "Estimated errors of the reduced model are not its errors: estimated over true, and what "
+    "corrections leave of the errors, on unseen samples, {off}. The sizes of errors on these samples are what can be "
+    "trusted; with a larger method.more or more snapshots estimates may come closer.",
+    "mesh-of-body": "The error of the mesh is not estimated: {why}; look at it with the body.",
+    "no-mesh": "The error of the mesh is not estimated, as accuracy.mesh_error = true asks for: a model of kind "
+    "'{kind}' has no mesh of its own.",
+    "mesh-estimates-too-large": "The error of the mesh is not estimated: that would take about {memory:,.0f} MiB for "
+    "each group of ranks, more than accuracy.memory = {limit:,.0f} MiB.",
+    "mesh-estimates-few": "The error of the mesh is estimated at {points} points only: more would take over a fifth "
+    "of the study, by prediction. What so few leave open is counted (mesh_error_doubt); more solves pay for more.",
+    "mesh-with-memory": "The error of the mesh is not estimated with {what}: compare with a finer mesh.",
+    "ratios-only": "No force acts on the specimen or is among the data, so displacements tell ratios of stiffnesses "
+    "only: the absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case).",
+    "tolerance-without-mesh": "accuracy.tolerance does not count the error of the mesh: {why}.",
+    "tolerance-without-mesh-of": "accuracy.tolerance does not count the error of the mesh in {about}, of which there "
+    "is no estimate.",
+    "tolerance-mesh-fixed": "accuracy.tolerance: the mesh {words}. If its error is too large for the tolerance, that "
+    "will be said.",
+    "mesh-estimates-contradict": "The estimates of the mesh error of {about} contradict each other: between meshes of "
+    "{coarse:,} and {fine:,} unknowns its mean moved by {seen:.2g}, where they foresaw {foreseen:.2g}. The error of "
+    "the corrected value may be larger than is said.",
+    "tolerance-constants": "accuracy.tolerance = {tolerance:g} is not known to be reached: all samples of {about} are "
+    "the same, so that what happens in up to {share:.2g} of all cases may be missed, and with it any part of mean and "
+    "standard deviation. Leave a constant out of the outputs; to meet an event, give a [method] with many samples.",
+    "prior-inadmissible": "{share} of the prior is of materials that are not stable at rest (μ or κ is not positive): "
+    "it has no weight, and the prior is scaled up where there is a material.",
+    "mesh-refined": REFINED + ".",
+    "mesh-refined-too-little": REFINED + ", above model.adapt.tolerance = {tolerance:g}: {why}.",
+    "tolerance-solves": NOT_REACHED + " More solves than {limits} would be needed.",
+    "tolerance-mesh-tried": NOT_REACHED + " {why}",
+    "tolerance-mesh-unknown": "accuracy.tolerance = {tolerance:g} is not reached. The error of the mesh is not known; "
+    "but for it, the {of} of {about} is known to {reached:.2g}.",
+    "most-probable": "{best} is the most probable of the candidates, with {probability}; ln of the Bayes factor over "
+    "{second}: {factor}, {grade}.",
+    "mixture-predicted": "Left-out data are predicted best by a mixture (stacking): {parts}. Probabilities say which "
+    'candidate is true, if one is; model = "stacked" of `from` predicts with the mixture.',
     "data-moved": Words("{points}{where} moved to its surface, by up to {farthest} (root mean square {rms})", short=""),
     "registered": Words("registered: {how}", short=""),
-    "data-unusual": Words("{text}", short=""),
-    "prediction-doubtful": Words("{text}", short=""),
+    "points-left-out": Words("{points} not belong to the body and are left out: {listed}{more}", short=""),
+    "registration-undetermined": Words(
+        "the registration does not determine {what}: left as at the start; what the data say then depends on it",
+        short="",
+    ),
+    "prediction-doubtful": Words("{doubts}", short=""),
     "prediction-mesh": Words(
         "the mesh is estimated to move {about} standard deviations, which the intervals do not hold: a finer mesh "
         "helps, or add what is said of it",

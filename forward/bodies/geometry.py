@@ -178,8 +178,8 @@ class _SixSided(Settings):
         return {}
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """No warnings."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Nothing is unusual about it."""
         return ()
 
     @property

@@ -22,6 +22,7 @@ from forward.bodies.elements import default_quadrature, node_count
 from forward.bodies.location import nearest_of
 from forward.bodies.mesh import CLOSE, FACES, TETRAHEDRA, Contents, Loaded, Point, contents, divided, divided_contents
 from forward.bodies.mesh_reading import digest_of, load
+from forward.findings import Finding
 from forward.model import FloatArray, ModelError
 from forward.readable import told
 from forward.settings import Settings
@@ -195,14 +196,11 @@ class MeshFile(Settings):
         }
 
     @property
-    def warnings(self) -> Iterator[str]:
+    def findings(self) -> Iterator[Finding]:
         """What is unusual about it without being wrong."""
         extent = max(high - low for low, high in self.bounds)
         if not SMALL <= extent <= LARGE:
-            yield (
-                f"model.body.unit = {self.unit:g} makes the body {told(extent, 'm', 3)} long: "
-                "is that meant? Coordinates in millimetres have unit = 1e-3"
-            )
+            yield Finding("body-size", "warning", {"unit": self.unit, "extent": told(extent, "m", 3)})
 
     def contains(self, point: Point) -> bool:
         """Whether a point (m) lies in a box around the body; where the mesh is made, it must lie in a cell."""

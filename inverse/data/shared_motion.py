@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.findings import Finding
 from forward.model import FloatArray, SolveError
 from inverse.data.approximation_error import Whitening
 from inverse.data.registration import UncertainMotion
@@ -149,11 +150,11 @@ class SharedMotion:
         return np.array(rows).reshape(-1, m)
 
 
-def said(values: FloatArray) -> str:
+def said(values: FloatArray) -> Finding:
     """Say what data determine, given the eigenvalues (k,) of `determined`."""
     seen, count = int((values > DETERMINED).sum()), len(values)
-    words = f"of {count} rigid motions that are uncertain, the data determine {seen} better than was known before"
-    return words + ("" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise")
+    lost = "" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise"
+    return Finding("motions", "note", {"count": count, "seen": seen, "lost": lost})
 
 
 def determined(spectrum: Spectrum, whitening: Whitening, shared: FloatArray, root: FloatArray) -> FloatArray:

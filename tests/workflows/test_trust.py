@@ -1,70 +1,90 @@
-"""The page that explains findings has an entry for every function that makes one, with words that the function says."""
+"""The page that explains findings has an entry for every code of the catalogue, and quotes the words that it has."""
 
 import ast
 import re
-from functools import cache
+from string import Formatter
 
+import pytest
+
+import forward
+import inverse
+import uq
+import workflows
+from forward.findings import CATALOGUE
 from tests.launch import ROOT
 
+pytestmark = pytest.mark.unit
+
+PACKAGES = (forward, uq, inverse, workflows)  # each fills the catalogue when it is imported
+OWN = {code: words for package in PACKAGES for code, words in CATALOGUE.items() if code in package.catalogue.TABLE}
 PAGE = (ROOT / "docs" / "trust.md").read_text()
-PASSED_ON = {"uq.findings:_kept"}  # reads what others have found
-SAID_BY = re.compile(r"^\*Said by\* (.*?)$\n(?:\n|\Z)", re.M | re.S)
-
-
-def text_of(node):
-    """A string of the source as words, with an ellipsis for what is put in; None for anything else."""
-    if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        return node.value
-    if isinstance(node, ast.JoinedStr):
-        return "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
-    return None
-
-
-@cache
-def finders():
-    """Every function that makes a finding or a doubt, by its place: what it says, in words."""
-    found = {}
-    for package in ("forward", "uq", "inverse", "workflows"):
-        for path in (ROOT / package).rglob("*.py"):
-            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            source = path.read_text()
-            for node in ast.walk(ast.parse(source)) if re.search(r"\b(Finding|Doubt)\(", source) else ():
-                if isinstance(node, ast.FunctionDef):
-                    calls = (one.func for one in ast.walk(node) if isinstance(one, ast.Call))
-                    if any(isinstance(name, ast.Name) and name.id in {"Finding", "Doubt"} for name in calls):
-                        said = (text_of(part) for part in ast.walk(ast.parse(source)))
-                        found[f"{module}:{node.name}"] = " ".join(" ".join(text.split()) for text in said if text)
-    return found
+CODES = re.compile(r"^\*Codes\* (.*?)$\n(?:\n|\Z)", re.M | re.S)
 
 
 def entries():
-    """The entries of the page: heading, words that are quoted, and functions."""
+    """The entries of the page: heading, words that are quoted, and codes."""
     for section in re.split(r"^##+ ", PAGE, flags=re.M)[1:]:
-        said = SAID_BY.search(section + "\n\n")
+        codes = CODES.search(section + "\n\n")
         quoted = re.findall(r"^> (.+)$", section, re.M)
-        yield section.partition("\n")[0], quoted, re.findall(r"`([\w.]+:\w+)`", said[1]) if said else []
+        yield section.partition("\n")[0], quoted, re.findall(r"`([\w-]+)`", codes[1]) if codes else []
 
 
-def test_every_finding_has_its_entry():
-    explained = [place for _, _, places in entries() for place in places]
+def places(text):
+    """The places for values in a template."""
+    return {name for _, name, _, _ in Formatter().parse(text) if name is not None}
+
+
+def test_every_code_has_one_entry():
+    explained = [code for _, _, codes in entries() for code in codes]
     assert len(explained) == len(set(explained))
-    assert set(explained) == set(finders()) - PASSED_ON
+    assert set(explained) == set(OWN)
 
 
 def test_entries_quote_what_is_said():
-    of = finders()
-    for heading, quoted, places in entries():
-        assert not quoted or places, heading
-        words = " ".join(of[place] for place in places)
+    for heading, quoted, codes in entries():
+        assert not quoted or codes, heading
+        said = " ".join(re.sub(r"\{\w+(:[^}]*)?\}", "…", OWN[code].text).lower() for code in codes)
         for line in quoted:
             for part in line.split("…"):
-                wanted = part.strip(" .,:'()%")
-                assert wanted in words, f"{heading}: {wanted}"
+                wanted = part.strip(" .,:'()%").lower()
+                assert wanted in said, f"{heading}: {wanted}"
 
 
 def test_every_entry_says_what_it_means():
-    for heading, quoted, places in entries():
+    for heading, quoted, codes in entries():
         section = PAGE.partition(f" {heading}\n")[2].partition("\n##")[0]
-        prose = [line for line in section.splitlines() if line and not line.startswith((">", "*Said by*", "`"))]
-        assert not places or prose, heading
+        prose = [line for line in section.splitlines() if line and not line.startswith((">", "*Codes*", "`"))]
+        assert not codes or prose, heading
         assert not quoted or len(" ".join(prose)) > 60, heading
+
+
+def strings(node):
+    """The texts that stand in a node of the source."""
+    return {one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)}
+
+
+def made(function):
+    """The findings that a function makes: codes of each, and whether outputs are given."""
+    assigned = {}
+    for node in ast.walk(function):
+        for name in node.targets if isinstance(node, ast.Assign) else ():
+            for one in ast.walk(name):
+                assigned.setdefault(getattr(one, "id", None), set()).update(strings(node.value))
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == "Finding":
+            code = node.args[0]
+            codes = assigned.get(code.id, set()) if isinstance(code, ast.Name) else strings(code)
+            yield codes & set(OWN), any(word.arg == "about" for word in node.keywords)
+
+
+def test_findings_bring_what_their_words_have_places_for():
+    used = set()
+    for path in (path for package in PACKAGES for path in (ROOT / package.__name__).rglob("*.py")):
+        source = path.read_text()
+        for function in ast.walk(ast.parse(source)) if "Finding(" in source else ():
+            for codes, about in made(function) if isinstance(function, ast.FunctionDef) else ():
+                known = strings(function) | ({"about"} if about else set())
+                for code in codes:
+                    assert places(OWN[code].text + (OWN[code].short or "")) <= known, (path, code)
+                used |= codes
+    assert used == set(OWN)

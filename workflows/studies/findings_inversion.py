@@ -108,10 +108,10 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
         measured = study.measurements[number]
         if measured.registered is not None:
             found.append(Finding("registered", "note", {"how": measured.registered.described}))
-        found += [Finding("data-unusual", "note", {"text": line}) for line in measured.warnings]
+        found += measured.findings
     if "motion_eigenvalue" in one:
         motions = one["motion_eigenvalue"].to_numpy()
-        found.append(Finding("motions", "note", {"text": said(motions[np.isfinite(motions)])}))
+        found.append(said(motions[np.isfinite(motions)]))
     found += (
         criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
     )

@@ -104,8 +104,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     if "motion_eigenvalue" in dataset:
         from inverse.data.shared_motion import said as determined
 
-        motions = determined(dataset["motion_eigenvalue"].sel(model=best).to_numpy())
-        said.append(Finding("motions", "note", {"text": motions}, subject=best))
+        said.append(determined(dataset["motion_eigenvalue"].sel(model=best).to_numpy()).of(best))
     return said
 
 

@@ -57,7 +57,7 @@ def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
         *([f"            {_moved(sum(moved), usable)}"] if sum(moved) else []),
         *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
-        *(f"warning     {line}" for one in usable for line in one.warnings),
+        *(f"warning     {found.clause}" for one in usable for found in one.findings),
         f"mesh check  {checked}",
         *_predicted(study),
         f"time        about {duration(seconds)} for each on 1 core (rough)",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -17,6 +17,7 @@ from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.files import meshes
+from forward.findings import Finding
 from forward.settings import Settings, one_line
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
@@ -260,19 +261,15 @@ class Measurement:
         return SharedMotion.of(data.places, data.along, data.cases, motion, project)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def findings(self) -> Iterator[Finding]:
         """What is to be known of the points before they are used."""
-        found = []
         if self.left_out:
             points = "1 point does" if len(self.left_out) == 1 else f"{len(self.left_out)} points do"
             more = "" if len(self.left_out) <= LISTED else f" and {len(self.left_out) - LISTED} others"
-            found.append(f"{points} not belong to the body and are left out: {', '.join(self.left_out[:LISTED])}{more}")
+            listed = ", ".join(self.left_out[:LISTED])
+            yield Finding("points-left-out", "note", {"points": points, "listed": listed, "more": more})
         if self.registered is not None and self.registered.unseen:
-            found.append(
-                f"the registration does not determine {', '.join(self.registered.unseen)}: left as at the start; what "
-                "the data say then depends on it"
-            )
-        return tuple(found)
+            yield Finding("registration-undetermined", "note", {"what": ", ".join(self.registered.unseen)})
 
 
 def onto(body: Body) -> Callable[[FloatArray], FloatArray]:

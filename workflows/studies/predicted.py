@@ -250,7 +250,7 @@ def findings(one: xr.Dataset, name: str) -> Iterator[Finding]:
 def _doubts(one: xr.Dataset) -> Iterator[Finding]:
     why = str(one["prediction_why"].item())
     if why:
-        yield Finding("prediction-doubtful", "warning", {"text": why})
+        yield Finding("prediction-doubtful", "warning", {"doubts": why})
     std, mesh = one["prediction_std"].to_numpy(), one["prediction_mesh_error"].to_numpy()
     off = _over(one, np.abs(mesh), std)
     if off:

@@ -388,7 +388,8 @@ def test_what_the_plan_says_of_a_scan(tmp_path):
     study = load(CONFIGS / "scan.toml", changes)
     (found,) = study.measurements
     np.testing.assert_allclose(found.registered.motion.angles, [0, 0, 5], atol=1e-2)
-    (line,) = found.warnings
+    (unusual,) = found.findings
+    line = unusual.clause
     assert line.startswith("7 points do not belong to the body and are left out: scan.csv: line 278 (")
     assert line.endswith("and 2 others")
     assert f"warning     {line}" in study.plan(1)
