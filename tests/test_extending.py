@@ -1,17 +1,26 @@
 """Kinds from outside the program, as the how-to page has them: one file each, checked, run on two ranks, reported."""
 
+import importlib.util
 import json
 import re
 import tomllib
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
 
+from forward.findings import CATALOGUE
 from tests.launch import ROOT, TISSUQ, run
+from uq.findings import findings
+from uq.inputs.distributions import Uniform
+from uq.inputs.random_parameters import Inputs
 
 PAGE = ROOT / "docs" / "how-to" / "extending.md"
+
+
+CORNERS = "Only 8 corners were looked at: inside, outputs may be smaller or larger."
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +46,21 @@ def test_the_page_has_one_file_for_each_kind(folder):
     }  # fmt: skip
 
 
+def test_a_method_brings_findings_of_its_own(folder, monkeypatch):
+    monkeypatch.setattr("forward.findings.CATALOGUE", dict(CATALOGUE))
+    spec = importlib.util.spec_from_file_location("my_methods", folder / "my_methods.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def evaluate(request):
+        return SimpleNamespace(outputs=request.points.sum(axis=1, keepdims=True))
+
+    evaluate.outputs = ("sum",)
+    inputs = Inputs({name: Uniform(lower=0, upper=1) for name in "abc"})
+    found = module.Corners(kind="my_methods.Corners").run(inputs, evaluate)
+    assert [(one.severity, one.text) for one in findings(found)] == [("note", CORNERS)]
+
+
 @pytest.mark.fem
 @pytest.mark.mpi
 @pytest.mark.slow
@@ -56,6 +80,9 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     assert swept == pytest.approx(area * stretch, rel=1e-10)
     page = (out / "report.html").read_text()
     assert "The ends of what is likely" in page
+    own = {"severity": "note", "text": CORNERS, "code": "my_methods.corners"}
+    assert own in json.loads((out / "summary.json").read_text())["findings"]
+    assert CORNERS in page  # though nothing loads the module to write a report
     assert f"{swept:.4g}" in page
     sources = json.loads((out / "sources.json").read_text())["files"]
     assert {"my_tissue", "my_loads", "my_outputs", "my_methods"} <= sources.keys()
