@@ -217,12 +217,6 @@ class Saturation:
     shifts: FloatArray | None = None
     doubts: FloatArray | None = None
 
-    def of(self, which: Sequence[int]) -> Saturation:
-        """Return that of some of the outputs, by number."""
-        rows = list(which)
-        shifts, doubts = (None if one is None else one[rows] for one in (self.shifts, self.doubts))
-        return replace(self, outputs=self.outputs[rows], shifts=shifts, doubts=doubts)
-
 
 @dataclass(frozen=True, eq=False)
 class MeshError:

@@ -34,7 +34,6 @@ WRAPPERS = (
     "forward/fem/finer.py",
     "forward/extrapolated.py",
     "forward/reduced/specimen.py",
-    "inverse/data/measured_model.py",
     "uq/evaluation/kept.py",
 )
 CHAINS = ("inverse/methods/invert_few.py inverted", "inverse/methods/selection.py run")

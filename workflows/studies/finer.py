@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.combine import Rows
 from forward.model import SolveError
 from forward.settings import one_line
 from inverse.criticism.finer import Finer, Solved
-from inverse.data.measured_model import MeasuredModel
 from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
@@ -39,10 +39,9 @@ def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) ->
     own: Any = make()
     if isinstance(own, SpecimenModel):
         return extrapolated(own, start).observing(own)
-    assert isinstance(own, MeasuredModel)
-    measured = own.which
+    assert isinstance(own, Rows)
     body: Any = own.model
-    return extrapolated(body, start).restricted(lambda model: MeasuredModel(model, measured))
+    return extrapolated(body, start).restricted(lambda model: Rows(model, own.S, own.outputs))
 
 
 def solved_on(model: ForwardModel) -> Finer:

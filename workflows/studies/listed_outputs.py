@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
+from forward.combine import selected
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import ModelSpec
 from forward.words import named
 from inverse.criticism.comparison import Data
 from inverse.data.curves import steps_of
-from inverse.data.measured_model import MeasuredModel
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from inverse.methods.invert import derivable
@@ -132,7 +132,7 @@ class ListedOutputs(Settings):
     def observed(self, spec: ModelSpec, model: ForwardModel) -> ForwardModel:
         """Return a model restricted to what was measured."""
         derivable(model, spec.kind)
-        return MeasuredModel(model, tuple(model.outputs.index(output) for output in self.names))
+        return selected(model, tuple(model.outputs.index(output) for output in self.names))
 
     def shared(self, spec: ModelSpec) -> None:
         """Return None: errors of outputs are independent."""

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from forward.combine import selected
 from forward.external.models import PythonModel
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import FunctionModel, Guess, ReferenceSolution
 from forward.specimen import Specimen
-from inverse.data.measured_model import MeasuredModel
 from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
 from tests.launch import ROOT, UP_TO_RANKS, run_script
 from tests.meshes import box
@@ -246,7 +246,7 @@ def test_data_of_a_specimen_have_errors():
     effectivity = (error.outputs / (exact - solution.outputs))[large]
     assert ((effectivity > 0.8) & (effectivity < 1.2)).all(), effectivity
     assert error.state.shape == solution.state.shape
-    seen = MeasuredModel(solution._model, (3, 3, 0)).solve(np.zeros(0)).mesh_error()
+    seen = selected(solution._model, (3, 3, 0)).solve(np.zeros(0)).mesh_error()
     np.testing.assert_array_equal(seen.outputs, error.outputs[[3, 3, 0]])
     saturation = solution.saturation()
     assert ((saturation.outputs >= 0.5) & (saturation.outputs <= 3)).all()

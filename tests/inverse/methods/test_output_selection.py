@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from forward.combine import selected
 from forward.conformance import check_derivatives
 from forward.model import FunctionModel
-from inverse.data.measured_model import MeasuredModel
 from tests.rubber import CONFIGS
 from workflows.__main__ import main
 from workflows.config.study import StudyError, document, load, parse
@@ -141,9 +141,7 @@ def test_mistakes_have_their_places(folder, old, new, told):
 def test_derivatives_of_what_is_measured():
     """Of some outputs, of one of them twice: those of the model."""
     A = np.arange(6.0).reshape(3, 2)
-    model = MeasuredModel(
-        FunctionModel(lambda p: A @ p**2, ("a", "b"), ("u", "v", "w"), lambda p: 2 * A * p), (2, 0, 2)
-    )
+    model = selected(FunctionModel(lambda p: A @ p**2, ("a", "b"), ("u", "v", "w"), lambda p: 2 * A * p), (2, 0, 2))
     assert model.outputs == ("w.0", "u", "w.1")
     check_derivatives(model, np.array([0.5, 1.5]), np.ones(2))
     solution = model.solve(np.array([0.5, 1.5]))

@@ -1,0 +1,92 @@
+"""Models made of models: derivatives and errors of the mesh are those of what they are made of."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+
+from forward.combine import Rows, selected
+from forward.conformance import check_derivatives, check_mesh_errors
+from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, Work
+
+pytestmark = pytest.mark.unit
+POINT = np.array([0.7, 1.2])
+FACTORS = np.array([2.0, 4.0, 1.25])
+
+
+@dataclass(frozen=True)
+class OnMesh(FunctionModel):
+    """A function whose mesh makes errors (m,), of which estimates see a part."""
+
+    errors: np.ndarray | None = None
+
+    def solve(self, parameters, guess=None):
+        found = super().solve(parameters, guess)
+        return SolvedOnMesh(self, found.parameters, found.outputs)
+
+
+class SolvedOnMesh(FunctionSolution):
+    def mesh_error(self):
+        seen = (self.model.errors - 0.01) / FACTORS
+        return MeshError(seen, np.zeros(0), 1.0, 0.1, Work(), nonlinearity=0.1)
+
+    def saturation(self, spare=np.inf):
+        return Saturation(FACTORS, 1.5, 1.6, shifts=np.full(3, 0.01), doubts=np.array([0.1, 0.2, 0.3]))
+
+
+def on(error):
+    """A model of three outputs, with an error of its mesh or without one."""
+    errors = error * np.array([0.3, -0.2, 0.5])
+
+    def values(p):
+        return np.array([np.exp(p[0]) * p[1], np.sin(p[0] * p[1]), p[0] ** 3]) - errors
+
+    def slopes(p):
+        c = np.cos(p[0] * p[1])
+        return np.array([[np.exp(p[0]) * p[1], np.exp(p[0])], [p[1] * c, p[0] * c], [3 * p[0] ** 2, 0]])
+
+    return OnMesh(values, ("a", "b"), ("u", "v", "w"), slopes, errors)
+
+
+def sums(model):
+    S = csr_matrix(np.array([[1.0, -2.0, 0.0], [0.0, 3.0, 0.0], [0.5, 0.25, 1.0], [0.0, 0.0, -1.0]]))
+    return Rows(model, S, ("p", "q", "r", "s"))
+
+
+COMBINED = {
+    "some outputs": lambda error: selected(on(error), (2, 0, 2)),
+    "sums": lambda error: sums(on(error)),
+    "sums of sums": lambda error: selected(sums(on(error)), (3, 0)),
+}
+
+
+@pytest.mark.parametrize("made", COMBINED.values(), ids=COMBINED)
+def test_a_combination_conforms(made):
+    check_derivatives(made(1.0), POINT, np.ones(len(made(1.0).parameters))).require()
+    check_mesh_errors(made(1.0), made(0.0), POINT)
+
+
+def test_a_wrong_sign_of_a_mesh_error_is_seen():
+    class Turned(Rows):
+        def solve(self, parameters, guess=None):
+            found = super().solve(parameters, guess)
+            return type(
+                "", (), {"outputs": -found.outputs, "mesh_error": found.mesh_error, "saturation": found.saturation}
+            )
+
+    wrong = Turned(on(1.0), csr_matrix(-np.eye(3)), ("u", "v", "w"))
+    with pytest.raises(AssertionError, match="mesh error of 'u', mesh error of 'v'"):
+        check_mesh_errors(wrong, on(0.0), POINT)
+
+
+def test_some_outputs():
+    """Of one of them twice; calibrations are those of what is selected."""
+    model = selected(on(1.0), (2, 0, 2))
+    assert model.outputs == ("w.0", "u", "w.1")
+    found = model.solve(POINT)
+    np.testing.assert_array_equal(found.outputs, on(1.0).solve(POINT).outputs[[2, 0, 2]])
+    factors = found.saturation()
+    assert factors.outputs.tolist() == [1.25, 2.0, 1.25]
+    assert factors.doubts.tolist() == [0.3, 0.1, 0.3]
+    assert selected(FunctionModel(np.sin, ("a",), ("u",)), (0,)).solve(np.ones(1)).saturation() is None
