@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -28,28 +29,20 @@ def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:
     return np.asarray((matrix @ np.asarray(rows).T).T)
 
 
-@dataclass(frozen=True, eq=False)
-class Rows(OneByOne):
-    """A model whose outputs are sums y = S o of the outputs o of another one.
-
-    Parameters
-    ----------
-    model
-        The other one.
-    S
-        Weights (n, m) in the sums.
-    outputs
-        Names of the sums.
-    """
+class OfOne(OneByOne):
+    """What a model has of the one `model` that it is made of."""
 
     model: ForwardModel
-    S: csr_matrix
-    outputs: tuple[str, ...]
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
 
     @property
     def differentiable(self) -> bool:
@@ -61,32 +54,17 @@ class Rows(OneByOne):
         """Where the states live."""
         return self.model.space
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> RowsSolution:
-        """Solve as the other model does."""
-        return RowsSolution(self.model.solve(parameters, guess), self.S)
-
-
-def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
-    """Return the model of some outputs, by number; names are numbered where one is there several times."""
-    names = [model.outputs[i] for i in which]
-    numbered = tuple(
-        f"{name}.{names[:k].count(name)}" if names.count(name) > 1 else name for k, name in enumerate(names)
-    )
-    entries = np.ones(len(names)), np.array(which, dtype=np.int64), np.arange(len(names) + 1)
-    return Rows(model, csr_matrix(entries, shape=(len(names), len(model.outputs))), numbered)
-
 
 @dataclass(frozen=True, eq=False)
-class RowsSolution:
-    """Sums of the outputs of a solution."""
+class SolutionOfOne:
+    """What a solution has of the one that it is made of."""
 
     solution: Solution
-    S: csr_matrix
 
     @property
     def outputs(self) -> FloatArray:
-        """Values of the sums (n,)."""
-        return times(self.S, self.solution.outputs)
+        """Values of the outputs (m,)."""
+        return self.solution.outputs
 
     @property
     def state(self) -> FloatArray:
@@ -113,6 +91,68 @@ class RowsSolution:
         """What it has cost so far."""
         return self.solution.work
 
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state along a `direction` (d,), or of k of them."""
+        return self.solution.state_tangent(direction)
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the error that the mesh makes; None without a mesh."""
+        return self.solution.mesh_error()
+
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh; None without a mesh."""
+        return self.solution.saturation(spare)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows(OfOne):
+    """A model whose outputs are sums y = S o of the outputs o of another one.
+
+    Parameters
+    ----------
+    model
+        The other one.
+    S
+        Weights (n, m) in the sums.
+    names
+        Of the sums.
+    """
+
+    model: ForwardModel
+    S: csr_matrix
+    names: tuple[str, ...]
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the sums."""
+        return self.names
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> RowsSolution:
+        """Solve as the other model does."""
+        return RowsSolution(self.model.solve(parameters, guess), self.S)
+
+
+def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
+    """Return the model of some outputs, by number; names are numbered where one is there several times."""
+    names = [model.outputs[i] for i in which]
+    numbered = tuple(
+        f"{name}.{names[:k].count(name)}" if names.count(name) > 1 else name for k, name in enumerate(names)
+    )
+    entries = np.ones(len(names)), np.array(which, dtype=np.int64), np.arange(len(names) + 1)
+    return Rows(model, csr_matrix(entries, shape=(len(names), len(model.outputs))), numbered)
+
+
+@dataclass(frozen=True, eq=False)
+class RowsSolution(SolutionOfOne):
+    """Sums of the outputs of a solution."""
+
+    S: csr_matrix
+
+    @property
+    def outputs(self) -> FloatArray:
+        """Values of the sums (n,)."""
+        return times(self.S, self.solution.outputs)
+
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the sums (n,) along a `direction` (d,); (k, n) for (k, d)."""
         return times(self.S, self.solution.tangent(direction))
@@ -120,10 +160,6 @@ class RowsSolution:
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the sums weighted by `weights` (n,); (k, d) for (k, n)."""
         return self.solution.adjoint(times(self.S.T, weights))
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state along a `direction` (d,), or of k of them."""
-        return self.solution.state_tangent(direction)
 
     def mesh_error(self) -> MeshError | None:
         """Estimate the error that the mesh makes; None without a mesh."""
@@ -153,3 +189,235 @@ class RowsSolution:
         shifts = None if found.shifts is None else times(self.S, found.shifts)
         doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
         return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
+
+
+class Affine(Protocol):
+    """An affine map p = A q + b of parameters q (d,) to parameters p (D,)."""
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return p (n, D) of points q (n, d)."""
+
+    def along(self, directions: FloatArray) -> FloatArray:
+        """Return A q (n, D) of directions q (n, d)."""
+
+    def back(self, gradients: FloatArray) -> FloatArray:
+        """Return gradients (n, d) by q of gradients (n, D) by p."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """An affine map by a sparse matrix.
+
+    Parameters
+    ----------
+    A
+        (D, d).
+    b
+        (D,).
+    """
+
+    A: csr_matrix
+    b: FloatArray
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return p (n, D) of points q (n, d)."""
+        return times(self.A, points) + self.b
+
+    def along(self, directions: FloatArray) -> FloatArray:
+        """Return A q (n, D) of directions q (n, d)."""
+        return times(self.A, directions)
+
+    def back(self, gradients: FloatArray) -> FloatArray:
+        """Return gradients (n, d) by q of gradients (n, D) by p."""
+        return times(self.A.T, gradients)
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped(OfOne):
+    """A model of other parameters q, from which an affine map tells those of the one that it is made of.
+
+    Parameters
+    ----------
+    model
+        The one.
+    by
+        The map.
+    names
+        Of q.
+    """
+
+    model: ForwardModel
+    by: Affine
+    names: tuple[str, ...]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of q."""
+        return self.names
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> MappedSolution:
+        """Solve at q (d,)."""
+        return MappedSolution(self.model.solve(self.by.values(parameters[None])[0], guess), self.by)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSolution(SolutionOfOne):
+    """A solution with derivatives by other parameters."""
+
+    by: Affine
+
+    def _along(self, direction: FloatArray) -> FloatArray:
+        found = self.by.along(np.atleast_2d(direction))
+        return found.reshape(*np.shape(direction)[:-1], -1)
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,); (k, m) for (k, d)."""
+        return self.solution.tangent(self._along(direction))
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state along a `direction` (d,), or of k of them."""
+        return self.solution.state_tangent(self._along(direction))
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m)."""
+        found = self.by.back(np.atleast_2d(self.solution.adjoint(weights)))
+        return found.reshape(*np.shape(weights)[:-1], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Joined(OneByOne):
+    """Several models of the same parameters as one: its outputs are those of the first, then of the second, and so on.
+
+    Parameters
+    ----------
+    models
+        The models.
+    outputs
+        Names of all outputs.
+    """
+
+    models: tuple[ForwardModel, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.models[0].parameters
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have tangents and adjoints."""
+        return all(model.differentiable for model in self.models)
+
+    @property
+    def space(self) -> None:
+        """States of several meshes are none of one."""
+        return
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
+        """Solve all at `parameters` (d,)."""
+        return self.solve_each(parameters, [None] * len(self.models))
+
+    def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess | None]) -> JoinedSolution:
+        """Solve all at `parameters` (d,), each with its own guess."""
+        found = (model.solve(parameters, near) for model, near in zip(self.models, guesses, strict=True))
+        return JoinedSolution(tuple(found))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedSolution:
+    """Several solutions as one."""
+
+    solutions: tuple[Solution, ...]
+
+    @property
+    def outputs(self) -> FloatArray:
+        """Values of all outputs (m,)."""
+        return np.concatenate([one.outputs for one in self.solutions])
+
+    @property
+    def state(self) -> FloatArray:
+        """None."""
+        return np.zeros(0)
+
+    @property
+    def residual(self) -> float:
+        """The largest one."""
+        return max(one.residual for one in self.solutions)
+
+    @property
+    def converged(self) -> bool:
+        """Whether all meet the solver's tolerance."""
+        return all(one.converged for one in self.solutions)
+
+    @property
+    def stability(self) -> Stability:
+        """That of the one of which least is known; an instability that was missed counts more."""
+        return Stability.of_all([one.stability for one in self.solutions])
+
+    @property
+    def work(self) -> Work:
+        """What all have cost so far."""
+        return Work.sum_of(one.work for one in self.solutions)
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,); (k, m) for (k, d)."""
+        return np.concatenate([one.tangent(direction) for one in self.solutions], axis=-1)
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m)."""
+        ends = np.cumsum([len(one.outputs) for one in self.solutions])[:-1]
+        parts = zip(self.solutions, np.split(np.asarray(weights), ends, axis=-1), strict=True)
+        return np.asarray(sum(one.adjoint(own) for one, own in parts))
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """There is no state."""
+        return np.zeros((*np.shape(direction)[:-1], 0))
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the errors that all meshes make; None where there are none."""
+        found = [(one, one.mesh_error()) for one in self.solutions]
+        known = [error for _, error in found if error is not None]
+        if not known:
+            return None
+        outputs = [np.zeros(len(one.outputs)) if error is None else error.outputs for one, error in found]
+        return MeshError(
+            np.concatenate(outputs),
+            self.state,
+            sum(one.energy for one in known),
+            max(one.relative for one in known),
+            Work.sum_of(one.work for one in known),
+            nonlinearity=farthest(known),
+        )
+
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
+        """Calibrate estimates of the errors of all meshes; None where there are none."""
+        return together([(len(one.outputs), one.saturation(spare)) for one in self.solutions])
+
+
+def farthest(errors: Sequence[MeshError]) -> float:
+    """Return the largest nonlinearity of several estimates; NaN is larger than all."""
+    return max((one.nonlinearity for one in errors), key=lambda far: (not np.isfinite(far), far))
+
+
+def together(parts: Sequence[tuple[int, Saturation | None]]) -> Saturation | None:
+    """Return what calibrates the outputs of several solutions, from their numbers of outputs and what calibrates them.
+
+    Where there is no mesh the factor is one.
+    """
+    known = [one for _, one in parts if one is not None]
+    if not known:
+        return None
+
+    def all_of(values: Sequence[FloatArray | float | None], otherwise: float) -> FloatArray:
+        pairs = zip(parts, values, strict=True)
+        return np.concatenate([np.broadcast_to(otherwise if v is None else v, n) for (n, _), v in pairs])
+
+    return Saturation(
+        all_of([None if one is None else one.outputs for _, one in parts], 1.0),
+        float(np.mean([one.state for one in known])),
+        float(np.mean([one.energy for one in known])),
+        all(one.measured for one in known),
+        all_of([0.0 if one is None else one.shifts for _, one in parts], 0.0),
+        all_of([0.0 if one is None else one.doubts for _, one in parts], math.nan),
+    )

@@ -16,33 +16,31 @@ boxes and blocks with fields are divided, and again at the rims of what is held 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, identity
 
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.nested import RATIO, layers_of, within
 from forward.bodies.random_fields import RandomField
-from forward.extrapolated import HALVED, Begun, Extrapolated
+from forward.combine import Joined, Mapped, MappedSolution, Rows
+from forward.extrapolated import HALVED, Begun, FromStart, Otherwise, limit
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-    from forward.fem.path import PathModel, PathSolution
-    from forward.fem.solution import FiniteElementSolution
-    from forward.fem.specimen import SpecimenModel, SpecimenSolution
+    from forward.fem.path import PathModel
+    from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
-    from forward.model import ForwardModel, MeshError, Saturation, Stability, Work
+    from forward.model import ForwardModel
     from forward.specimen import Specimen
 
     AnyBody = Hyperelastic | Specimen
     AnyModel = HyperelasticModel | PathModel | SpecimenModel
-    AnySolution = FiniteElementSolution | PathSolution | SpecimenSolution
 
 TIMES = 1.5  # cells along an edge, over those of the body
 LEAST = {TIMES: 5, 1.0: 3}  # cells along an edge of the finer and of the coarser mesh
@@ -210,7 +208,7 @@ class FinerMeshes:
     fine, coarse
         On the finest, and on the other one; None where that is its own.
     share, start, otherwise
-        As of `Extrapolated`.
+        As of `limit` and `FromStart`, and what takes their place (`Otherwise`).
     """
 
     def __init__(
@@ -224,19 +222,27 @@ class FinerMeshes:
     ) -> None:
         self.own, self.fine, self.coarse, self.share, self.start = own, fine, coarse, share, start
         self.otherwise = otherwise
-        self._begun: list[Begun | None] = []
+        self._begun: list[Begun | SolveError] = []
 
-    def observing(self, observed: SpecimenModel) -> Extrapolated:
+    def observing(self, observed: SpecimenModel) -> ForwardModel:
         """Return the model of what is `observed` of a specimen; collective when it is first solved."""
         coarse = observed if self.coarse is None else self.coarse.observing(observed)
         otherwise = None if self.otherwise is None else self.otherwise.observing(observed)
-        return Extrapolated(self.fine.observing(observed), coarse, self.share, self.start, self._begun, otherwise)
+        return self._limit(self.fine.observing(observed), coarse, None, otherwise)
 
-    def restricted(self, to: Callable[[ForwardModel], ForwardModel] = lambda model: model) -> Extrapolated:
-        """Return the model of its outputs, or of those that a function restricts it to; as `observing`."""
+    def restricted(self, to: Rows | None = None) -> ForwardModel:
+        """Return the model of its outputs, or of those rows of them that a model has; as `observing`."""
         otherwise = None if self.otherwise is None else self.otherwise.restricted(to)
-        coarse = to(self.coarse or self.own)
-        return Extrapolated(to(self.fine), coarse, self.share, self.start, self._begun, otherwise)
+        return self._limit(self.fine, self.coarse or self.own, to, otherwise)
+
+    def _limit(
+        self, fine: ForwardModel, coarse: ForwardModel, to: Rows | None, otherwise: ForwardModel | None
+    ) -> ForwardModel:
+        both = Joined((fine, coarse), (*fine.outputs, *(f"{name} (coarse)" for name in fine.outputs)))
+        begun = FromStart(both, self.start, self._begun, otherwise is not None)
+        observed = csr_matrix(identity(len(fine.outputs))) if to is None else to.S
+        found = limit(begun, observed, (to or fine).outputs, self.share)
+        return found if otherwise is None else Otherwise(found, otherwise)
 
 
 class OtherMesh(OneByOne):
@@ -312,7 +318,15 @@ class OtherMesh(OneByOne):
             found.append((weights * log).sum(axis=2) - field.on(self.spec.body).offset)
         return np.concatenate(found, axis=1)
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> OtherSolution:
+    def along(self, directions: FloatArray) -> FloatArray:
+        """Return derivatives (n, D) of the parameters on the other mesh along directions (n, d); collective."""
+        return self.values(directions) - self.values(np.zeros((1, directions.shape[1])))
+
+    def back(self, gradients: FloatArray) -> FloatArray:
+        """Return gradients (n, d) of those (n, D) by the parameters on the other mesh; collective."""
+        return gradients @ self.along(np.eye(len(self.parameters))).T
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> MappedSolution:
         """Solve at parameters (d,) of the body on its own mesh; collective.
 
         Raises
@@ -324,50 +338,4 @@ class OtherMesh(OneByOne):
             model = self._model
         except ValueError as error:  # as on all ranks of the group
             raise SolveError(str(error)) from None
-        return OtherSolution(self, model.solve(self.values(parameters[None])[0], guess))
-
-
-class OtherSolution:
-    """A solution on another mesh, with derivatives by the parameters on the own one."""
-
-    def __init__(self, model: OtherMesh, solution: AnySolution) -> None:
-        self._model, self._solution = model, solution
-        self.outputs, self.state = solution.outputs, solution.state
-        self.residual, self.converged = solution.residual, solution.converged
-
-    @property
-    def stability(self) -> Stability:
-        """What is known of the stability."""
-        return self._solution.stability
-
-    @property
-    def work(self) -> Work:
-        """What it has cost so far."""
-        return self._solution.work
-
-    def _directions(self, directions: FloatArray) -> FloatArray:
-        rows = np.atleast_2d(directions)
-        centre = self._model.values(np.zeros((1, rows.shape[1])))
-        moved = self._model.values(rows) - centre
-        return np.asarray(moved.reshape(*np.shape(directions)[:-1], -1))
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        return self._solution.tangent(self._directions(direction))
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state (U_local,) along a `direction` (d,), or of k of them; collective."""
-        return self._solution.state_tangent(self._directions(direction))
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        gradient = self._solution.adjoint(weights)
-        return gradient @ self._directions(np.eye(len(self._model.parameters))).T
-
-    def mesh_error(self) -> MeshError:
-        """Estimate the error of the other mesh; collective."""
-        return self._solution.mesh_error()
-
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates on the other mesh; collective."""
-        return self._solution.saturation(spare)
+        return Mapped(model, self, self.parameters).solve(parameters, guess)

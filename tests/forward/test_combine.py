@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
-from forward.combine import Rows, selected
+from forward.combine import Joined, Mapped, Rows, Sparse, selected
 from forward.conformance import check_derivatives, check_mesh_errors
+from forward.extrapolated import FromStart, Otherwise, limit
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, Work
 
 pytestmark = pytest.mark.unit
@@ -54,17 +55,48 @@ def sums(model):
     return Rows(model, S, ("p", "q", "r", "s"))
 
 
+def tied(model):
+    """Parameters a = 2 q + 0.3 and b = q − r."""
+    A = csr_matrix(np.array([[2.0, 0.0, 0.0], [1.0, -1.0, 0.0]]))
+    return Mapped(model, Sparse(A, np.array([0.3, 0.1])), ("q", "r", "unused"))
+
+
+def joined(*models):
+    return Joined(models, tuple(f"{name} {i}" for i, model in enumerate(models) for name in model.outputs))
+
+
+def between(error):
+    """Two meshes, the second with twice the error; beside each other meshes where these have no answer."""
+    both = joined(on(error), tied_back(on(2 * error)))
+    found = limit(FromStart(both, np.array([0.5, 1.0])), csr_matrix(np.eye(3)), on(0.0).outputs, 0.7)
+    return Otherwise(found, found)
+
+
+def tied_back(model):
+    return Mapped(model, Sparse(csr_matrix(np.array([[1.0, 0.0], [0.5, 1.0]])), np.zeros(2)), ("a", "b"))
+
+
+def plain():
+    return FunctionModel(lambda p: p**2, ("a", "b"), ("s", "t"), lambda p: np.diag(2 * p))
+
+
 COMBINED = {
     "some outputs": lambda error: selected(on(error), (2, 0, 2)),
     "sums": lambda error: sums(on(error)),
     "sums of sums": lambda error: selected(sums(on(error)), (3, 0)),
+    "other parameters": lambda error: tied(on(error)),
+    "two": lambda error: joined(on(error), on(-2 * error)),
+    "two, of which one has no mesh": lambda error: joined(plain(), on(error)),
+    "sums of two, of other parameters": lambda error: tied(selected(joined(plain(), sums(on(error))), (5, 0, 2))),
+    "two meshes": between,
 }
 
 
 @pytest.mark.parametrize("made", COMBINED.values(), ids=COMBINED)
 def test_a_combination_conforms(made):
-    check_derivatives(made(1.0), POINT, np.ones(len(made(1.0).parameters))).require()
-    check_mesh_errors(made(1.0), made(0.0), POINT)
+    point = np.array([0.7, 1.2, 0.4])[: len(made(1.0).parameters)]
+    check_derivatives(made(1.0), point, np.ones(len(point))).require()
+    check_mesh_errors(made(1.0), made(0.0), point)
 
 
 def test_a_wrong_sign_of_a_mesh_error_is_seen():

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
-from forward.extrapolated import Extrapolated
+from forward.combine import Joined
+from forward.extrapolated import FromStart, Otherwise, limit
 from forward.model import FunctionModel, SolveError
 
 pytestmark = pytest.mark.unit
@@ -23,7 +25,13 @@ def on(h):
     return FunctionModel(outputs, NAMES, ("y", "z"), slopes)
 
 
-MODEL = Extrapolated(on(0.2), on(0.3), 1 / (1.5**2 - 1), np.array([1.0, 1.0]))
+def extrapolated(fine, coarse, share, start=None, other=None):
+    both = Joined((fine, coarse), (*fine.outputs, "y on the coarse mesh", "z on the coarse mesh"))
+    found = limit(FromStart(both, start, needed=other is not None), csr_matrix(np.eye(2)), fine.outputs, share)
+    return found if other is None else Otherwise(found, other)
+
+
+MODEL = extrapolated(on(0.2), on(0.3), 1 / (1.5**2 - 1), np.array([1.0, 1.0]))
 POINT = np.array([0.7, 1.2])
 
 
@@ -56,25 +64,25 @@ def test_other_meshes_take_the_place_of_those_without_an_answer():
     """At some parameters; or at all, where there is none at the start: searches without an answer take minutes."""
     there, tried = without_answer_at_one()
     start = np.array([1.0, 1.0])
-    other = Extrapolated(on(0.4), on(0.5), 0.7)
-    lost = Extrapolated(there, on(0.3), 0.8, start, otherwise=other)
+    other = extrapolated(on(0.4), on(0.5), 0.7)
+    lost = extrapolated(there, on(0.3), 0.8, start, other=other)
     np.testing.assert_array_equal(lost.solve(POINT).outputs, other.solve(POINT).outputs)
     np.testing.assert_array_equal(lost.solve(start).outputs, other.solve(start).outputs)
     assert tried == [1.0]
-    part = Extrapolated(there, on(0.3), 0.8, POINT, otherwise=other)
+    part = extrapolated(there, on(0.3), 0.8, POINT, other=other)
     np.testing.assert_array_equal(part.solve(start).outputs, other.solve(start).outputs)
-    whole = Extrapolated(on(0.2), on(0.3), 0.8)
+    whole = extrapolated(on(0.2), on(0.3), 0.8)
     np.testing.assert_allclose(part.solve(POINT).outputs, whole.solve(POINT).outputs)
 
 
 def test_a_start_without_an_answer_is_none():
     there, tried = without_answer_at_one()
-    model = Extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
+    model = extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
     np.testing.assert_allclose(model.solve(POINT).outputs, MODEL.solve(POINT).outputs)
     with pytest.raises(SolveError, match="not there"):
         model.solve(np.array([1.0, 1.0]))
     tried.clear()
-    first = Extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
+    first = extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
     with pytest.raises(SolveError, match="not there"):
         first.solve(np.array([1.0, 1.0]))
     assert tried == [1.0]  # a search without an answer takes minutes, and is not repeated

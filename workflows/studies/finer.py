@@ -41,7 +41,7 @@ def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) ->
         return extrapolated(own, start).observing(own)
     assert isinstance(own, Rows)
     body: Any = own.model
-    return extrapolated(body, start).restricted(lambda model: Rows(model, own.S, own.outputs))
+    return extrapolated(body, start).restricted(own)
 
 
 def solved_on(model: ForwardModel) -> Finer:
