@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from uq.estimators.estimate import part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs
@@ -95,7 +96,7 @@ def record(before: Band, after: Band, mesh_error: FloatArray, share: FloatArray 
         **after.named("prediction_"),
         **before.named("prediction_prior_"),
         "prediction_share": share,
-        "prediction_mesh_error": mesh_error,
+        part("prediction_mean", "mesh"): mesh_error,
         "prediction_solves": np.array(float(before.solves + after.solves)),
         "prediction_why": "; ".join(line.rstrip(".") for line in said),
     }

@@ -22,6 +22,7 @@ from inverse.data.neighbours import Neighbours
 from inverse.data.shared_motion import determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
+from uq.estimators.estimate import part
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -129,7 +130,7 @@ DIMS: dict[str, tuple[str, ...]] = {
         for name in (f"{first}{end}" for end in ("mean", "mean_error", "std", "std_error", "lower", "upper"))
     },
     "prediction_share": ("goal",),
-    "prediction_mesh_error": ("goal",),
+    part("prediction_mean", "mesh"): ("goal",),
     "prediction_solves": (),
     "prediction_why": (),
 }

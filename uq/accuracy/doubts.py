@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray
 from forward.readable import told as in_words
+from uq.estimators.estimate import estimate_of, holds
 from uq.estimators.rounding import only_rounding
 from uq.evaluation.request import Evaluations
 
@@ -54,15 +55,17 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[
     names = np.array([str(name) for name in dataset["output"].values])
     units, counts = told.units, ~only_rounding(dataset, told.units)
     yield from _of_estimates(names, estimates, told, counts)
-    if "mesh_error" not in dataset:
+    if not holds(dataset, "mean", "mesh"):
         if "nominal" in dataset:  # methods from outside may leave it out
-            error, size = np.abs(dataset["nominal_mesh_error"].to_numpy()), np.abs(dataset["nominal"].to_numpy())
+            at_mean = estimate_of(dataset, "nominal")
+            error, size = np.abs(at_mean.mesh), np.abs(at_mean.value)
             yield from _large(names, "value at the mean parameters", np.where(counts, error, 0.0), size)
             yield from _of_solver(names, np.where(counts, error, np.nan), size, told)
         return
-    mean, std, sampling = (dataset[name].to_numpy() for name in ("mean", "std", "mean_error"))
+    moments = estimate_of(dataset, "mean"), estimate_of(dataset, "std")
+    (mean, std), sampling = (one.value for one in moments), moments[0].error
     size = np.maximum(np.abs(mean), std)  # a mean may be zero
-    error, of_std = (np.where(counts, np.abs(dataset[f"{first}mesh_error"].to_numpy()), 0.0) for first in ("", "std_"))
+    error, of_std = (np.where(counts, np.abs(one.mesh), 0.0) for one in moments)
     yield from _large(names, "mean", error, size)
     yield from _large(names, "standard deviation", of_std, std)
     yield from _unexplained(names, dataset, counts)
@@ -83,9 +86,9 @@ def failed(why: str) -> Finding:
 
 def _unexplained(names: Names, dataset: xr.Dataset, counts: NDArray[np.bool_]) -> Iterator[Finding]:
     """Find errors of the mesh that vary with the parameters as no expansion says."""
-    error, doubt = np.abs(dataset["mesh_error"].to_numpy()), dataset["mesh_error_doubt"].to_numpy()
-    rough = doubt > ROUGH * error
-    visible = doubt > np.maximum(dataset["mean_error"].to_numpy(), VISIBLE * np.abs(dataset["mean"].to_numpy()))
+    mean = estimate_of(dataset, "mean")
+    rough = mean.doubt > ROUGH * np.abs(mean.mesh)
+    visible = mean.doubt > np.maximum(mean.error, VISIBLE * np.abs(mean.value))
     contradicted = dataset["mesh_error_unknown"].to_numpy() > ROUGH
     unclear = rough & visible & counts & ~contradicted
     if (contradicted & visible & counts).any():

@@ -4,16 +4,14 @@ The error e(ω) of an output ψ is known between its estimates (`uq.accuracy.mes
 an expansion, samples, or tangents. Mean, standard deviation, quantiles and indices are found, at many points of the
 distribution, of ψ and of ψ + e; they differ by the error of the estimate, exact minus computed: added, it corrects.
 
-How an error of an estimate adds up: with σ the standard error of sampling, e the error of the mesh and δ what is not
-known of e, √(σ² + (|e| + δ)²) is the total error of the estimate as it stands, and √(σ² + δ²) that of the corrected
-one. Like σ itself they are to be doubled for 95 %.
+How they add up with errors of sampling is said in `uq.estimators.estimate`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from forward.model import FloatArray
 from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
 from uq.accuracy.doubts import FEWEST_ANSWERS, Told, doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
+from uq.estimators.estimate import OF_MESH, PARTS, Variables, holds, part, parts_of, with_mesh
 from uq.estimators.moments import ESTIMATES
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -33,7 +32,6 @@ from uq.surrogates.linearisation import Linearisation
 if TYPE_CHECKING:
     import xarray as xr
 
-Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
@@ -104,7 +102,7 @@ def with_mesh_errors(
     dataset = dataset.assign(variables)
     add(dataset, *doubts(dataset, found.evaluations, told), first=True)
     left_out = [words for name, words in WITHOUT.items() if name in dataset]
-    if "mesh_error" in dataset and left_out:
+    if holds(dataset, "mean", "mesh") and left_out:
         add(dataset, Finding("mesh-error-left-out", "note", {"what": " and of ".join(left_out)}))
     if len(found.points) and not found.measured and np.isfinite(found.saturation).any():
         add(dataset, Finding("mesh-error-uncalibrated", "note", {"factor": np.nanmax(found.saturation)}))
@@ -226,19 +224,12 @@ def _of_outputs(
     variables = _at_centre(dataset, centre, effects, unknown)
     if not all(has(dataset, name, "output") for name in ESTIMATES):
         return variables
-    for estimated, first in (("mean", ""), ("std", "std_")):
+    for estimated in ("mean", "std"):
         error, rest = np.full((2, len(effects)), np.nan)
         for i, one in enumerate(effects):
             if one is not None:
                 error[i], rest[i] = one.mean if estimated == "mean" else one.std(float(dataset["std"][i]))
-        doubt, sampling = np.hypot(unknown * error, rest), dataset[f"{estimated}_error"].to_numpy()
-        variables |= {
-            f"{first}mesh_error": (("output",), error),
-            f"{first}mesh_error_doubt": (("output",), doubt),
-            f"{first}total_error": (("output",), np.hypot(sampling, np.abs(error) + doubt)),
-            f"{estimated}_corrected": (("output",), dataset[estimated].to_numpy() + error),
-            f"{estimated}_corrected_error": (("output",), np.hypot(sampling, doubt)),
-        }
+        variables |= _corrected(dataset, estimated, error, np.hypot(unknown * error, rest), "total")
     for consequence in consequences(dataset, inputs, drawn.points):
         variables |= _of_consequence(dataset, consequence, effects, unknown)
     return variables
@@ -259,11 +250,8 @@ def _at_centre(
         along = one.way.slopes(centre.point, centre.outputs, centre.tangents)
         slopes[i] = along @ one.coefficients
         open_slopes[i] = np.hypot(unknown[i] * slopes[i], [one.left(row) for row in along])
-    variables: Variables = {
-        "nominal_mesh_error": (("output",), nominal),
-        "nominal_mesh_error_doubt": (("output",), doubt),
-        "nominal_corrected": (("output",), centre.outputs + nominal),
-    }
+    at_mean = with_mesh(centre.outputs, 0.0, nominal, doubt)
+    variables = parts_of(at_mean, "nominal", ("output",), ("mesh", "doubt", "corrected"))
     if has(dataset, "derivative", "output", "parameter"):
         variables |= _corrected(dataset, "derivative", slopes, open_slopes)
     return variables
@@ -286,17 +274,12 @@ def _of_consequence(
     return _corrected(dataset, of.name, error, doubt)
 
 
-def _corrected(dataset: xr.Dataset, name: str, error: FloatArray, doubt: FloatArray) -> Variables:
+def _corrected(dataset: xr.Dataset, name: str, error: FloatArray, doubt: FloatArray, *more: str) -> Variables:
     """Name errors of a variable, and its corrected values."""
-    stated, dims = dataset[name], tuple(map(str, dataset[name].dims))
-    sampling = dataset[f"{name}_error"].to_numpy() if f"{name}_error" in dataset else 0.0
-    values = {
-        f"{name}_mesh_error": error,
-        f"{name}_mesh_error_doubt": doubt,
-        f"{name}_corrected": stated.to_numpy() + error,
-        f"{name}_corrected_error": np.hypot(sampling, doubt),
-    }
-    return {key: (dims, found) for key, found in values.items()}
+    sampling = dataset[part(name, "error")].to_numpy() if holds(dataset, name, "error") else 0.0
+    found = with_mesh(dataset[name].to_numpy(), sampling, error, doubt)
+    which = [one for one in PARTS if one in (*OF_MESH, *more)]
+    return parts_of(found, name, tuple(map(str, dataset[name].dims)), which)
 
 
 # --- fields ----------------------------------------------------------------------------------------------------------
@@ -314,23 +297,23 @@ def _of_fields(
     followed = (None, *range(found.outputs.shape[1]))
     way = best([between(inputs, centre.output_slopes, found.points, found.outputs, i) for i in followed], fields)
     at_centre = way.functions(centre.point[None, :], centre.outputs[None, :])[0] @ way.weights
-    variables: Variables = {"field_nominal_mesh_error": (by_node, (at_centre @ fields).reshape(-1, 3))}
+    variables: Variables = {part("field_nominal", "mesh"): (by_node, (at_centre @ fields).reshape(-1, 3))}
     if has(dataset, "field_derivative", "parameter", *by_node):
         along = way.slopes(centre.point, centre.outputs, centre.tangents) @ way.weights
-        variables["field_derivative_mesh_error"] = (
+        variables[part("field_derivative", "mesh")] = (
             ("parameter", *by_node),
             (along @ fields).reshape(dataset["field_derivative"].shape),
         )
     if not has(dataset, "field_mean", *by_node):
         return variables
     shares = way.functions(drawn.points, drawn.outputs) @ way.weights
-    variables["field_mean_mesh_error"] = (by_node, (shares.mean(axis=0) @ fields).reshape(-1, 3))
+    variables[part("field_mean", "mesh")] = (by_node, (shares.mean(axis=0) @ fields).reshape(-1, 3))
     shared = _with_displacements(dataset, centre, drawn, shares)
     if has(dataset, "field_std", *by_node) and shared is not None:
         std = dataset["field_std"].to_numpy().ravel()
         more = (fields * (2 * shared + covariances(shares, shares) @ fields)).sum(axis=0)
         moved = np.sqrt(np.maximum(std**2 + more, 0.0)) - std
-        variables["field_std_mesh_error"] = (by_node, moved.reshape(-1, 3))
+        variables[part("field_std", "mesh")] = (by_node, moved.reshape(-1, 3))
     return variables
 
 

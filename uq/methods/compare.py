@@ -21,6 +21,7 @@ from forward.findings import Finding, Severity
 from forward.model import FloatArray
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
+from uq.estimators.estimate import ESTIMATED
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import rate, score
 from uq.evaluation.request import OWN, Evaluate, Request
@@ -43,7 +44,6 @@ COMPARED = Kinds("method", SAMPLING, Amount)  # methods that estimate moments fr
 # A reference is solved on a model of its own, which has no cheap ones beside it.
 _ALONE = {kind: where for kind, where in SAMPLING.items() if kind != "multifidelity"}
 REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **_ALONE}, Method)
-ESTIMATED = ("mean", "std")
 TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # results that a restart does not reproduce
 ROUNDING = 16 * np.finfo(float).eps  # smallest relative error assumed for a reference
 TIGHT, TEXTBOOK, REFINED = "tight", "textbook", "refined"  # names of the models beside the study's own

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ModelError
 from uq.estimators.doubts import of_differences, of_tails
+from uq.estimators.estimate import part
 from uq.estimators.moments import (
     ESTIMATES,
     ratio,
@@ -192,11 +193,11 @@ class MultilevelMonteCarlo(Amount):
             {
                 **{name: (by_output, getattr(found.estimates, name)) for name in ESTIMATES},
                 "bias_error": (by_output, found.bias_error),
-                "total_error": (by_output, found.total_error),
+                part("mean", "total"): (by_output, found.total_error),
                 "std_bias_error": (by_output, found.std_bias_error),
-                "std_total_error": (by_output, np.hypot(found.estimates.std_error, found.std_bias_error)),
-                "mesh_error": (by_output, found.signs * found.bias_error),
-                "std_mesh_error": (by_output, found.std_signs * found.std_bias_error),
+                part("std", "total"): (by_output, np.hypot(found.estimates.std_error, found.std_bias_error)),
+                part("mean", "mesh"): (by_output, found.signs * found.bias_error),
+                part("std", "mesh"): (by_output, found.std_signs * found.std_bias_error),
                 "weak_rate": (by_output, rate(found.differences)),
                 "strong_rate": (by_output, rate(plain[1:])),
                 "cost_rate": ((), float(-rate(seconds[:, None])[0])),

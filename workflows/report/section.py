@@ -21,6 +21,7 @@ from forward.readable import and_error, margin, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import NONE
+from uq.estimators.estimate import holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
 from workflows.report.words import solves
@@ -97,7 +98,8 @@ class Results:
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output, unit = self.of(output), self.unit(output)
-        value, error = float(of_output[name]), float(of_output[f"{name}_error"])
+        one = single(of_output, name)
+        value, error = one.value, one.error
         if np.isnan(value) or output not in self.meshes_unknown or name.endswith("corrected"):
             return NONE if np.isnan(value) else and_error(value, error, unit)
         if self.meshes_unknown[output]:
@@ -106,9 +108,9 @@ class Results:
 
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""
-        if f"{name}_corrected" not in self.dataset:
+        if not holds(self.dataset, name, "corrected"):
             return []
-        value, error = (float(self.dataset[f"{name}_corrected{end}"].sel(at)) for end in ("", "_error"))
+        value, error = (float(self.dataset[part(name, which)].sel(at)) for which in ("corrected", "left"))
         return [NONE if np.isnan(value) else and_error(value, error, unit)]
 
     def unit(self, output: str) -> str:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.words import with_error
+from uq.estimators.estimate import ESTIMATED, OF_MESH, PARTS, holds, part
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
 from uq.findings import NOT_KNOWN
-from uq.methods.compare import ESTIMATED
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -21,20 +21,19 @@ Part = dict[str, Any]
 LISTED = 20  # observations of a design
 OTHER_ESTIMATES = (
     *("variance_ratio", "std_variance_ratio", "loo_error"),
-    *("bias_error", "total_error", "std_bias_error", "std_total_error"),
-    *("mesh_error", "mesh_error_doubt", "mean_corrected", "mean_corrected_error"),
-    *("std_mesh_error", "std_mesh_error_doubt", "std_corrected", "std_corrected_error"),
+    *("bias_error", part("mean", "total"), "std_bias_error", part("std", "total")),
+    *(part(name, which) for name in ESTIMATED for which in OF_MESH),
 )
 # Of these, what is not estimated of every output.
-NOT_OF_ALL = {name for name in OTHER_ESTIMATES if any(word in name for word in ("mesh", "corrected", "total"))}
+NOT_OF_ALL = {part(name, which) for name in ESTIMATED for which in (*OF_MESH, "total")}
 
 
 def summarise(dataset: xr.Dataset) -> Part:
     """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
     summary: Part = {}
-    for needed, part in _PARTS:
+    for needed, told in _PARTS:
         if needed <= set(dataset.variables):
-            summary |= part(dataset)
+            summary |= told(dataset)
     if "accuracy" in dataset.attrs:
         summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
     return summary
@@ -212,9 +211,9 @@ def _bounds(dataset: xr.Dataset) -> Part:
 
 def _with_errors(dataset: xr.Dataset, name: str, short: str) -> dict[str, str]:
     """Return the variables that say how exact one is, which there are, by shorter names."""
-    ends = ("", "_error", "_mesh_error", "_mesh_error_doubt", "_corrected", "_corrected_error")
-    first = "" if short == "value" else f"{short}_"
-    return {(f"{first}{end[1:]}" if end else short): f"{name}{end}" for end in ends if f"{name}{end}" in dataset}
+    first = "" if short == "value" else short
+    errors = {part(first, which): part(name, which) for which in PARTS if holds(dataset, name, which)}
+    return {short: name} | errors
 
 
 def _local(dataset: xr.Dataset) -> Part:
@@ -222,10 +221,7 @@ def _local(dataset: xr.Dataset) -> Part:
         "local": "derivative",
         "local_per_std": "derivative_per_std",
         "local_per_range": "derivative_per_range",
-    } | {
-        f"local{end}": f"derivative{end}"
-        for end in ("_mesh_error", "_mesh_error_doubt", "_corrected", "_corrected_error")
-    }
+    } | {part("local", which): part("derivative", which) for which in OF_MESH}
     return {
         key: {
             output: {parameter: numbers[""] for parameter, numbers in of_output.items()}
@@ -238,11 +234,7 @@ def _local(dataset: xr.Dataset) -> Part:
 
 def _nominal(dataset: xr.Dataset) -> Part:
     """What is known of outputs at the mean parameters, where nothing is sampled."""
-    names = {"value": "nominal"} | {
-        name: f"nominal_{name}"
-        for name in ("mesh_error", "mesh_error_doubt", "corrected")
-        if f"nominal_{name}" in dataset
-    }
+    names = _with_errors(dataset, "nominal", "value")
     return {
         "nominal": {
             str(output): {short: _number(dataset[name].sel(output=output)) for short, name in names.items()}
@@ -320,6 +312,6 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"candidate_mean"}, _averaged),
     ({"total_bound"}, _bounds),
     ({"derivative"}, _local),
-    ({"derivative", "nominal_corrected"}, _nominal),
+    ({"derivative", part("nominal", "corrected")}, _nominal),
     ({"row_method"}, _methods),
 )

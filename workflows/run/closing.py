@@ -6,7 +6,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from forward.words import NONE, duration, named, places, with_error
+from uq.estimators.estimate import ESTIMATED, single
 from uq.estimators.rounding import only_rounding
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.report import words
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
 MOST = 8  # significant digits of values
 SMALL = -5  # power of ten below which it is written
 PARAMETERS = 12  # of which derivatives are listed
-ESTIMATES = {"mean": "", "std": "std_"}  # first part of the names of their mesh and total errors
 WIDTH = 24  # letters of a bar
 Row = Sequence[str]
 
@@ -78,7 +80,7 @@ def _not_known(dataset: xr.Dataset, model: str, found: Mapping[str, Any]) -> str
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Moments of the outputs: in a table with the errors of the mesh where there are any, else a line each."""
     unknown = meshes_unknown(dataset)
-    if not any(values.get("mesh_error") is not None for values in outputs.values()):
+    if not any(np.isfinite(single(values, "mean").mesh) for values in outputs.values()):
         for output, values in outputs.items():
             yield _line(output, values, _unit(dataset, output), unknown.get(output))
         return
@@ -86,21 +88,15 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
     rows: list[Row] = [("", "value", "sampling", "mesh", "in all", "corrected")]
     for (output, values), nothing in zip(outputs.items(), rounding.tolist(), strict=True):
         rows.append((named(output, _unit(dataset, output)) + (": zero but for rounding" if nothing else ""),))
-        for name, first in ESTIMATES.items() if not nothing else ():
-            error = values.get(f"{first}mesh_error")
+        for name in ESTIMATED if not nothing else ():
+            one = single(values, name)
             of_mesh = ["not known" if output in unknown else NONE]
-            if error is not None and f"{name}_corrected" in values:
-                total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
-                doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
-                of_mesh = [_signed(error, doubt), _error(total), _plus_minus(corrected, its)]
-            elif (
-                error is not None
-            ):  # of the finest of several meshes; comparisons look at one finer mesh, and add nothing
-                total = values.get(f"{first}total_error")
-                of_mesh = [f"{error:+.2g}", NONE if total is None else _error(total), NONE]
-            sampling = values[f"{name}_error"]
-            value = _two(values[name]) if unknown.get(output) else _value(values[name], sampling)
-            rows.append((f"  {name}", value, _error(sampling), *of_mesh))
+            if np.isfinite(one.corrected):
+                of_mesh = [_signed(one.mesh, one.doubt), _error(one.total), _plus_minus(one.corrected, one.left)]
+            elif np.isfinite(one.mesh):  # of the finest of several meshes; comparisons look at one, and add nothing
+                of_mesh = [f"{one.mesh:+.2g}", NONE if np.isnan(one.total) else _error(one.total), NONE]
+            value = _two(one.value) if unknown.get(output) else _value(one.value, one.error)
+            rows.append((f"  {name}", value, _error(one.error), *of_mesh))
     yield from _table(rows)
 
 
@@ -135,22 +131,21 @@ def _line(output: str, values: Mapping[str, Any], unit: str, failed: bool | None
 
 def _derivatives(dataset: xr.Dataset, summary: Mapping[str, Any]) -> Iterator[str]:
     """Outputs at the mean parameters, and the effects of the parameters to first order."""
-    nominal = summary.get("nominal", {})
-    known = any(values["mesh_error"] is not None for values in nominal.values())
+    shown = summary.get("local_per_range", {})
+    nominal = {output: single(dataset.sel(output=output), "nominal") for output in shown}
+    known = any(np.isfinite(one.mesh) for one in nominal.values())
     unknown = meshes_unknown(dataset)
     rows: list[Row] = [("", "value", *(("mesh", "corrected") if known else ()))]
-    for output, slopes in summary.get("local_per_range", {}).items():
+    for output, slopes in shown.items():
         rows.append((named(output, _unit(dataset, output)),))
-        at = nominal.get(output, {"value": float(dataset["nominal"].sel(output=output)), "mesh_error": None})
+        at = nominal[output]
         digits, gap = DIGITS if unknown.get(output) else 4, ("not known",) * (known and output in unknown)
-        here = _with_mesh(at["value"], at["mesh_error"], at.get("mesh_error_doubt"), digits)
-        rows.append(("  at the mean parameters", *here, *gap))
+        rows.append(("  at the mean parameters", *_with_mesh(at.value, at.mesh, at.doubt, digits), *gap))
         spreads = [_spread(dataset, summary, output, name, slope) for name, slope in slopes.items()]
         spreads.sort(key=lambda one: -abs(one[1]))
         for name, value, factor in spreads[:PARAMETERS]:
-            errors = [summary.get(f"local_mesh_error{end}", {}).get(output, {}).get(name) for end in ("", "_doubt")]
-            error, doubt = (None if one is None else one * factor for one in errors)
-            rows.append((f"  {name}", *_with_mesh(value, error, doubt, digits)))
+            slope = single(dataset.sel(output=output, parameter=name), "derivative")
+            rows.append((f"  {name}", *_with_mesh(value, slope.mesh * factor, slope.doubt * factor, digits)))
         if len(spreads) > PARAMETERS:
             rows.append((f"  {len(spreads) - PARAMETERS} smaller ones are in summary.json",))
     if len(rows) > 1:
@@ -168,8 +163,8 @@ def _spread(
     return name, float("nan") if effect is None else effect, float(dataset["parameter_std"].sel(parameter=name))
 
 
-def _with_mesh(value: float, error: float | None, doubt: float | None, digits: int) -> list[str]:
-    if error is None or doubt is None:
+def _with_mesh(value: float, error: float, doubt: float, digits: int) -> list[str]:
+    if not (np.isfinite(error) and np.isfinite(doubt)):
         return [f"{value:.{digits}g}"]
     return [f"{value:.6g}", _signed(error, doubt), _plus_minus(value + error, doubt)]
 

@@ -12,6 +12,7 @@ import numpy as np
 from forward.findings import Finding
 from forward.machine import write_whole
 from forward.registry import named
+from uq.estimators.estimate import part
 from uq.findings import add
 from workflows.results.directory import write_text
 
@@ -108,13 +109,15 @@ def with_history(study: Study, dataset: xr.Dataset) -> xr.Dataset:
 
     add(dataset, _finding(study, told))
     return dataset.assign(
-        cycle_cells=("cycle", [cycle["cells"] for cycle in cycles]),
-        cycle_unknowns=("cycle", [cycle["unknowns"] for cycle in cycles]),
-        cycle_value=of_outputs("values"),
-        cycle_mesh_error=of_outputs("errors"),
-        mesh_vertex_position=(("mesh_vertex", "axis"), mesh.points),
-        mesh_cell_vertices=(("mesh_cell", "mesh_corner"), mesh.cells),
-        mesh_indicator=("mesh_cell", shares),
+        {
+            "cycle_cells": ("cycle", [cycle["cells"] for cycle in cycles]),
+            "cycle_unknowns": ("cycle", [cycle["unknowns"] for cycle in cycles]),
+            "cycle_value": of_outputs("values"),
+            part("cycle_value", "mesh"): of_outputs("errors"),
+            "mesh_vertex_position": (("mesh_vertex", "axis"), mesh.points),
+            "mesh_cell_vertices": (("mesh_cell", "mesh_corner"), mesh.cells),
+            "mesh_indicator": ("mesh_cell", shares),
+        }
     )
 
 

@@ -15,6 +15,7 @@ from forward.bodies.inclusions import derived, log_factor
 from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, SOURCES, TRUST, stacked, usual_sizes
+from uq.estimators.estimate import part
 from workflows.studies.findings_inversion import judged
 
 if TYPE_CHECKING:
@@ -232,7 +233,7 @@ BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")
 OF_PREDICTIONS = {
     **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
     "share": "prediction_share",
-    "mesh_error": "prediction_mesh_error",
+    part("", "mesh"): part("prediction_mean", "mesh"),
 }
 
 

@@ -14,6 +14,7 @@ from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
 from forward.specimen import SHARED, LoadCase, Specimen, in_words, shared_paths
 from inverse.methods import predict
+from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
@@ -235,7 +236,8 @@ def keep_unknown_meshes(study: Inversion, dataset: xr.Dataset) -> None:
     if not has_mesh(spec):
         return
     goals = dataset["goal"].values
-    solved, error = (np.isfinite(dataset[f"prediction_{what}"].to_numpy()) for what in ("std", "mesh_error"))
+    predicted = estimate_of(dataset, "prediction_mean")
+    solved, error = np.isfinite(dataset["prediction_std"].to_numpy()), np.isfinite(predicted.mesh)
     unknown = [str(goal) for goal in goals[(solved & ~error).any(axis=0)]]
     looked = study.method.treatment is not None and not spec.remembers and not spec.hidden
     keep_unknown(dataset, unknown, set(unknown) - set(never_estimable(spec, unknown)) if looked else ())
@@ -251,11 +253,12 @@ def _doubts(one: xr.Dataset) -> Iterator[Finding]:
     why = str(one["prediction_why"].item())
     if why:
         yield Finding("prediction-doubtful", "warning", {"doubts": why})
-    std, mesh = one["prediction_std"].to_numpy(), one["prediction_mesh_error"].to_numpy()
+    std, predicted = one["prediction_std"].to_numpy(), estimate_of(one, "prediction_mean")
+    mesh = predicted.mesh
     off = _over(one, np.abs(mesh), std)
     if off:
         yield Finding("prediction-mesh", "warning", about=off)
-    rough = _over(one, one["prediction_mean_error"].to_numpy(), std)
+    rough = _over(one, predicted.error, std)
     if rough:
         yield Finding("prediction-rough", "warning", about=rough)
     unknown = meshes_unknown(one) if np.isfinite(std).any() else {}

@@ -13,6 +13,7 @@ from forward.model import SolveError, Stability
 from forward.registry import named
 from uq.accuracy.budget import spare_for
 from uq.estimators import branch
+from uq.estimators.estimate import holds, part
 from uq.estimators.rounding import settled
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -149,8 +150,8 @@ def _with_mesh_errors(
 def with_unknown_meshes(study: Study, dataset: xr.Dataset) -> xr.Dataset:
     """Keep which outputs have an error of a mesh that nobody knows, for all who print them."""
     if (study.spec.meshed or study.spec.hidden) and "output" in dataset.coords:
-        kind = next((name for name in ("mesh_error", "nominal_mesh_error") if name in dataset), None)
-        errors = np.full(dataset.sizes["output"], np.nan) if kind is None else dataset[kind].to_numpy()
+        kind = next((name for name in ("mean", "nominal") if holds(dataset, name, "mesh")), None)
+        errors = np.full(dataset.sizes["output"], np.nan) if kind is None else dataset[part(kind, "mesh")].to_numpy()
         names = [str(name) for name in dataset["output"].values[np.isnan(errors)]]
         keep_unknown(dataset, names, set(names) - set(never_estimable(study.spec, names)) if study.estimates else ())
     return dataset

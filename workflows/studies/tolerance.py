@@ -26,6 +26,7 @@ from forward.machine import MIB, StopError
 from forward.model import FloatArray, SolveError
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
+from uq.estimators.estimate import ESTIMATED, estimate_of
 from uq.estimators.moments import Z
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder
@@ -192,20 +193,13 @@ class Found:
         dataset = dataset.assign({name: (("output",), values) for name, values in moments.items()})
         self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, told_of(study))
         self.doubts = doubts(self.dataset)
-        errors = np.array([self.dataset[name].to_numpy() for name in ERRORS if name in self.dataset])
-        unknown = self.dataset["mesh_error_unknown"].to_numpy()
-        self.close = np.nan_to_num(unknown * np.abs(errors)) if len(errors) else np.zeros_like(self.doubts)
-
-
-ERRORS = "mesh_error", "std_mesh_error"
+        errors = np.abs([estimate_of(self.dataset, name).mesh for name in ESTIMATED])
+        self.close = np.nan_to_num(self.dataset["mesh_error_unknown"].to_numpy() * errors)
 
 
 def doubts(dataset: xr.Dataset) -> FloatArray:
     """Return what is not known of the error of the mesh in means and standard deviations (2, m); zero without one."""
-    names = [f"{name}_doubt" for name in ERRORS]
-    if names[0] not in dataset:
-        return np.zeros((2, dataset.sizes["output"]))
-    return np.nan_to_num(np.array([dataset[name].to_numpy() for name in names]))
+    return np.nan_to_num([estimate_of(dataset, name).doubt for name in ESTIMATED])
 
 
 def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> Assessed:
@@ -227,10 +221,10 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
             asked, data = goal(study), found.dataset
             sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
             shares, close = (Z * part / (asked.tolerance * sizes) for part in (found.doubts, found.close))
-            known = (data[name].to_numpy().tolist() for name in ("mean", ERRORS[0], f"{ERRORS[0]}_doubt"))
-            rows = zip(recorder.outputs, *known, strict=True)
+            mean = estimate_of(data, "mean")
+            rows = zip(recorder.outputs, *(x.tolist() for x in (mean.value, mean.mesh, mean.doubt)), strict=True)
             means = [row for row in rows if np.isfinite(row[2])]
-            relative = float((np.nan_to_num(np.abs(data["nominal_mesh_error"].to_numpy())) / sizes[0]).max())
+            relative = float((np.nan_to_num(np.abs(estimate_of(data, "nominal").mesh)) / sizes[0]).max())
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
         return Assessed(
             study.spec.unknowns,

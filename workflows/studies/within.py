@@ -17,6 +17,7 @@ from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.goal import Goal
 from uq.estimators.doubts import equal, unmet
+from uq.estimators.estimate import ESTIMATED, estimate_of
 from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 FAR_OFF = 2.0  # times what is not known: then estimates on two meshes contradict each other
 ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
 SOURCES = ("mesh", "sampling", "solver", "total")
-ESTIMATED = ("mean", "std")
 TRIED = ("unknowns", "cells", "estimates", "share")  # of a mesh
 IN_WORDS = {"mean": "mean", "std": "standard deviation"}
 
@@ -106,10 +106,12 @@ def _told(
     row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
     meshes = [] if before is None else before["meshes"]
     never = told_of(study).never
+    estimates = {name: estimate_of(found, name) for name in ESTIMATED}
+    corrected = np.isfinite(estimates["mean"].corrected)  # the outputs of which the error of the mesh was estimated
     if before is None:  # nothing to be known, or not asked for; else it was too much
         known = not (study.spec.meshed or study.spec.hidden) or not study.accuracy.mesh_error
     else:
-        known = all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
+        known = all(corrected[i] for i, name in enumerate(names) if name not in never)
     missed = _unmet(found)
     return {
         "tolerance": goal.tolerance,
@@ -130,12 +132,12 @@ def _told(
         "outputs": {
             name: {
                 estimate: {
-                    "value": float(found[f"{estimate}_corrected" if _corrected(found, i) else estimate][i]),
+                    "value": float(one.corrected[i] if corrected[i] else one.value[i]),
                     "error": float(goal.tolerance * parts["total"][k, i] * sizes[k, i]),
                     "relative_to": float(sizes[k, i]),
                     **{source: float(parts[source][k, i]) for source in SOURCES},
                 }
-                for k, estimate in enumerate(ESTIMATED)
+                for k, (estimate, one) in enumerate(estimates.items())
             }
             for i, name in enumerate(names)
         },
@@ -149,11 +151,6 @@ def _unmet(found: xr.Dataset) -> dict[str, float]:
     values = found["values"].to_numpy()[found["ok"].to_numpy()]
     names = np.array([str(name) for name in found["output"].values])
     return dict.fromkeys(names[equal(values)].tolist(), unmet(len(values))) if len(values) else {}
-
-
-def _corrected(found: xr.Dataset, output: int) -> bool:
-    """Whether the error of the mesh was estimated of an output."""
-    return "mean_corrected" in found and bool(np.isfinite(found["mean_corrected"][output]))
 
 
 def _of_mesh(before: dict[str, Any]) -> str:

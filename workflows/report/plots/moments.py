@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from uq.estimators.estimate import estimate_of, single
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
 from uq.estimators.tails import skewed
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, count_axis, quantity, text_of
@@ -110,10 +111,9 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
             values, bins=_bins(values) if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white"
         )
     ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
-    corrected = dataset.get("mean_corrected")
-    if corrected is not None and np.isfinite(corrected.sel(output=output)):
-        place = float(corrected.sel(output=output))
-        ax.axvline(place, color=DARK, linestyle=":", label="corrected mean")
+    corrected = single(dataset.sel(output=output), "mean").corrected
+    if np.isfinite(corrected):
+        ax.axvline(corrected, color=DARK, linestyle=":", label="corrected mean")
     for i, probability in enumerate(dataset["quantile"].to_numpy()):
         place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
         ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
@@ -136,10 +136,9 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 def _corrected_density(dataset: xr.Dataset, output: str, ax: Axes) -> None:
     """Draw the density without the error of the mesh: as much of it between ends that have moved."""
-    if "density_edge_corrected" not in dataset:
-        return
     of_output = dataset.sel(output=output)
-    before, after = (of_output[name].to_numpy() for name in ("density_edge", "density_edge_corrected"))
+    edges = estimate_of(of_output, "density_edge")
+    before, after = edges.value, edges.corrected
     widths = np.diff(after)
     if np.isfinite(after).all() and (widths > 0).all():
         density = of_output["density"].to_numpy() * np.diff(before) / widths

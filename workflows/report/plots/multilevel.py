@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from uq.estimators.estimate import estimate_of
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, quantity, text_of
 
 if TYPE_CHECKING:
@@ -145,8 +146,8 @@ def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax
     unknowns = dataset["cycle_unknowns"].to_numpy()
     for output, colour in zip(outputs, cycle(COLOURS), strict=False):
         found = dataset.sel(output=output)
-        error = found["cycle_mesh_error"].to_numpy()
-        size = np.abs(found["cycle_value"].to_numpy() + error)
+        at = estimate_of(found, "cycle_value")
+        error, size = at.mesh, np.abs(at.value + at.mesh)
         relative = np.divide(np.abs(error), size, out=np.full(len(size), np.nan), where=size > 0)
         ax.plot(
             unknowns, np.where(relative > 0, relative, np.nan), "o-", color=colour, markersize=4, label=text_of(output)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray
+from uq.estimators.estimate import estimate_of, holds
 from uq.estimators.moments import half_width
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, text_of
 
@@ -37,9 +38,10 @@ def curve(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | No
         ax.errorbar(x, there["mean"].to_numpy(), error, color=CONTROLLED, marker="o", ms=4, capsize=3, label="mean")
     else:
         ax.plot(x, there["nominal"].to_numpy(), color=CONTROLLED, marker="o", ms=4, label="at the mean parameters")
-    if "mean_corrected" in there:
-        corrected = there["mean_corrected"].to_numpy()
-        ax.plot(x, corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added")
+    if holds(there, "mean", "corrected"):
+        ax.plot(
+            x, estimate_of(there, "mean").corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added"
+        )
     _along(ax, along, unit)
     ax.set_ylabel(_labelled(output, str(there["unit"].to_numpy()[0])))
     ax.legend(frameon=False, fontsize="small")

@@ -13,6 +13,7 @@ import numpy as np
 from forward.bodies.inclusions import INDICATORS, OPS
 from forward.model import FloatArray
 from forward.readable import spoken
+from uq.estimators.estimate import estimate_of, holds
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
@@ -186,10 +187,11 @@ def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
         yield Quantity("Standard deviation of the displacement", _size(of["field_std"]), "m", "plasma", std=True)
     if "von_mises" in of:
         yield Quantity("Von Mises stress at the mean parameters", of["von_mises"].to_numpy(), "Pa", "plasma")
-    if f"{mean}_mesh_error" in of:
-        yield Quantity("Error of the mesh in the displacement", _size(of[f"{mean}_mesh_error"]), "m", "plasma")
-    if "field_mean_error" in of:
-        yield Quantity("Sampling error of the mean displacement", _size(of["field_mean_error"]), "m", "plasma")
+    found = estimate_of(of, mean)
+    if holds(of, mean, "mesh"):
+        yield Quantity("Error of the mesh in the displacement", _size(found.mesh), "m", "plasma")
+    if holds(of, mean, "error"):
+        yield Quantity("Sampling error of the mean displacement", _size(found.error), "m", "plasma")
     names = of["parameter"].to_numpy() if "parameter" in of.coords else np.zeros(0, dtype=str)
     if "field_derivative_rms" in of:
         effects = of["field_derivative_rms"] * of["parameter_std"]

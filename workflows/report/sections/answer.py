@@ -10,6 +10,7 @@ import numpy as np
 
 from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
 from forward.words import duration, number, power_of_ten, with_error
+from uq.estimators.estimate import single
 from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.section import Results, Section
@@ -105,10 +106,9 @@ def forward(results: Results) -> Card:
         lines = [] if not sampled else [spread(one, unit, value)]
         unknown = output in results.meshes_unknown
         lines += known(errors, unit, value, mesh=not unknown)
-        if f"{name}_corrected" in one and np.isfinite(one[f"{name}_corrected"]):
-            doubt = f"{name}_corrected_error" if sampled else "nominal_mesh_error_doubt"
-            better, left = float(one[f"{name}_corrected"]), float(one[doubt])
-            lines.append(f"corrected for the mesh: {and_error(better, left, unit)}")
+        estimate = single(one, name)
+        if np.isfinite(estimate.corrected):
+            lines.append(f"corrected for the mesh: {and_error(estimate.corrected, estimate.left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
         curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
         shown = size(value, unit, DIGITS) if results.meshes_unknown.get(output) else quantity(value, error, unit)
@@ -281,9 +281,10 @@ def _goal(name: str) -> str:
 
 def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
     """A quantity that was not measured, by the posterior."""
-    mean, std, lower, upper, before, wide, mesh = (
-        float(at[f"prediction_{which}"])
-        for which in ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "mesh_error")
+    predicted = single(at, "prediction_mean")
+    mean, mesh = predicted.value, predicted.mesh
+    std, lower, upper, before, wide = (
+        float(at[f"prediction_{which}"]) for which in ("std", "lower", "upper", "prior_mean", "prior_std")
     )
     unit = str(at["goal_unit"].item())
     if not np.isfinite(mean):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.readable import and_error, margin, quantity, size, spoken
 from forward.words import NONE, duration, number
+from uq.estimators.estimate import estimate_of, holds, single
 from uq.estimators.rounding import only_rounding
 from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report import bodies, plots
@@ -21,7 +22,6 @@ from workflows.report.sections.bodies import NO_BODY
 if TYPE_CHECKING:
     import xarray as xr
 
-FIRST = {"std": "std_", "nominal": "nominal_"}  # of the names of an estimate's mesh and total error
 MANY = 10.0  # times a value: percentages beyond say nothing
 LISTED = 8  # outputs that the sentence names
 BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
@@ -54,7 +54,7 @@ class ErrorBudget(Section):
                     for name, found in budgets.items()
                 ]
             )
-        if any(f"{name}_corrected" in results.dataset for name in shown):
+        if any(holds(results.dataset, name, "corrected") for name in shown):
             yield Text(
                 "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
                 "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
@@ -65,20 +65,16 @@ class ErrorBudget(Section):
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
     """Return the errors of an estimate by source, for each output (m,); NaN where they are not estimated."""
-    dataset, first = results.dataset, FIRST.get(name, "")
-    found = {}
-    if f"{name}_error" in dataset:
-        found["sampling"] = dataset[f"{name}_error"].to_numpy()
-    if f"{first}mesh_error" in dataset:
-        found["mesh"] = np.abs(dataset[f"{first}mesh_error"].to_numpy())
-        if f"{first}mesh_error_doubt" in dataset:  # as it is in the total
-            found["mesh"] += dataset[f"{first}mesh_error_doubt"].to_numpy()
+    one = estimate_of(results.dataset, name)
     tolerance = getattr(getattr(results.study.model, "solver", None), "tolerance", None)
-    if tolerance is not None:
-        found["solver"] = tolerance * np.abs(dataset[name].to_numpy())
-    if f"{first}total_error" in dataset:
-        found["total"] = dataset[f"{first}total_error"].to_numpy()
-    return found
+    doubt = one.doubt if holds(results.dataset, name, "doubt") else 0.0
+    found = {
+        "sampling": one.error if holds(results.dataset, name, "error") else None,
+        "mesh": np.abs(one.mesh) + doubt if holds(results.dataset, name, "mesh") else None,  # as it is in the total
+        "solver": None if tolerance is None else tolerance * np.abs(one.value),
+        "total": one.total if holds(results.dataset, name, "total") else None,
+    }
+    return {source: error for source, error in found.items() if error is not None}
 
 
 def counting(results: Results) -> NDArray[np.bool_]:
@@ -131,27 +127,20 @@ def table(results: Results, names: list[str]) -> Table:
     rows = []
     for output in np.array(results.outputs)[counting(results)].tolist():
         of_output, unit = results.of(output), results.unit(output)
-
-        def known(name: str, of_output: xr.Dataset = of_output) -> float:
-            return float(of_output[name]) if name in of_output else np.nan
-
         for name in names:
-            value, first = known(name), FIRST.get(name, "")
-            error, doubt = (known(f"{first}mesh_error{end}") for end in ("", "_doubt"))
-            corrected, its_error = known(f"{name}_corrected"), known(f"{name}_corrected_error")
-            total = known(f"{first}total_error")
-            if name == "nominal":  # where nothing is sampled
-                its_error, total = doubt, abs(error) + doubt
+            one = single(of_output, name)
+            value, error = one.value, one.mesh
+            total = abs(error) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
             rows.append(
                 (
                     f"{ESTIMATES[name]} of {output}",
                     size(value, unit, DIGITS)
                     if results.meshes_unknown.get(output)
-                    else quantity(value, total if np.isfinite(total) else known(f"{name}_error"), unit),
-                    margin(known(f"{name}_error"), unit, like=value),
-                    "not known" if np.isnan(error) else and_error(error, doubt, unit, like=value),
+                    else quantity(value, total if np.isfinite(total) else one.error, unit),
+                    margin(one.error, unit, like=value),
+                    "not known" if np.isnan(error) else and_error(error, one.doubt, unit, like=value),
                     margin(total, unit, like=value),
-                    NONE if np.isnan(error) else and_error(corrected, its_error, unit),
+                    NONE if np.isnan(error) else and_error(one.corrected, one.left, unit),
                 )
             )
     head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")
@@ -390,7 +379,8 @@ def cycles(results: Results) -> Table:
         found = []
         for output in results.outputs:
             here = dataset.isel(cycle=k).sel(output=output)
-            value, error = float(here["cycle_value"]), float(here["cycle_mesh_error"])
+            at = single(here, "cycle_value")
+            value, error = at.value, at.mesh
             unit = results.unit(output)
             sign = "+" if error > 0 else ""
             estimated = NONE if np.isnan(error) else sign + size(error, unit, like=value)

@@ -10,6 +10,7 @@ import numpy as np
 
 from forward.readable import and_error, margin, size
 from forward.words import number, worth
+from uq.estimators.estimate import estimate_of, part, single
 from uq.estimators.moments import half_width
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
@@ -18,7 +19,7 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     import xarray as xr
 
-CORRECTED = ("mean_corrected", "std_corrected")  # with the estimated error of the mesh
+CORRECTED = tuple(part(name, "corrected") for name in ("mean", "std"))  # with the estimated error of the mesh
 
 
 class Moments(Section):
@@ -41,8 +42,8 @@ def moments(results: Results) -> Table:
     words = {
         "mean": "mean",
         "std": "standard deviation",
-        "mean_corrected": "mean, error of the mesh added",
-        "std_corrected": "standard deviation, error of the mesh added",
+        CORRECTED[0]: "mean, error of the mesh added",
+        CORRECTED[1]: "standard deviation, error of the mesh added",
         "plain_mean": "mean, plain Monte Carlo",
         "plain_std": "standard deviation, plain Monte Carlo",
     }
@@ -69,9 +70,10 @@ def total_errors(results: Results) -> Table:
     rows = []
     for output in results.outputs:
         of_output = results.of(output)
-        for word, first in (("mean", ""), ("standard deviation", "std_")):
-            names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
-            errors = [margin(float(of_output[name]), results.unit(output)) for name in names]
+        for name, word, first in (("mean", "mean", ""), ("std", "standard deviation", "std_")):
+            one = single(of_output, name)
+            found = (one.error, float(of_output[f"{first}bias_error"]), one.total)
+            errors = [margin(error, results.unit(output)) for error in found]
             rows.append((f"{word} of {output}", *errors))
     return Table(("estimate", "sampling", "mesh", "total"), rows)
 
@@ -93,13 +95,14 @@ def quantiles(results: Results) -> Table:
     """Quantiles of the outputs."""
     rows = []
     for output in results.outputs:
-        of_output = results.of(output)
-        pairs = zip(of_output["quantiles"].to_numpy(), of_output["quantiles_error"].to_numpy(), strict=True)
-        rows.append((output, *(and_error(float(q), float(e), results.unit(output)) for q, e in pairs)))
-        if "quantiles_corrected" in results.dataset and np.isfinite(of_output["quantiles_corrected"]).all():
-            ends = (of_output[f"quantiles_corrected{end}"].to_numpy() for end in ("", "_error"))
-            corrected = [and_error(float(q), float(e), results.unit(output)) for q, e in zip(*ends, strict=True)]
-            rows.append((f"{output}, corrected for the mesh", *corrected))
+        found = estimate_of(results.of(output), "quantiles")
+        for words, values, errors in (
+            (output, found.value, found.error),
+            (f"{output}, corrected for the mesh", found.corrected, found.left),
+        ):
+            if words == output or np.isfinite(values).all():
+                pairs = zip(values.tolist(), errors.tolist(), strict=True)
+                rows.append((words, *(and_error(value, error, results.unit(output)) for value, error in pairs)))
     return Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from forward.readable import and_error, interval, percent, place, quantity, scale, size, spoken
 from forward.specimen import Specimen
 from forward.words import NONE, named, number, with_error
+from uq.estimators.estimate import single
 from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import design as design_plots
 from workflows.report.plots import population as population_plots
@@ -117,7 +118,8 @@ def table(one: xr.Dataset) -> Table:
     for goal in one["goal"].values[:SHOWN]:
         at = one.sel(goal=goal)
         unit = str(at["goal_unit"].item())
-        lower, upper, share, mesh = (float(at[f"prediction_{n}"]) for n in ("lower", "upper", "share", "mesh_error"))
+        lower, upper, share = (float(at[f"prediction_{name}"]) for name in ("lower", "upper", "share"))
+        mesh = single(at, "prediction_mean").mesh
         rows.append(
             (
                 str(goal),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from forward.readable import percent, size
 from forward.words import NONE, number, per, with_error, with_unit
+from uq.estimators.estimate import holds
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
@@ -45,7 +46,7 @@ def sensitivities(results: Results, output: str) -> Table:
         corrected = results.corrected("derivative", {"output": output, "parameter": name}, by)
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
         rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
-    known = ("corrected for the mesh",) if "derivative_corrected" in results.dataset else ()
+    known = ("corrected for the mesh",) if holds(results.dataset, "derivative", "corrected") else ()
     return Table(("parameter", "derivative", *known, "× standard deviation", "× range"), rows)
 
 
@@ -147,7 +148,7 @@ def _cells(results: Results, names: Sequence[str], at: Mapping[str, str]) -> Ite
 def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
     for word in words:
         yield word
-        if f"{name}_corrected" in results.dataset:
+        if holds(results.dataset, name, "corrected"):
             yield f"{word}, corrected"
 
 
@@ -256,7 +257,7 @@ def bounds(results: Results, output: str) -> Table:
         "Poincaré constant",
         "total index (expansion)",
         "is at most",
-        *(("is at most, corrected",) if "total_bound_corrected" in results.dataset else ()),
+        *(("is at most, corrected",) if holds(results.dataset, "total_bound", "corrected") else ()),
     )
     return Table(head, rows)
 
