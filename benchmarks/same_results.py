@@ -285,7 +285,7 @@ def _opened(value: Any) -> Any:
     if isinstance(value, str) and value.startswith(("{", "[")):
         with suppress(ValueError):
             value = json.loads(value)
-    elif isinstance(value, str) and "\n" in value:
+    if isinstance(value, str) and "\n" in value:
         with suppress(ValueError):
             value = tomllib.loads(value)
     return {str(place): one for place, one in enumerate(value)} if isinstance(value, list) else value

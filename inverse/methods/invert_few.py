@@ -7,16 +7,15 @@ other all groups solve at different points of one posterior.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution
 from inverse.criticism.answer import Answer, answer, by_gaussian
-from inverse.criticism.assessment import Assessment, Points, assess, even, of_chains, of_gaussian, weighted
+from inverse.criticism.assessment import Assessment, Points, even, of_chains, of_gaussian, weighted
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
@@ -25,10 +24,10 @@ from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import Evidence
-from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
+from inverse.methods.infer import Looked, Starts, infer
 from inverse.methods.invert import Invert
-from inverse.methods.mesh_correction import before_few, corrected_few
 from inverse.methods.record import (
     ENDS,
     SOURCES,
@@ -44,7 +43,7 @@ from inverse.methods.record import (
     of_test,
 )
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.request import Evaluate, Start
+from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
 
@@ -170,36 +169,34 @@ def inverted(
     evaluate: Evaluate,
     data: Data,
     method: Invert,
-    look: Look | None,
+    interior: Look | None,
     errors: NormalErrors | StudentErrors,
     finer: Finer | None,
-    start: Callable[[FloatArray], Start | None],
+    start: Starts,
     say: Callable[[str], None],
     shared: Shared | None,
     model: ForwardModel | None = None,
 ) -> Inverted:
     """Invert a data set, as `invert_by_group`; `start` predicts states from a solution at parameters (d,)."""
     counted = Recorder(evaluate)
-    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
-    if shared is not None:
-        posterior = replace(posterior, shared=shared(inputs.mean))
-    d = len(inputs.names)
-    with suppress(SolveError):  # or else every solve begins at zero
-        posterior = replace(posterior, start=start(inputs.mean))
-    before = before_few(posterior, finer, say) if finer is not None and method.treatment is not None else None
-    searched = laplace(posterior, starts=method.starts, seed=method.seed)
-    gaussian, mesh = searched, None
-    if shared is not None:  # which depends on the displacements
-        posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
-        gaussian = laplace(posterior, starts=1, first=gaussian.mode)
-    posterior = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d]))
-    if finer is not None:
-        treatment = method.treatment or "report"
-        posterior, gaussian, mesh = corrected_few(posterior, gaussian, finer, data.spread, treatment)
+    of_data_set = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
+    solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
+    look = None if finer is None else Looked(finer, data.spread, method.treatment)
+    inferred = infer(
+        of_data_set,
+        start,
+        solves,
+        starts=method.starts,
+        seed=method.seed,
+        look=look,
+        shared=shared,
+        chains=method.chains,
+        model=model,
+        say=say,
+    )
+    posterior, searched, one, mesh = inferred.posterior, inferred.searched, inferred.assessment, inferred.mesh
+    gaussian, found, chains = one.gaussian, one.evidence, one.chains
     best = posterior.physical(gaussian.mode[None])[0]
-    solves = method.solves(len(best), field=False)
-    one = assess(posterior, gaussian, solves, chains=method.chains, model=model, seed=method.seed)
-    found, chains = one.evidence, one.chains
     at = posterior.at(gaussian.mode[None], derivatives=True)
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
@@ -210,12 +207,12 @@ def inverted(
     known = answer(posterior, gaussian, found, chains)
     log_evidence, error = one.log_evidence
     drawn = _drawn(posterior, one, at, method)
-    moments = _moments(posterior, gaussian, known, drawn, look)
+    moments = _moments(posterior, gaussian, known, drawn, interior)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
-        **({} if mesh is None else of_mesh(mesh, before, len(best) - d)),
+        **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
         **of_motions(spectrum, posterior.whitening, posterior.shared, root),
         **moments,
         **_alone(posterior, gaussian, spectrum, data),

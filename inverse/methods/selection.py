@@ -19,21 +19,21 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import Settings
-from inverse.criticism.assessment import Assessment, Kind, Points, assess, of_chains, of_gaussian, solves_of, weighted
+from inverse.criticism.assessment import Assessment, Kind, Points, of_chains, of_gaussian, solves_of, weighted
 from inverse.criticism.comparison import Candidate, Data, comparison
-from inverse.criticism.finer import Finer, MeshFound
+from inverse.criticism.finer import Finer
 from inverse.criticism.verdict import verdict_on_points
 from inverse.criticism.weights import fewest
 from inverse.data.approximation_error import Places
 from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST
-from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.mesh_correction import MeshTreatment, Treatment, before_few, corrected_few
+from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
+from inverse.methods.mesh_correction import MeshTreatment, Treatment
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
-from uq.surrogates.linearisation import linearise
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -180,36 +180,49 @@ class Select(Settings):
             If a model has no answer at any start or any point.
         """
         pairs = [(name, group) for name in candidates for group in data_groups]
-        posteriors, stated, meshes = {}, {}, {}
+        found: dict[tuple[str, str], Inferred] = {}
+        starts: dict[tuple[str, str], Starts] = {}
         for name, group in pairs:
-            one = started(posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group)))
-            errors = None if shared is None else shared.get((name, group))
-            if errors is not None:
-                one = replace(one, shared=errors(one.inputs.mean))
-            look = None if finer is None else (finer(name, group), _places(data_groups[group]))
-            if look is not None and self.treatment is not None:
-                before_few(one, look[0], lambda line, name=name: say(f"{name}: {line}"))  # type: ignore[misc]
-            near, gaussian, found = self._around(one, (name, group), look, errors)
-            itself = None if model is None else model(name, group)
-            posteriors[name, group] = near
-            stated[name, group] = self._assessed(near, gaussian, (name, group), chains=self.chains, model=itself)
-            if found is not None:
-                meshes[name, group] = found
+            one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
+            starts[name, group] = by_tangents(one.inputs, one.evaluate)
+            places = _places(data_groups[group])
+            with _of((name, group)):
+                found[name, group] = infer(
+                    one,
+                    starts[name, group],
+                    self.samples,
+                    starts=self.starts,
+                    seed=self.seed,
+                    look=None if finer is None else Looked(finer(name, group), places, self.treatment),
+                    shared=None if shared is None else shared.get((name, group)),
+                    chains=self.chains,
+                    model=None if model is None else model(name, group),
+                    say=lambda line, name=name: say(f"{name}: {line}"),  # type: ignore[misc]
+                )
+        posteriors = {pair: one.posterior for pair, one in found.items()}
+        stated = {pair: one.assessment for pair, one in found.items()}
+        meshes = {pair: one.mesh for pair, one in found.items() if one.mesh is not None}
+
+        def value(changed: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
+            with _of(pair):
+                again = infer(changed, starts[pair], self.samples, starts=self.starts, seed=self.seed)
+            return again.assessment.log_evidence
+
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
-            STATED: {pair: found.log_evidence for pair, found in stated.items()}
+            STATED: {pair: one.log_evidence for pair, one in stated.items()}
         }
         for width in WIDTHS:
             label = f"priors × {width:g}"
             variants[label] = {
-                pair: found.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, found in stated.items()
+                pair: one.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, one in stated.items()
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
-                pair: self._value(_with_noise(posteriors[pair], data_groups[pair[1]], noise), pair) for pair in pairs
+                pair: value(_with_noise(posteriors[pair], data_groups[pair[1]], noise), pair) for pair in pairs
             }
         for label, tests in self.subsets.items():
             variants[label] = {
-                pair: self._value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
+                pair: value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
                 for pair in pairs
                 if set(tests) & set(_tests(data_groups[pair[1]]))
             }
@@ -218,11 +231,11 @@ class Select(Settings):
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
         left_out = (
-            {test: self._without(test, data_groups, posteriors) for test in _testnames(data_groups)}
+            {test: _without(test, data_groups, posteriors, value) for test in _testnames(data_groups)}
             if self.held_out
             else {}
         )
-        points = {pair: _standing(posteriors[pair], found) for pair, found in stated.items()}
+        points = {pair: _standing(posteriors[pair], one) for pair, one in stated.items()}
         verdicts = {pair: verdict_on_points(one.gaussian, one.evidence, one.chains) for pair, one in stated.items()}
         result = comparison(
             candidates, data_groups, posteriors, stated, points, verdicts, variants, checks, left_out, meshes
@@ -232,57 +245,10 @@ class Select(Settings):
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
         return result.assign(motion_eigenvalue=(("model", "motion"), np.array(seen)))
 
-    def _without(
-        self, test: str, data_groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
-    ) -> dict[tuple[str, str], tuple[float, float]]:
-        """Return ln Z and its error without a test, in the groups that have it and others."""
-        found = {}
-        for pair, posterior in posteriors.items():
-            rest = _tests(data_groups[pair[1]])
-            if test in rest and len(rest) > 1:
-                others = tuple(other for other in rest if other != test)
-                found[pair] = self._value(_only(posterior, data_groups[pair[1]], others), pair)
-        return found
-
     @property
     def treatment(self) -> Treatment | None:
         """What is done about the error of meshes: there are none."""
         return None
-
-    def _around(
-        self,
-        posterior: Posterior,
-        pair: tuple[str, str],
-        look: tuple[Finer, Places] | None = None,
-        shared: Shared | None = None,
-    ) -> tuple[Posterior, Laplace, MeshFound | None]:
-        """Find the mode; the posterior too, with solves that start from the mode, corrected for its mesh."""
-        with _of(pair):
-            gaussian, found = laplace(posterior, starts=self.starts, seed=self.seed), None
-            d = len(posterior.inputs.names)
-            if shared is not None:  # which depends on the displacements
-                posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
-                gaussian = laplace(posterior, starts=1, first=gaussian.mode)
-            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, :d])
-            if look is not None:
-                near, gaussian, found = corrected_few(near, gaussian, *look, self.treatment or "report")
-            return near, gaussian, found
-
-    def _assessed(
-        self,
-        near: Posterior,
-        gaussian: Laplace,
-        pair: tuple[str, str],
-        *,
-        chains: Kind | None = None,
-        model: ForwardModel | None = None,
-    ) -> Assessment:
-        with _of(pair):
-            return assess(near, gaussian, self.samples, chains=chains, model=model, seed=self.seed)
-
-    def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
-        near, gaussian, _ = self._around(posterior, pair)
-        return self._assessed(near, gaussian, pair).log_evidence
 
 
 class SelectSpecimens(MeshTreatment, Select):
@@ -316,15 +282,20 @@ def _places(data: Data) -> Places:
     return Places(kinds[order], places[order] if places.shape[1] == 3 else None)
 
 
-def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
-    """Start solves of a model with states from its tangent at a point (d,), by default the mean of the prior."""
-    if posterior.start is None and point is not None:
-        return posterior  # a model without states, or without an answer at the mean
-    try:
-        start = linearise(posterior.inputs, posterior.evaluate, point).prediction
-    except SolveError:
-        return posterior
-    return replace(posterior, start=start)
+def _without(
+    test: str,
+    data_groups: Mapping[str, Data],
+    posteriors: Mapping[tuple[str, str], Posterior],
+    value: Callable[[Posterior, tuple[str, str]], tuple[float, float]],
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return ln Z and its error without a test, in the groups that have it and others."""
+    found = {}
+    for pair, posterior in posteriors.items():
+        rest = _tests(data_groups[pair[1]])
+        if test in rest and len(rest) > 1:
+            others = tuple(other for other in rest if other != test)
+            found[pair] = value(_only(posterior, data_groups[pair[1]], others), pair)
+    return found
 
 
 def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:

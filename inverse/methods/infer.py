@@ -1,0 +1,137 @@
+"""The way from a model and data to a posterior of few parameters, the same for inversions and for comparisons.
+
+Start, mode, errors that data share, error of the mesh, evidence: in this order, since each stands on the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+from forward.model import FloatArray, ForwardModel, SolveError
+from inverse.criticism.assessment import Assessment, Kind, assess
+from inverse.criticism.finer import Finer, MeshFound
+from inverse.data.approximation_error import Places
+from inverse.data.shared_motion import Shared
+from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
+from uq.evaluation.request import Evaluate, Start
+from uq.inputs.random_parameters import Inputs
+from uq.surrogates.linearisation import linearise
+
+Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what predicts states near there; None if nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """How the error of the mesh is looked at: on finer meshes, of data at places, and what is done about it.
+
+    Without a treatment it is not looked at before the search, and only reported.
+    """
+
+    finer: Finer
+    places: Places
+    treatment: Treatment | None
+
+
+@dataclass(frozen=True, eq=False)
+class Inferred:
+    """A posterior, and what was found of it.
+
+    Attributes
+    ----------
+    posterior
+        As it was corrected, with solves that start from its mode.
+    searched
+        Laplace's Gaussian as it was first found, with all starts of the search.
+    assessment
+        That of the corrected posterior, weighted points, chains.
+    mesh, before
+        What finer meshes have said, and the error of the mesh at the mean of the prior, in deviations of the noise;
+        None where they were not asked.
+    """
+
+    posterior: Posterior
+    searched: Laplace
+    assessment: Assessment
+    mesh: MeshFound | None
+    before: float | None
+
+
+def infer(
+    posterior: Posterior,
+    start: Starts,
+    samples: int,
+    *,
+    starts: int,
+    seed: int,
+    look: Looked | None = None,
+    shared: Shared | None = None,
+    chains: Kind | None = None,
+    model: ForwardModel | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Inferred:
+    """Find the mode of a posterior, and what stands for it around there.
+
+    Parameters
+    ----------
+    posterior
+        Of a model and data. Where solves start from something already, that is not sought again.
+    start
+        Makes what predicts states from a solution at parameters (d,), at the mean and at the mode.
+    samples, chains, model
+        As of `assess`.
+    starts, seed
+        Of the search for the mode.
+    look
+        How the error of the mesh is looked at; None where there is no mesh.
+    shared
+        What errors the data share, at parameters (d,); None if they are independent.
+    say
+        Shows the user a line before the search.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer where the search needs one.
+    """
+    d = len(posterior.inputs.names)
+    if shared is not None:
+        posterior = replace(posterior, shared=shared(posterior.inputs.mean))
+    if posterior.start is None:
+        with suppress(SolveError):  # or else every solve begins at zero
+            posterior = replace(posterior, start=start(posterior.inputs.mean))
+    asked = look is not None and look.treatment is not None
+    before = before_few(posterior, look.finer, say) if look is not None and asked else None
+    searched = gaussian = laplace(posterior, starts=starts, seed=seed)
+    if shared is not None:  # which depends on the displacements
+        posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
+        gaussian = laplace(posterior, starts=1, first=gaussian.mode)
+    posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
+    if look is not None:
+        treatment = look.treatment or "report"
+        posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.places, treatment)
+    one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed)
+    return Inferred(posterior, searched, one, mesh, before)
+
+
+def by_tangents(inputs: Inputs, evaluate: Evaluate) -> Starts:
+    """Return what predicts states by tangents at a point.
+
+    A model without states, or without an answer at the first point, the mean of the prior, is not asked again.
+    """
+    known: list[bool] = []
+
+    def start(point: FloatArray) -> Start | None:
+        if known == [False]:
+            return None
+        found = None
+        try:
+            found = linearise(inputs, evaluate, point).prediction
+        finally:
+            known[:] = known or [found is not None]
+        return found
+
+    return start
