@@ -136,15 +136,13 @@ class Finding:
     def read(cls, kept: Mapping[str, Any]) -> Self:
         """Return a finding as `kept` returned it; words that this version does not have stay as they were said."""
         severity, text = kept["severity"], kept["text"]
-        if kept.get("code") in CATALOGUE:
+        try:
             about = tuple(Entry(*entry) for entry in kept["about"])
             found = cls(kept["code"], severity, kept["values"], about, kept["subject"], kept["also"])
-            try:
-                if found.text == text:
-                    return found
-            except (KeyError, ValueError):
-                pass  # the text has other places now
-        return cls(FREE, severity, {"text": text})
+            known = found.text == text
+        except (KeyError, ValueError):  # no such code, or its text has other places
+            known = False
+        return found if known else cls(FREE, severity, {"text": text})
 
     def __eq__(self, other: object) -> bool:
         """Whether both say the same."""

@@ -4,16 +4,12 @@ import ast
 import re
 from string import Formatter
 
-import pytest
-
 import forward
 import inverse
 import uq
 import workflows
 from forward.findings import CATALOGUE
 from tests.launch import ROOT
-
-pytestmark = pytest.mark.unit
 
 PACKAGES = (forward, uq, inverse, workflows)  # each fills the catalogue when it is imported
 OWN = {code: words for package in PACKAGES for code, words in CATALOGUE.items() if code in package.catalogue.TABLE}

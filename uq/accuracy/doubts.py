@@ -26,6 +26,7 @@ EXACT = 1e-9  # of a value: errors that are no more than that are rounding
 LOOSE = 1e-8  # tolerance of the solver from which its error may be as large as one of a mesh
 VISIBLE = 1e-3  # of a mean: doubts below do no harm
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
+TINY = 1e-300
 Names = NDArray[Any]  # of the outputs (m,)
 
 
@@ -134,9 +135,7 @@ def _large(names: Names, word: str, error: FloatArray, size: FloatArray) -> Iter
     large = error > LARGE * size
     if large.any():
         listed = [
-            Entry(
-                name, f" {e / s:.0%}" if e < MANY * s else f" (more than {MANY:.0f} times it)", e / s if s else np.inf
-            )
+            Entry(name, f" {e / s:.0%}" if e < MANY * s else f" (more than {MANY:.0f} times it)", e / max(s, TINY))
             for name, e, s in zip(names[large], error[large], size[large], strict=True)
         ]
         yield Finding("mesh-coarse", "warning", {"what": word}, about=tuple(listed))
