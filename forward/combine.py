@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -321,24 +322,41 @@ class Joined(OneByOne):
     def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess | None]) -> JoinedSolution:
         """Solve all at `parameters` (d,), each with its own guess."""
         found = (model.solve(parameters, near) for model, near in zip(self.models, guesses, strict=True))
-        return JoinedSolution(tuple(found))
+        return JoinedSolution(tuple(found), len(parameters))
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedSolution:
-    """Several solutions as one."""
+    """Several solutions as one.
+
+    Attributes
+    ----------
+    solutions
+        The solutions.
+    count
+        Number d of parameters.
+    """
 
     solutions: tuple[Solution, ...]
+    count: int
 
-    @property
+    def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
+        """Return states (…, U_local) of all, or changes of them, as one; of different meshes there is none (…, 0)."""
+        return np.zeros((*states[0].shape[:-1], 0))
+
+    @cached_property
     def outputs(self) -> FloatArray:
         """Values of all outputs (m,)."""
-        return np.concatenate([one.outputs for one in self.solutions])
+        found = np.concatenate([one.outputs for one in self.solutions])
+        found.flags.writeable = False
+        return found
 
-    @property
+    @cached_property
     def state(self) -> FloatArray:
-        """None."""
-        return np.zeros(0)
+        """This rank's part of the states (U_local,)."""
+        found = self.side_by_side([one.state for one in self.solutions])
+        found.flags.writeable = False
+        return found
 
     @property
     def residual(self) -> float:
@@ -365,14 +383,22 @@ class JoinedSolution:
         return np.concatenate([one.tangent(direction) for one in self.solutions], axis=-1)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m)."""
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m).
+
+        Solutions whose outputs have no weight cost nothing.
+        """
         ends = np.cumsum([len(one.outputs) for one in self.solutions])[:-1]
-        parts = zip(self.solutions, np.split(np.asarray(weights), ends, axis=-1), strict=True)
-        return np.asarray(sum(one.adjoint(own) for one, own in parts))
+        rows = np.atleast_2d(weights)
+        gradients = np.zeros((len(rows), self.count))
+        for one, own in zip(self.solutions, np.split(rows, ends, axis=-1), strict=True):
+            counted = own.any(axis=1)
+            if counted.any():
+                gradients[counted] += one.adjoint(own[counted])
+        return gradients.reshape(*np.shape(weights)[:-1], -1)
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """There is no state."""
-        return np.zeros((*np.shape(direction)[:-1], 0))
+        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local) of k of them."""
+        return self.side_by_side([one.state_tangent(direction) for one in self.solutions])
 
     def mesh_error(self) -> MeshError | None:
         """Estimate the errors that all meshes make; None where there are none."""
@@ -383,7 +409,7 @@ class JoinedSolution:
         outputs = [np.zeros(len(one.outputs)) if error is None else error.outputs for one, error in found]
         return MeshError(
             np.concatenate(outputs),
-            self.state,
+            self.side_by_side([one.state for one in known]),
             sum(one.energy for one in known),
             max(one.relative for one in known),
             Work.sum_of(one.work for one in known),

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import eye
 
+from forward.combine import JoinedSolution, MappedSolution, Sparse, together
 from forward.fem.calibration import FinerMesh
 from forward.fem.model import HyperelasticModel
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, gather_each, scatter_each
-from forward.model import (
-    FloatArray,
-    Guess,
-    MeshError,
-    OneByOne,
-    ReferenceSolution,
-    Saturation,
-    SolveError,
-    Stability,
-    Work,
-)
+from forward.model import FloatArray, Guess, OneByOne, ReferenceSolution, Saturation, SolveError, Work
 from forward.path import Path
 
 FEW = 16  # parameters up to which derivatives of the states of all steps are kept
@@ -48,7 +41,9 @@ class PathModel(OneByOne):
         self.steps = tuple(whole.with_own_reference() for _ in range(spec.count))
         self.values = np.array(list(spec.steps.values())).T  # (steps, numbers that have steps)
         self.equations = whole.equations
-        self.space = PathSpace(whole.space, spec.count, self.along)
+        extended = eye(len(parameters) + len(spec.steps), len(parameters), format="csr")
+        self._maps = [Sparse(extended, np.append(np.zeros(len(parameters)), values)) for values in self.values]
+        self.space = PathSpace(whole.space, spec.count, self._maps[0].along)
         self.differentiable = True
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> PathSolution:
@@ -59,16 +54,17 @@ class PathModel(OneByOne):
         SolveError
             With the step at which the path stops, and the outputs before.
         """
-        solutions: list[FiniteElementSolution] = []
-        slopes: list[FloatArray] = []
-        directions = self.along(np.eye(len(self.parameters)))
+        solutions: list[StepSolution] = []
+        directions = np.eye(len(self.parameters))
         soon = guess is not None and guess.derivatives and len(directions) <= FEW
         for k, (model, given) in enumerate(zip(self.steps, self._guesses(guess or Guess()), strict=True)):
             known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
             try:
-                solutions.append(model.solve(np.append(parameters, self.values[k]), known))
+                by = self._maps[k]
+                found = StepSolution(model.solve(by.values(parameters[None])[0], known), by)
                 if soon:  # while its factor is at hand: the next step needs the room
-                    slopes.append(solutions[-1].state_tangent(directions))
+                    found = replace(found, slopes=found.state_tangent(directions))
+                solutions.append(found)
             except SolveError as error:
                 reached = np.full(len(self.outputs), np.nan)
                 for i, solution in enumerate(solutions):
@@ -77,9 +73,9 @@ class PathModel(OneByOne):
                 message = f"step {k + 1} of {len(self.steps)} ({where}): {error.reason}"
                 work = Work.sum_of([*(one.work for one in solutions), error.work])
                 raise type(error)(message, error.history, work, error.stability, reached) from error
-        return PathSolution(self, parameters, tuple(solutions), tuple(slopes))
+        return PathSolution(tuple(solutions), len(parameters), self)
 
-    def _continued(self, solutions: Sequence[FiniteElementSolution]) -> FloatArray | None:
+    def _continued(self, solutions: Sequence[StepSolution]) -> FloatArray | None:
         """Predict the state (U_local,) of the next step from the last two."""
         if not solutions:
             return None
@@ -110,10 +106,6 @@ class PathModel(OneByOne):
         """Split states (…, U) or parts of them into those of the steps, in their order."""
         last, *others = np.split(rows, len(self.steps), axis=-1)
         return [*others, last]
-
-    def along(self, direction: FloatArray) -> FloatArray:
-        """Return a direction (…, d) of the parameters as one of the parameters of each step."""
-        return np.concatenate([direction, np.zeros((*direction.shape[:-1], self.values.shape[1]))], axis=-1)
 
 
 def joined(parts: Sequence[FloatArray]) -> FloatArray:
@@ -153,111 +145,42 @@ class PathSpace:
         return self._one.factors(self._along(points), degree)
 
 
-class PathSolution:
-    """The equilibria of all steps with their linearisations.
+@dataclass(frozen=True, eq=False)
+class StepSolution(MappedSolution):
+    """The equilibrium of a step, with derivatives (d, U_local) of its state where they were found with it."""
 
-    Parameters
-    ----------
-    model, parameters, steps
-        Where it was found, and what.
-    slopes
-        Derivatives (d, U_local) of the states by all parameters, where they were found with these; empty otherwise.
-    """
-
-    def __init__(
-        self,
-        model: PathModel,
-        parameters: FloatArray,
-        steps: tuple[FiniteElementSolution, ...],
-        slopes: tuple[FloatArray, ...] = (),
-    ) -> None:
-        self._model, self.steps, self._slopes = model, steps, slopes
-        self.parameters = np.array(parameters, dtype=float)
-        self.state = joined([step.state for step in steps])
-        self.outputs = np.concatenate([step.outputs for step in steps])
-        for array in (self.parameters, self.state, self.outputs):
-            array.flags.writeable = False
-        self.residual = max(step.residual for step in steps)
-        self.converged = all(step.converged for step in steps)
-
-    @property
-    def stability(self) -> Stability:
-        """That of the step of which least is known; an instability that was missed counts more."""
-        return Stability.of_all([step.stability for step in self.steps])
-
-    def touched(self) -> dict[str, FloatArray]:
-        """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
-        return self.steps[-1].touched()
-
-    def stressed(self) -> FloatArray | None:
-        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
-        return self.steps[-1].stressed()
-
-    @property
-    def work(self) -> Work:
-        """Cost of all steps so far."""
-        return Work.sum_of(step.work for step in self.steps)
+    solution: FiniteElementSolution
+    slopes: FloatArray | None = None
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        return joined(self._state_tangents(direction))
+        """Return the derivative of the state (U_local,) along a `direction` (d,), or (k, U_local); collective."""
+        return super().state_tangent(direction) if self.slopes is None else direction @ self.slopes
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        along, states = self._model.along(direction), self._state_tangents(direction)
-        return np.concatenate([step.along(du, along) for step, du in zip(self.steps, states, strict=True)], axis=-1)
+        return self.solution.along(self.state_tangent(direction), self._along(direction))
 
-    def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
-        """Those of each step."""
-        if self._slopes:
-            return [direction @ slopes for slopes in self._slopes]
-        along = self._model.along(direction)
-        return [step.state_tangent(along) for step in self.steps]
 
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective.
+@dataclass(frozen=True, eq=False)
+class PathSolution(JoinedSolution):
+    """The equilibria of all steps with their linearisations."""
 
-        Steps whose outputs have no weight cost nothing.
-        """
-        d = len(self._model.parameters)
-        gradients = np.zeros((*np.shape(weights)[:-1], d))
-        for step, own in zip(self.steps, np.split(weights, len(self.steps), axis=-1), strict=True):
-            rows, found = np.atleast_2d(own), np.atleast_2d(gradients)
-            counted = rows.any(axis=1)
-            if counted.any():
-                found[counted] += step.adjoint(rows[counted])[:, :d]
-        return gradients
+    solutions: tuple[StepSolution, ...]
+    model: PathModel
 
-    def mesh_error(self) -> MeshError:
-        """Estimate the error of the mesh in the outputs and states of all steps; collective.
+    def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
+        """Join states of the steps (…, U_local), the last first."""
+        return joined(states)
 
-        Raises
-        ------
-        SolveError
-            If the stiffness in the enriched space is singular.
-        """
-        found = [step.mesh_error() for step in self.steps]
-        far = max((one.nonlinearity for one in found), key=lambda far: (not np.isfinite(far), far))
-        return MeshError(
-            np.concatenate([one.outputs for one in found]),
-            joined([one.state for one in found]),
-            sum(one.energy for one in found),
-            max(one.relative for one in found),
-            Work.sum_of(one.work for one in found),
-            nonlinearity=far,
-        )
+    def touched(self) -> dict[str, FloatArray]:
+        """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
+        return self.solutions[-1].solution.touched()
 
-    def saturation(self, spare: float = math.inf) -> Saturation:
-        """Calibrate estimates of the error of the mesh, step by step; collective."""
-        finer = FinerMesh(self._model.steps[0], spare)
-        found = [step.saturation(spare, finer) for step in self.steps]
-        return Saturation(
-            np.concatenate([one.outputs for one in found]),
-            float(np.mean([one.state for one in found])),
-            float(np.mean([one.energy for one in found])),
-            all(one.measured for one in found),
-            np.concatenate([one.shifts if one.shifts is not None else np.zeros(len(one.outputs)) for one in found]),
-            np.concatenate(
-                [one.doubts if one.doubts is not None else np.full(len(one.outputs), np.nan) for one in found]
-            ),
-        )
+    def stressed(self) -> FloatArray | None:
+        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
+        return self.solutions[-1].solution.stressed()
+
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh, step by step on one finer mesh; collective."""
+        finer = FinerMesh(self.model.steps[0], spare)
+        return together([(len(one.outputs), one.solution.saturation(spare, finer)) for one in self.solutions])
