@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -413,7 +413,7 @@ class JoinedSolution:
             sum(one.energy for one in known),
             max(one.relative for one in known),
             Work.sum_of(one.work for one in known),
-            nonlinearity=farthest(known),
+            nonlinearity=farthest(one.nonlinearity for one in known),
         )
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
@@ -421,9 +421,9 @@ class JoinedSolution:
         return together([(len(one.outputs), one.saturation(spare)) for one in self.solutions])
 
 
-def farthest(errors: Sequence[MeshError]) -> float:
+def farthest(nonlinearities: Iterable[float]) -> float:
     """Return the largest nonlinearity of several estimates; NaN is larger than all."""
-    return max((one.nonlinearity for one in errors), key=lambda far: (not np.isfinite(far), far))
+    return max(nonlinearities, key=lambda far: (not np.isfinite(far), far))
 
 
 def together(parts: Sequence[tuple[int, Saturation | None]]) -> Saturation | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import AXES
+from forward.combine import JoinedSolution, farthest
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import Enriched, EnrichedState, relative
 from forward.fem.equations import Discretisation
@@ -24,7 +26,7 @@ from forward.fem.model import HyperelasticModel
 from forward.fem.saturation import factors, typical
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, gather_each, log_factor, scatter_each
-from forward.model import FloatArray, Guess, MeshError, OneByOne, ReferenceSolution, Saturation, Stability, Work
+from forward.model import FloatArray, Guess, MeshError, OneByOne, ReferenceSolution, Saturation, Work
 from forward.specimen import Observed, Specimen, of_case
 
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
@@ -185,7 +187,7 @@ class SpecimenModel(OneByOne):
         for case, model, where, known in zip(self.spec.cases, self.models, self.positions, guesses, strict=True):
             with of_case(case.name):
                 solutions.append(model.solve(parameters[where], known))
-        return SpecimenSolution(self, tuple(solutions))
+        return SpecimenSolution(tuple(solutions), len(parameters), self)
 
     def _guesses(self, guess: Guess) -> Iterator[Guess]:
         """Split a guess into those of the cases."""
@@ -231,36 +233,31 @@ class SpecimenSpace:
         return self._model.models[0].space.factors(points[:, self._model.positions[0]], degree)
 
 
-class SpecimenSolution:
+@dataclass(frozen=True, eq=False)
+class SpecimenSolution(JoinedSolution):
     """The equilibria of all cases with their linearisations; k derivatives of a case are solved for together."""
 
-    def __init__(self, model: SpecimenModel, solutions: tuple[FiniteElementSolution, ...]) -> None:
-        self._model = model
-        self.solutions = solutions
-        self.state = np.concatenate([solution.state for solution in solutions])
-        self.outputs = self._observe(
-            [solution.state for solution in solutions], model.observations, [solution.outputs for solution in solutions]
-        )
-        for array in (self.state, self.outputs):
-            array.flags.writeable = False
-        self.residual = max(solution.residual for solution in solutions)
-        self.converged = all(solution.converged for solution in solutions)
+    solutions: tuple[FiniteElementSolution, ...]
+    model: SpecimenModel
 
-    @property
-    def stability(self) -> Stability:
-        """That of the case of which least is known; an instability that was missed counts more."""
-        return Stability.of_all([solution.stability for solution in self.solutions])
+    def __post_init__(self) -> None:
+        self.outputs.flags.writeable = False  # found here, on all ranks, since that is collective
 
-    @property
-    def work(self) -> Work:
-        """Cost of the solutions of all cases so far."""
-        return Work.sum_of(solution.work for solution in self.solutions)
+    def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
+        """Return the states (…, U_local) of the cases, one after the other."""
+        return np.concatenate(states, axis=-1)
+
+    @cached_property
+    def outputs(self) -> FloatArray:
+        """What is observed (n,)."""
+        states, outputs = [one.state for one in self.solutions], [one.outputs for one in self.solutions]
+        return self._observe(states, self.model.observations, outputs)
 
     def _observe(
         self, states: list[FloatArray], observations: list[csr_matrix], outputs: Sequence[FloatArray | None]
     ) -> FloatArray:
         """What is observed (…, n) of states (…, U_local) and other outputs (…, m) of the cases."""
-        model = self._model
+        model = self.model
         found = [
             case.equations.total((B @ u.T).T) for case, B, u in zip(model.models, observations, states, strict=True)
         ]
@@ -271,23 +268,23 @@ class SpecimenSolution:
         return np.concatenate(found, axis=-1)
 
     def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
-        parts = zip(self.solutions, self._model.positions, strict=True)
+        parts = zip(self.solutions, self.model.positions, strict=True)
         return [solution.state_tangent(direction[..., where]) for solution, where in parts]
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        return np.concatenate(self._state_tangents(direction), axis=-1)
+        return self.side_by_side(self._state_tangents(direction))
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
-        states, model = self._state_tangents(direction), self._model
+        states, model = self._state_tangents(direction), self.model
         parts = zip(self.solutions, states, model.positions, model.others, strict=True)
         outputs = [one.along(du, direction[..., where]) if len(rows) else None for one, du, where, rows in parts]
         return self._observe(states, model.observations, outputs)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
-        model = self._model
+        model = self.model
         gradients = np.zeros((*np.shape(weights)[:-1], len(model.parameters)))
         parts = zip(self.solutions, model.positions, model.observations, model.values(weights), strict=True)
         for k, (solution, where, B, w) in enumerate(parts):
@@ -301,7 +298,7 @@ class SpecimenSolution:
 
     def _enriched_outputs(self, bodies: Sequence[Enriched], states: Sequence[EnrichedState]) -> list[FloatArray | None]:
         """The other outputs of the cases, where they are observed, at states in elements of a higher degree."""
-        parts = zip(self.solutions, bodies, states, self._model.others, strict=True)
+        parts = zip(self.solutions, bodies, states, self.model.others, strict=True)
         return [body.values(one, state) if len(rows) else None for one, body, state, rows in parts]
 
     def mesh_error(self) -> MeshError:
@@ -312,14 +309,14 @@ class SpecimenSolution:
         SolveError
             If the stiffness in the enriched space is singular.
         """
-        model, found = self._model, [solution.enriched_state for solution in self.solutions]
+        model, found = self.model, [solution.enriched_state for solution in self.solutions]
         observations = model.enriched_observations([case.enriched for case in model.models])
         others = self._enriched_outputs([case.enriched for case in model.models], found)
         outputs = self._observe([one.state for one in found], observations, others) - self.outputs
         parts = zip(model.models, found, strict=True)
         state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
-        far = max((one.nonlinearity for one in found), key=lambda far: (not np.isfinite(far), far))
+        far = farthest(one.nonlinearity for one in found)
         return MeshError(
             outputs, state, energy, relative(energy, stored), Work.sum_of(one.work for one in found), nonlinearity=far
         )
@@ -334,7 +331,7 @@ class SpecimenSolution:
         SolveError
             If a stiffness in an enriched space is singular.
         """
-        model, found = self._model, [solution.saturated() for solution in self.solutions]
+        model, found = self.model, [solution.saturated() for solution in self.solutions]
         known = [one for one in found if one is not None]
         seen, degree = self.mesh_error().outputs, model.spec.body.degree
         if len(known) < len(found):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, Guess, OneByOne, Stability, WithoutMesh, Work
+from forward.combine import JoinedSolution
+from forward.model import FloatArray, Guess, OneByOne
 from forward.reduced.model import ReducedModel, ReducedSolution
 from forward.specimen import of_case
 
@@ -67,23 +68,28 @@ class ReducedSpecimen(OneByOne):
         for case, model, where in zip(self.cases, self.models, self.positions, strict=True):
             with of_case(case):
                 solutions.append(model.reduced(parameters[where]))
-        return ReducedSpecimenSolution(self, tuple(solutions), len(parameters))
+        return ReducedSpecimenSolution(tuple(solutions), len(parameters), self)
 
 
-class ReducedSpecimenSolution(WithoutMesh):
+@dataclass(frozen=True, eq=False)
+class ReducedSpecimenSolution(JoinedSolution):
     """The equilibria of all cases, with derivatives of what is observed."""
 
-    residual, converged = 0.0, True
+    solutions: tuple[ReducedSolution, ...]
+    model: ReducedSpecimen
 
-    def __init__(self, model: ReducedSpecimen, solutions: tuple[ReducedSolution, ...], count: int) -> None:
-        self._model, self._solutions, self._count = model, solutions, count
-        self.outputs = np.concatenate(self._observed([one.c for one in solutions], [one.outputs for one in solutions]))
-        self.outputs.flags.writeable = False
-        self.state = np.zeros(0)
+    @cached_property
+    def outputs(self) -> FloatArray:
+        """What is observed (n,)."""
+        found = np.concatenate(
+            self._observed([one.c for one in self.solutions], [one.outputs for one in self.solutions])
+        )
+        found.flags.writeable = False
+        return found
 
     def _observed(self, coordinates: Sequence[FloatArray], outputs: Sequence[FloatArray]) -> list[FloatArray]:
         """What is observed (n, …) of coordinates (N, …) and other outputs (m, …) of each case."""
-        model = self._model
+        model = self.model
         found = [seen @ c for seen, c in zip(model.seen, coordinates, strict=True)]
         for rows, others, which, values in zip(found, model.others, model.which, outputs, strict=True):
             rows[others] = values[which]
@@ -92,21 +98,11 @@ class ReducedSpecimenSolution(WithoutMesh):
     @cached_property
     def jacobian(self) -> FloatArray:
         """Derivatives (n, d) of the outputs."""
-        found = self._observed([one.slopes for one in self._solutions], [one.jacobian for one in self._solutions])
-        whole = [np.zeros((len(rows), self._count)) for rows in found]
-        for to, rows, where in zip(whole, found, self._model.positions, strict=True):
+        found = self._observed([one.slopes for one in self.solutions], [one.jacobian for one in self.solutions])
+        whole = [np.zeros((len(rows), self.count)) for rows in found]
+        for to, rows, where in zip(whole, found, self.model.positions, strict=True):
             to[:, where] = rows
         return np.concatenate(whole)
-
-    @property
-    def stability(self) -> Stability:
-        """That of the case of which least is known."""
-        return Stability.of_all([one.stability for one in self._solutions])
-
-    @property
-    def work(self) -> Work:
-        """Cost of the solutions of all cases so far."""
-        return Work.sum_of(one.work for one in self._solutions)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them."""
