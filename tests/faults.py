@@ -53,6 +53,14 @@ FAULTS = {
         "gradients -= np.array([equations.field_products",
         "gradients += np.array([equations.field_products",
     ),
+    "rows-mesh-error": Fault(
+        "forward/combine.py",
+        "outputs=times(self.S, found.outputs), seen",
+        "outputs=-times(self.S, found.outputs), seen",
+    ),
+    "joined-adjoint": Fault(
+        "forward/combine.py", "np.split(rows, ends, axis=-1),", "np.split(rows, ends, axis=-1)[::-1],"
+    ),
     "friction-adjoint": Fault(
         "forward/fem/history.py",
         "carried -= np.array([equations.rubbed(row)",
