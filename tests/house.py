@@ -26,6 +26,7 @@ LONG = 450  # lines of a file that can be read as a whole
 # that is gone counts no more, and whoever adds one adds it here.
 CONTAINERS = ("Table", "Readings", "Scan", "Observations", "Placed", "Measurement", "Measurements", "Components")
 WRAPPERS = (
+    "forward/combine.py",
     "forward/path.py",
     "forward/fem/path.py",
     "forward/fem/history.py",
