@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.model import FloatArray
 from forward.words import with_error
 from uq.estimators.estimate import ESTIMATED, OF_MESH, PARTS, holds, part
 from uq.estimators.moments import ESTIMATES
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 Part = dict[str, Any]
 LISTED = 20  # observations of a design
+ALONE = ""  # name of a number that stands without one
 OTHER_ESTIMATES = (
     *("variance_ratio", "std_variance_ratio", "loo_error"),
     *("bias_error", part("mean", "total"), "std_bias_error", part("std", "total")),
@@ -34,6 +37,9 @@ def summarise(dataset: xr.Dataset) -> Part:
     for needed, told in _PARTS:
         if needed <= set(dataset.variables):
             summary |= told(dataset)
+    for one in _TOLD:
+        if {*one.variables.values(), *one.needs} <= set(dataset.variables):
+            summary[one.key] = one.of(dataset)
     if "accuracy" in dataset.attrs:
         summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
     return summary
@@ -154,105 +160,19 @@ def _moments(dataset: xr.Dataset) -> Part:
     }
 
 
-def _quantiles(dataset: xr.Dataset) -> Part:
-    probabilities = [f"{p:g}" for p in dataset["quantile"].to_numpy()]
-    names = _with_errors(dataset, "quantiles", "value")
+def _nested(labels: Sequence[tuple[str, Sequence[str]]], values: Mapping[str, FloatArray], above: str = "") -> Any:
+    """Return values of one shape under names of dimensions within each other: numbers by the names of the values.
+
+    Of what is below the label `above` a partner of the same name is left out.
+    """
+    if not labels:
+        numbers = {short: _number(value) for short, value in values.items()}
+        return numbers.get(ALONE, numbers)
+    (dimension, names), *rest = labels
     return {
-        "quantiles": {
-            str(output): {
-                p: {short: _number(dataset[name].sel(output=output)[i]) for short, name in names.items()}
-                for i, p in enumerate(probabilities)
-            }
-            for output in dataset.output.values
-        }
-    }
-
-
-def _sobol(dataset: xr.Dataset) -> Part:
-    def both(kind: str) -> dict[str, str]:
-        return _with_errors(dataset, f"{kind}_first", "first") | _with_errors(dataset, f"{kind}_total", "total")
-
-    found = {"sobol": _by(dataset, "parameter", both("sobol"))}
-    if "sobol_group_first" in dataset:
-        found["sobol_groups"] = _by(dataset, "group", both("sobol_group"))
-    return found
-
-
-def _averaged(dataset: xr.Dataset) -> Part:
-    names = ("mean", "mean_error", "std", "std_error", "within", "between")
-    outputs = dataset.output.values
-    return {"outputs": {str(one): {name: _number(dataset[name].sel(output=one)) for name in names} for one in outputs}}
-
-
-def _shapley(dataset: xr.Dataset) -> Part:
-    return {"shapley": _by(dataset, "parameter", _with_errors(dataset, "shapley", "value"))}
-
-
-def _second(dataset: xr.Dataset) -> Part:
-    names = _with_errors(dataset, "sobol_second", "second")
-    pairs = {
-        str(parameter): _by(dataset.sel(parameter=parameter), "partner", names)
-        for parameter in dataset.parameter.values
-    }
-    return {
-        "sobol_second": {
-            str(output): {
-                parameter: {other: of for other, of in found[str(output)].items() if other != parameter}
-                for parameter, found in pairs.items()
-            }
-            for output in dataset.output.values
-        }
-    }
-
-
-def _bounds(dataset: xr.Dataset) -> Part:
-    return {"bounds": _by(dataset, "parameter", _with_errors(dataset, "total_bound", "total"))}
-
-
-def _with_errors(dataset: xr.Dataset, name: str, short: str) -> dict[str, str]:
-    """Return the variables that say how exact one is, which there are, by shorter names."""
-    first = "" if short == "value" else short
-    errors = {part(first, which): part(name, which) for which in PARTS if holds(dataset, name, which)}
-    return {short: name} | errors
-
-
-def _local(dataset: xr.Dataset) -> Part:
-    names = {
-        "local": "derivative",
-        "local_per_std": "derivative_per_std",
-        "local_per_range": "derivative_per_range",
-    } | {part("local", which): part("derivative", which) for which in OF_MESH}
-    return {
-        key: {
-            output: {parameter: numbers[""] for parameter, numbers in of_output.items()}
-            for output, of_output in _by(dataset, "parameter", {"": variable}).items()
-        }
-        for key, variable in names.items()
-        if variable in dataset
-    }
-
-
-def _nominal(dataset: xr.Dataset) -> Part:
-    """What is known of outputs at the mean parameters, where nothing is sampled."""
-    names = _with_errors(dataset, "nominal", "value")
-    return {
-        "nominal": {
-            str(output): {short: _number(dataset[name].sel(output=output)) for short, name in names.items()}
-            for output in dataset.output.values
-        }
-    }
-
-
-def _by(dataset: xr.Dataset, what: str, names: Mapping[str, str]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Return some variables (output, what) under shorter names, by output and parameter, say."""
-    return {
-        str(output): {
-            str(one): {
-                short: _number(dataset[name].sel({"output": output, what: one})) for short, name in names.items()
-            }
-            for one in dataset[what].values
-        }
-        for output in dataset.output.values
+        name: _nested(rest, {short: value[i] for short, value in values.items()}, name)
+        for i, name in enumerate(names)
+        if dimension != "partner" or name != above
     }
 
 
@@ -299,19 +219,58 @@ def _number(value: Any) -> float | None:
     return number if np.isfinite(number) else None
 
 
+@dataclass(frozen=True)
+class _Told:
+    """Variables of results of which the summary holds every number, with what is known of its errors.
+
+    Attributes
+    ----------
+    key
+        Where, in summary.json.
+    variables
+        Of the same dimensions, by their names there; one that is `ALONE` stands without a name, and without errors.
+    needs
+        Other variables that must be there.
+    """
+
+    key: str
+    variables: Mapping[str, str]
+    needs: Collection[str] = ()
+
+    def of(self, dataset: xr.Dataset) -> Part:
+        """Return the numbers, by output and the other dimensions in their order."""
+        names: dict[str, str] = {}
+        for short, name in self.variables.items():
+            first, parts = "" if short == "value" else short, () if short == ALONE else PARTS
+            names[short] = name
+            names |= {part(first, which): part(name, which) for which in parts if holds(dataset, name, which)}
+        dims = sorted(dataset[name].dims, key=lambda dimension: dimension != "output")
+        labels = [
+            (str(one), [f"{x:g}" if isinstance(x, float) else str(x) for x in dataset[one].to_numpy().tolist()])
+            for one in dims
+        ]
+        values = {short: dataset[name].transpose(*dims).to_numpy() for short, name in names.items()}
+        return dict(_nested(labels, values))
+
+
 _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what each needs
     ({"alone_eigenvalue"}, _inversion),
     ({"clean"}, _synthetic),
     ({"random_equal"}, _design),
     ({"probability"}, _comparison),
     ({"nominal", "mean"}, _moments),
-    ({"quantiles", "mean"}, _quantiles),
-    ({"sobol_first"}, _sobol),
-    ({"sobol_second"}, _second),
-    ({"shapley"}, _shapley),
-    ({"candidate_mean"}, _averaged),
-    ({"total_bound"}, _bounds),
-    ({"derivative"}, _local),
-    ({"derivative", part("nominal", "corrected")}, _nominal),
     ({"row_method"}, _methods),
+)
+_TOLD = (
+    _Told("quantiles", {"value": "quantiles"}, ("mean",)),
+    _Told("sobol", {"first": "sobol_first", "total": "sobol_total"}),
+    _Told("sobol_groups", {"first": "sobol_group_first", "total": "sobol_group_total"}),
+    _Told("sobol_second", {"second": "sobol_second"}),
+    _Told("shapley", {"value": "shapley"}),
+    _Told("outputs", {name: name for name in ("mean", "std", "within", "between")}, ("candidate_mean",)),
+    _Told("bounds", {"total": "total_bound"}),
+    _Told("local", {ALONE: "derivative"}),
+    *(_Told(f"local_per_{one}", {ALONE: f"derivative_per_{one}"}, ("derivative",)) for one in ("std", "range")),
+    *(_Told(part("local", which), {ALONE: part("derivative", which)}, ("derivative",)) for which in OF_MESH),
+    _Told("nominal", {"value": "nominal"}, ("derivative", part("nominal", "corrected"))),
 )
