@@ -87,9 +87,7 @@ class Corners(Method):
 class Ends(Section):
     """The smallest and largest outputs of `Corners`."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether the method was `Corners`."""
-        return "smallest" in results.dataset
+    needs = ("smallest",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Yield a table."""

@@ -134,13 +134,16 @@ class Section(ABC):
     ----------
     before
         The program's own section before which a section from outside is placed.
+    needs
+        Variables of the results without which there is nothing to say.
     """
 
     before: ClassVar[str] = "failures"
+    needs: ClassVar[tuple[str, ...]] = ()
 
-    @abstractmethod
     def applies(self, results: Results) -> bool:
-        """Whether there is something to say about these results."""
+        """Whether there is something to say about these results: with all that it needs, if not said otherwise."""
+        return set(self.needs) <= set(results.dataset.variables)
 
     @abstractmethod
     def content(self, results: Results) -> Iterator[Block]:

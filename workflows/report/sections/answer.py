@@ -44,10 +44,6 @@ LAPLACE = 0  # value of `source`, see docs/results.md
 class AnswerFirst(Section):
     """What was asked and found, for every kind of study."""
 
-    def applies(self, results: Results) -> bool:
-        """Return whether it does: always."""
-        return True
-
     def content(self, results: Results) -> Iterator[Block]:
         """One card."""
         dataset = results.dataset

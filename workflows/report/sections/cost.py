@@ -16,9 +16,7 @@ from workflows.report.section import Results, Section
 class ErrorAgainstCost(Section):
     """Errors of several methods against their cost."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether methods were compared."""
-        return "row_method" in results.dataset
+    needs = ("row_method",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The reference, and pictures and a table for each estimate of each output."""
@@ -131,9 +129,7 @@ CHOSEN = (
 class Fidelities(Section):
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are several models."""
-        return "fidelity_cost" in results.dataset
+    needs = ("fidelity_cost",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table of models, one of groups, and one of gains."""
@@ -203,9 +199,7 @@ def worth(results: Results) -> Table:
 class Levels(Section):
     """Costs and accuracy of the levels of multilevel chaos."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "level_change" in results.dataset
+    needs = ("level_change",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table, a picture, and the moments by control variates."""

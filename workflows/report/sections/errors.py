@@ -199,9 +199,7 @@ class Tolerance(Section):
 class Meshes(Section):
     """The meshes of a multilevel method, and the contribution of each."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are several."""
-        return "mesh_samples" in results.dataset
+    needs = ("mesh_samples",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table of meshes, and rates, differences and pictures of each output."""
@@ -296,9 +294,7 @@ def rates(results: Results, output: str) -> str:
 class FinerMeshes(Section):
     """The effect of a finer mesh on each candidate."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether meshes were checked."""
-        return "probability" in results.dataset and "mesh_checked" in results.dataset
+    needs = ("probability", "mesh_checked")
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -342,9 +338,7 @@ def finer_mesh_table(dataset: xr.Dataset) -> Table:
 class AdaptedMesh(Section):
     """How the mesh was refined, what errors are left, and where they come from."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether a mesh was refined."""
-        return "mesh_indicator" in results.dataset
+    needs = ("mesh_indicator",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table of meshes, a picture of their errors, and the last one."""

@@ -25,9 +25,7 @@ CORRECTED = tuple(part(name, "corrected") for name in ("mean", "std"))  # with t
 class Moments(Section):
     """Mean and standard deviation of the outputs, with their errors."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether the outputs vary."""
-        return "mean" in results.dataset and "nominal" in results.dataset
+    needs = ("mean", "nominal")
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -54,9 +52,7 @@ def moments(results: Results) -> Table:
 class TotalErrors(Section):
     """Errors of means and standard deviations by source."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether the error of the mesh is known."""
-        return "bias_error" in results.dataset
+    needs = ("bias_error",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -81,9 +77,7 @@ def total_errors(results: Results) -> Table:
 class Quantiles(Section):
     """Quantiles of the outputs."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "quantiles" in results.dataset
+    needs = ("quantiles",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -109,9 +103,7 @@ def quantiles(results: Results) -> Table:
 class Nominal(Section):
     """The outputs at the mean parameters."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "nominal" in results.dataset
+    needs = ("nominal",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -152,9 +144,7 @@ class Distribution(Section):
 class Density(Section):
     """Densities of the outputs by an expansion."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "density" in results.dataset
+    needs = ("density",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A picture of each output."""
@@ -171,9 +161,7 @@ class Density(Section):
 class ControlVariate(Section):
     """The gain of a control variate, or of quasi-random points."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there is something better than plain samples."""
-        return "variance_ratio" in results.dataset
+    needs = ("variance_ratio",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A sentence for each output."""
@@ -223,9 +211,7 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
 class Expansion(Section):
     """The polynomials of an expansion, and their errors."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there is one."""
-        return "multi_index" in results.dataset
+    needs = ("multi_index",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 class Constants(Section):
     """Constants of the models: posteriors and priors."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Pictures and tables, the candidates, and where the data are from."""
@@ -94,9 +92,7 @@ def priors(results: Results) -> Table:
 class Criticism(Section):
     """Predictions of left-out data, and residuals."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Tables of scores."""
@@ -141,9 +137,7 @@ def criticism(dataset: xr.Dataset) -> Table:
 class HeldOut(Section):
     """Whole tests, predicted from the others."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether tests were left out."""
-        return "held_out_score" in results.dataset
+    needs = ("held_out_score",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -168,9 +162,7 @@ def held_out(dataset: xr.Dataset) -> Table:
 class Curves(Section):
     """Curves over the data, or residuals."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A picture for each test."""

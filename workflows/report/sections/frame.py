@@ -19,10 +19,6 @@ from workflows.report.words import counted, joined, model_in_words, stability
 class Header(Section):
     """Which study it is, and how it went."""
 
-    def applies(self, results: Results) -> bool:
-        """Return whether it does: always."""
-        return True
-
     def content(self, results: Results) -> Iterator[Block]:
         """Title, method and number of solves."""
         summary = results.summary
@@ -70,9 +66,7 @@ def gravest(results: Results) -> list[str]:
 class Model(Section):
     """The model in words, and its random parameters."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether one model was sampled or linearised."""
-        return "nominal" in results.dataset
+    needs = ("nominal",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The model block by block, and a table of distributions."""
@@ -104,9 +98,7 @@ def parameters(results: Results) -> Table:
 class Priors(Section):
     """The priors of the unknowns."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether data were inverted."""
-        return "alone_eigenvalue" in results.dataset
+    needs = ("alone_eigenvalue",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -134,10 +126,6 @@ def priors(results: Results) -> Table:
 
 class Failures(Section):
     """Which solves failed, and why."""
-
-    def applies(self, results: Results) -> bool:
-        """Return whether it does: always."""
-        return True
 
     def content(self, results: Results) -> Iterator[Block]:
         """How many failed, at which parameters, and why."""
@@ -184,10 +172,6 @@ def failures(results: Results) -> Table:
 class RunTime(Section):
     """What the study took."""
 
-    def applies(self, results: Results) -> bool:
-        """Return whether it does: always."""
-        return True
-
     def content(self, results: Results) -> Iterator[Block]:
         """Times and work."""
         yield Heading("Run time")
@@ -209,10 +193,6 @@ def times(results: Results) -> Iterator[tuple[str, str]]:
 
 class Provenance(Section):
     """When, from which study and on which machine the results were made."""
-
-    def applies(self, results: Results) -> bool:
-        """Return whether it does: always."""
-        return True
 
     def content(self, results: Results) -> Iterator[Block]:
         """Pairs, and the whole study."""

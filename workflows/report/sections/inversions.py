@@ -84,9 +84,7 @@ SETS = 12  # data sets that have a table
 class Predictions(Section):
     """What is predicted from each data set, and what its data added."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether anything is."""
-        return "prediction_share" in results.dataset
+    needs = ("prediction_share",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table and a picture for each data set."""
@@ -137,9 +135,7 @@ def table(one: xr.Dataset) -> Table:
 class PopulationOfSpecimens(Section):
     """Tables of the population and of its specimens."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there is one."""
-        return "population_draw" in results.dataset
+    needs = ("population_draw",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The population, then the specimens."""
@@ -280,9 +276,7 @@ FIRST = 5  # observations on the card
 class ChosenObservations(Section):
     """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether observations were chosen."""
-        return "chosen" in results.dataset
+    needs = ("chosen",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """How many random ones they are worth, where they are, and each of them."""
@@ -363,9 +357,7 @@ def _table(results: Results) -> Table:
 class SyntheticData(Section):
     """How many data were made, how large they are, and their errors."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether data were made."""
-        return "clean" in results.dataset
+    needs = ("clean",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table: what was measured in each load case, or of each output over a path."""

@@ -61,9 +61,7 @@ def measured_kind(of: xr.Dataset, study: Any) -> str:
 class Posterior(Section):
     """The posterior of a few parameters for each data set."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether a few parameters were inferred."""
-        return "alone_eigenvalue" in results.dataset and "draw" in results.dataset
+    needs = ("alone_eigenvalue", "draw")
 
     def content(self, results: Results) -> Iterator[Block]:
         """The same for each of the first data sets."""
@@ -350,9 +348,7 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
 class FieldPosterior(Section):
     """The posterior of a field for each data set."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether a field was inferred."""
-        return "alone_stiffness_std" in results.dataset
+    needs = ("alone_stiffness_std",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The same for each of the first data sets."""

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 class Evidences(Section):
     """Evidence and probability of each model, and how each was found."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Tables, pictures, routes and meshes."""
@@ -112,9 +110,7 @@ def routes(dataset: xr.Dataset) -> Table:
 class Dependence(Section):
     """Evidences with other errors, other data and other priors."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -150,9 +146,7 @@ UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
 class Averages(Section):
     """Predictions averaged over the models."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether models were compared."""
-        return "probability" in results.dataset
+    needs = ("probability",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -206,9 +200,7 @@ def averages(results: Results) -> Table:
 class AveragedCandidates(Section):
     """A table for each output, and a bar of the parts of its variance."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether candidates were averaged."""
-        return "candidate_mean" in results.dataset
+    needs = ("candidate_mean",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """The tables, then the bars."""

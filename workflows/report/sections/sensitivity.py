@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 class LocalSensitivities(Section):
     """Effects of parameters, to first order."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are derivatives."""
-        return "derivative" in results.dataset
+    needs = ("derivative",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Tables of each output, and tornado charts."""
@@ -59,9 +57,7 @@ def largest_of(dataset: xr.Dataset) -> str:
 class LocalField(Section):
     """Effects of parameters on the displacement field, to first order."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether its derivatives are known."""
-        return "field_derivative_rms" in results.dataset
+    needs = ("field_derivative_rms",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -90,9 +86,7 @@ def field_norms(results: Results) -> Table:
 class SobolIndices(Section):
     """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "sobol_first" in results.dataset
+    needs = ("sobol_first",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Tables and pictures of each output, then of all and of the field."""
@@ -155,9 +149,7 @@ def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
 class SobolField(Section):
     """Generalised Sobol' indices of the displacement field."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "field_sobol_first" in results.dataset
+    needs = ("field_sobol_first",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -179,9 +171,7 @@ def field_sobol(results: Results) -> Table:
 class ShapleyEffects(Section):
     """Shares of the variance that parameters are responsible for, a column for each output."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "shapley" in results.dataset
+    needs = ("shapley",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
@@ -204,9 +194,7 @@ def _cell(one: xr.Dataset) -> str:
 class DerivativeBased(Section):
     """Bounds on total indices, and active subspaces."""
 
-    def applies(self, results: Results) -> bool:
-        """Whether there are some."""
-        return "total_bound" in results.dataset
+    needs = ("total_bound",)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Tables and pictures of each output."""
