@@ -20,7 +20,7 @@ from forward.external.own_modules import make_visible, refused
 from forward.readable import and_error, margin, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
-from forward.words import NONE
+from forward.words import NONE, with_error
 from uq.estimators.estimate import holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
@@ -125,6 +125,12 @@ class Results:
     def solves(self) -> int:
         """Number of solves."""
         return solves(self.summary)
+
+
+def written(of: Mapping[Any, Any], name: str, unit: str | None = None) -> str:
+    """Write one estimate and its error of sampling, in a unit if it has one."""
+    one = single(of, name)
+    return with_error(one.value, one.error) if unit is None else and_error(one.value, one.error, unit)
 
 
 class Section(ABC):

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 
 from forward.readable import size
-from forward.words import NONE, duration, number, with_error, with_unit
+from forward.words import NONE, duration, number, with_unit
 from uq.estimators.scores import gains, plain_samples
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, Section, written
 
 
 class ErrorAgainstCost(Section):
@@ -71,7 +71,7 @@ def errors(results: Results, output: str, estimated: str) -> Table:
     rates = {}
     for name in dataset["estimator"].to_numpy().tolist():
         of_method = dataset.sel(estimator=name)
-        rates[name] = with_error(*(float(of_method[f"{estimated}_rate{end}"]) for end in ("", "_error")))
+        rates[name] = written(of_method, f"{estimated}_rate")
     rows = []
     for i, name in enumerate(methods):
         row = dataset.isel(row=i)
@@ -189,8 +189,7 @@ def worth(results: Results) -> Table:
     for output in results.outputs:
         here = dataset.sel(output=output)
         needed = [f"{float(here['alternative_solves'].sel(alternative=name)):,.0f}" for name in others]
-        gain = with_error(float(here["gain"]), float(here["gain_error"]))
-        rows.append((output, gain, number(float(dataset["spent"]), 4), *needed))
+        rows.append((output, written(here, "gain"), number(float(dataset["spent"]), 4), *needed))
     words = {"monte-carlo": "plain Monte Carlo", "sensitivity-monte-carlo": "the tangent", "expansion": "an expansion"}
     head = ("output", "gain over plain Monte Carlo", "spent (solves)")
     return Table((*head, *(f"{words[name]}, predicted" for name in others)), rows)

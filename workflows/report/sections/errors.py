@@ -16,7 +16,7 @@ from uq.estimators.rounding import only_rounding
 from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report import bodies, plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, Section, written
 from workflows.report.sections.bodies import NO_BODY
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def differences(results: Results, output: str) -> Table:
     for level in results.dataset["level"].to_numpy():
         here = results.dataset.sel(output=output, level=level)
         unit = results.unit(output)
-        text = and_error(float(here["difference_mean"]), float(here["difference_mean_error"]), unit)
+        text = written(here, "difference_mean", unit)
         rest = (
             "mesh_variance",
             "difference_variance",

@@ -12,7 +12,7 @@ from forward.words import NONE, named, number, settings, with_error
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, Section, written
 from workflows.studies.findings_selection import by_probability, chance, conflicts, ranking
 
 if TYPE_CHECKING:
@@ -113,8 +113,8 @@ def criticism(dataset: xr.Dataset) -> Table:
         rows.append(
             (
                 model,
-                with_error(float(one["score"]), float(one["score_error"])),
-                with_error(behind, float(one["score_behind_error"])) if behind else NONE,
+                written(one, "score"),
+                written(one, "score_behind") if behind else NONE,
                 number(float(one["score_tail"]), 2),
                 "yes" if bool(one["score_trusted"]) else "no",
                 *(chance(float(one[f"{what}_probability"].min())) for what in ("misfit", "correlation")),

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import and_error, percent, size
+from forward.readable import percent, size
 from forward.words import number, with_error
+from uq.estimators.estimate import estimate_of, single
 from workflows.report import plots
 from workflows.report.blocks import Block, Folded, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import selection as selection_plots
 from workflows.report.plots.averaged import within_and_between
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, Section, written
 from workflows.studies.findings_selection import bayes_factor, grade, ranking
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def evidences(dataset: xr.Dataset) -> Table:
         ln_B, error = bayes_factor(dataset, order[0], model)
         row = [
             model,
-            with_error(float(of_model["log_evidence"]), float(of_model["log_evidence_error"])),
+            written(of_model, "log_evidence"),
             number(float(of_model["laplace_log_evidence"].sum()), 6),
             "" if model == order[0] else with_error(ln_B, error),
             "" if model == order[0] else grade(ln_B),
@@ -66,11 +67,11 @@ def evidences(dataset: xr.Dataset) -> Table:
             f"{number(100 * float(of_model['probability']), 4)} %",
         ]
         if stacked:
-            share, error = (100 * float(of_model[name]) for name in ("stacking", "stacking_error"))
-            row.append(f"{with_error(share, error)} %")
+            share = single(of_model, "stacking")
+            row.append(f"{with_error(100 * share.value, 100 * share.error)} %")
         if nested:
-            value = float(of_model["nested_log_evidence"].sum())
-            row.append(with_error(value, float(np.sqrt((of_model["nested_log_evidence_error"] ** 2).sum()))))
+            found = estimate_of(of_model, "nested_log_evidence")
+            row.append(with_error(float(np.nansum(found.value)), float(np.sqrt(np.nansum(found.error**2)))))
         rows.append(row)
     head = [
         "model",
@@ -95,7 +96,7 @@ def routes(dataset: xr.Dataset) -> Table:
                 (
                     str(model),
                     str(group),
-                    with_error(float(one["group_log_evidence"]), float(one["group_log_evidence_error"])),
+                    written(one, "group_log_evidence"),
                     str(one["route"].item()),
                     str(one["why"].item()),
                     number(float(one["effective"]), 3),
@@ -135,8 +136,7 @@ def variants(dataset: xr.Dataset) -> Table:
     rows = []
     for model in dataset.model.values:
         one = dataset.sel(model=model)
-        ends = (one[f"variant_log_evidence{end}"].to_numpy() for end in ("", "_error"))
-        rows.append((str(model), *(with_error(float(z), float(e)) for z, e in zip(*ends, strict=True))))
+        rows.append((str(model), *(written(one.sel(variant=name), "variant_log_evidence") for name in names)))
     return Table(("ln Z", *names), rows)
 
 
@@ -217,10 +217,7 @@ class AveragedCandidates(Section):
             for name in map(str, of["candidate"].values):
                 one = of.sel(candidate=name, output=output)
                 share = f"{100 * float(one['candidate_probability']):.3g} %"
-                cells = [
-                    and_error(float(one[f"candidate_{m}"]), float(one[f"candidate_{m}_error"]), unit) for m in MOMENTS
-                ]
-                rows.append((name, share, *cells))
+                rows.append((name, share, *(written(one, f"candidate_{m}", unit) for m in MOMENTS)))
             rows.append(("all", "100 %", *(results.estimate(output, m) for m in MOMENTS)))
             yield Heading(output, level=3)
             yield Table(("candidate", "weight" if stacked else "probability", "mean", "standard deviation"), rows)

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from forward.readable import percent, size
-from forward.words import NONE, number, per, with_error, with_unit
-from uq.estimators.estimate import holds
+from forward.words import NONE, number, per, with_unit
+from uq.estimators.estimate import holds, part
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, Section, written
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -134,8 +134,7 @@ def second_order(results: Results, output: str) -> Table:
 def _cells(results: Results, names: Sequence[str], at: Mapping[str, str]) -> Iterator[str]:
     """Indices with their errors, each followed by its corrected value where there is one."""
     for name in names:
-        value, error = (float(results.dataset[f"{name}{end}"].sel(at)) for end in ("", "_error"))
-        yield with_error(value, error)
+        yield written(results.dataset[[name, part(name, "error")]].sel(at), name)
         yield from results.corrected(name, at)
 
 
@@ -163,8 +162,7 @@ def field_sobol(results: Results) -> Table:
     rows = []
     for name in results.parameters:
         of = results.dataset.sel(parameter=name)
-        pairs = [(of[f"field_sobol_{which}"], of[f"field_sobol_{which}_error"]) for which in ("first", "total")]
-        rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
+        rows.append((name, *(written(of, f"field_sobol_{which}") for which in ("first", "total"))))
     return Table(("parameter", "first order", "total"), rows)
 
 
@@ -182,13 +180,10 @@ class ShapleyEffects(Section):
             "evenly: parameters that are given by the same draws depend on each other, and have no Sobol' indices."
         )
         rows = [
-            (name, *(_cell(of.sel(output=output, parameter=name)) for output in outputs)) for name in results.parameters
+            (name, *(written(of.sel(output=output, parameter=name), "shapley") for output in outputs))
+            for name in results.parameters
         ]
         yield Table(("parameter", *outputs), rows)
-
-
-def _cell(one: xr.Dataset) -> str:
-    return with_error(float(one["shapley"]), float(one["shapley_error"]))
 
 
 class DerivativeBased(Section):
@@ -232,12 +227,11 @@ def bounds(results: Results, output: str) -> Table:
     rows = []
     for name in results.parameters:
         of = of_output.sel(parameter=name)
-        squared = with_unit(with_error(float(of["dgsm"]), float(of["dgsm_error"])), slope_unit(results, output, name))
-        total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
-        bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
+        squared = with_unit(written(of, "dgsm"), slope_unit(results, output, name))
+        total = written(of, "sobol_total") if "sobol_total" in of else NONE
         corrected = results.corrected("total_bound", {"output": output, "parameter": name})
         share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
-        rows.append((name, share, squared, constant, total, bound, *corrected))
+        rows.append((name, share, squared, constant, total, written(of, "total_bound"), *corrected))
     head = (
         "parameter",
         "share of the local variance",
@@ -253,11 +247,7 @@ def bounds(results: Results, output: str) -> Table:
 def leading_direction(results: Results, output: str) -> Table:
     """Components of the direction along which an output changes most, in parameters over their deviations."""
     of_output = results.of(output)
-    directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
-    rows = [
-        (name, with_error(float(component), float(error)))
-        for name, (component, error) in zip(results.parameters, directions, strict=True)
-    ]
+    rows = [(name, written(of_output.sel(parameter=name), "active_direction")) for name in results.parameters]
     return Table(("parameter", "leading direction"), rows)
 
 
