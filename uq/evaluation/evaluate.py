@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,11 @@ from forward.model import FloatArray, ForwardModel, ModelError, displacements
 from uq.evaluation.block import BlockSolver, merge
 from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 
+if TYPE_CHECKING:
+    from uq.evaluation.kept import Kept
+
+BLOCKS = 16  # into which a request of one rank group is cut: an interruption costs at most one of them
+LEAST = 4  # points in such a block, unless a request has fewer
 LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers must not overflow or underflow
 MANY = 8  # points among which at least one should have an output that is not small by chance
 
@@ -79,7 +85,7 @@ class OfEvaluate:
 
 @dataclass(frozen=True)
 class SerialEvaluate(OfModel):
-    """Evaluation of a model in this process, point by point.
+    """Evaluation of a model in this process or rank group, block by block; collective over the group.
 
     Parameters
     ----------
@@ -91,21 +97,57 @@ class SerialEvaluate(OfModel):
         Other models that a method may ask for, by name.
     node_volumes
         See `Evaluate`.
+    kept
+        Where finished blocks are kept and found; None if an interrupted run starts again. Its blocks have no fields.
     """
 
     model: ForwardModel
     progress: Callable[[int, int], None] = lambda done, failed: None
     others: Mapping[str, ForwardModel] = field(default_factory=dict)
     node_volumes: FloatArray | None = None
+    kept: Kept | None = None
 
     def on(self, model: str) -> SerialEvaluate:
         """Return the evaluation of another of the models."""
         return self if model == OWN else replace(self, model=self.others[model])
 
     def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request."""
-        solver = BlockSolver(self.model, request)
-        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
+        """Evaluate all points of a request; blocks on disk are read."""
+        solver: list[BlockSolver] = []  # made for the first block that is not on disk
+        found = []
+
+        def solve(block: Request) -> Evaluations:
+            if not solver:
+                solver.append(BlockSolver(self.model, request))
+            return solver[0](block.points, self.progress)
+
+        most = None if self.kept is None else max(1, min(BLOCKS, len(request.points) // LEAST))
+        for block in request.blocks(most):
+            if self.kept is None:
+                found.append(solve(block))
+                continue
+            one, new = self.kept.found(_asked(block), partial(solve, block))
+            if not new:
+                self.progress(len(one.points), len(one.failures))
+            found.append(one)
+        return merge(found, request.fields)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What determines a block: of a start only its point, as its state has rounding errors if ranks share a model."""
+
+    points: FloatArray
+    tangents: bool
+    iterations: int | None
+    start: FloatArray
+    mesh_errors: bool
+    saturations: float | None
+
+
+def _asked(block: Request) -> _Asked:
+    start = np.asarray(getattr(block.start, "point", np.zeros(0)), dtype=float)
+    return _Asked(block.points, block.tangents, block.iterations, start, block.mesh_errors, block.saturations)
 
 
 class Recorder(OfEvaluate):
@@ -114,18 +156,25 @@ class Recorder(OfEvaluate):
     Attributes
     ----------
     log
-        Every evaluation, in order, of all models; shared by the evaluations of the other models.
+        Every evaluation, in order, of all models; shared by the evaluations of the other models, and may be given.
     models
         The name of the model of each evaluation.
     first
         The complete first evaluation of this model, with derivatives and fields: methods begin at the mean parameters.
     """
 
-    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
+    def __init__(
+        self,
+        evaluate: Evaluate,
+        whole: Recorder | None = None,
+        model: str = OWN,
+        *,
+        log: list[Evaluations] | None = None,
+    ) -> None:
         self._evaluate = evaluate
         self._model = model
         self.first: Evaluations | None = None
-        self.log: list[Evaluations] = [] if whole is None else whole.log
+        self.log: list[Evaluations] = whole.log if whole is not None else [] if log is None else log
         self.models: list[str] = [] if whole is None else whole.models
 
     def __call__(self, request: Request) -> Evaluations:

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
-from forward.model import FloatArray
-
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -217,15 +215,3 @@ def stored_dataset(path: Path) -> xr.Dataset:
         about_it = {key: value for key, value in said.items() if key not in ("dtype", "coordinates")}
         made[name] = (dims, np.asarray(values, dtype=kind), about_it)
     return xr.Dataset(made, attrs=about).set_coords([name for name in made if name in coordinates])
-
-
-def stored_array(path: Path, place: str) -> FloatArray:
-    """Return the numbers of a data set in a file.
-
-    Raises
-    ------
-    OSError, KeyError
-        If the file cannot be read, or has no such data set.
-    """
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[place], dtype=float)

@@ -1,4 +1,4 @@
-"""Evaluations, solves and derivatives of a model by one rank group, which stores what it has computed."""
+"""What one rank group keeps of its evaluations and solves, so that a restart does not compute them again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,51 +27,33 @@ from forward.model import (
     gathered,
     scattered,
 )
-from uq.evaluation.block import BlockSolver, merge
-from uq.evaluation.checkpoint import HEAD, read
-from uq.evaluation.evaluate import OfModel
-from uq.evaluation.hdf5 import creation, image, in_memory, stored_array
-from uq.evaluation.request import Evaluations, Failure, Request
+from uq.evaluation.checkpoint import read
+from uq.evaluation.request import Evaluations, Failure
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from uq.evaluation.checkpoint import Checkpoint
 
-T = TypeVar("T")
-BLOCKS = 16  # into which a request is cut: an interruption costs at most one of them
-LEAST = 4  # points in a block, unless a request has fewer
-
 
 @dataclass(frozen=True)
-class _Asked:
-    """What determines a block: of a start only its point, as its state has rounding errors if ranks share a model."""
+class _Block:
+    """What determines a block."""
 
     label: str
-    points: FloatArray
-    tangents: bool
-    iterations: int | None
-    start: FloatArray
+    asked: object
 
 
 @dataclass(frozen=True)
-class KeptEvaluate(OfModel):
-    """Evaluation of a model in one rank group; blocks on disk are read. Collective over the group.
+class Kept:
+    """The blocks that one rank group keeps on disk.
 
     Parameters
     ----------
-    model
-        The model of the group.
-    group
-        Its communicator.
     checkpoint
-        Where finished blocks are kept and found.
+        Where they are kept and found.
+    group
+        The communicator of the group.
     label
         What determines the model besides the study.
-    progress
-        Told the numbers of points that finished and that failed since the last call.
-    log
-        Every evaluation is added to it, without derivatives and fields.
 
     Attributes
     ----------
@@ -79,49 +61,26 @@ class KeptEvaluate(OfModel):
         Names of the blocks so far.
     """
 
-    model: ForwardModel
-    group: Any
     checkpoint: Checkpoint
+    group: Any
     label: str
-    progress: Callable[[int, int], None]
-    log: list[Evaluations] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
-    def on(self, model: str) -> KeptEvaluate:
-        """Return itself: there is one model."""
-        return self
+    def found(self, asked: object, compute: Callable[[], Evaluations]) -> tuple[Evaluations, bool]:
+        """Return the block that was asked for, and whether it is new: what is on disk is not computed again.
 
-    @property
-    def node_volumes(self) -> FloatArray | None:
-        """None: no sums of fields."""
-        return None
-
-    def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request, without sums of fields."""
-        solver: BlockSolver | None = None
-        found = []
-        for block in request.blocks(max(1, min(BLOCKS, len(request.points) // LEAST))):
-            key = self.checkpoint.key(self._asked(block))
-            self.keys.append(key)
-            kept = self.group.bcast(self._read(key) if self.group.rank == 0 else None)
-            if kept is None:
-                solver = solver or BlockSolver(self.model, request)
-                kept = solver(block.points, self.progress)
-                if self.group.rank == 0:
-                    self.checkpoint.save(key, kept)
-            else:
-                self.progress(len(kept.points), len(kept.failures))
-            found.append(kept)
-        whole = merge(found, request.fields)
-        self.log.append(replace(whole, tangents=None, fields=whole.fields[:0]))
-        return whole
-
-    def _asked(self, block: Request) -> _Asked:
-        start = np.asarray(getattr(block.start, "point", np.zeros(0)), dtype=float)
-        return _Asked(self.label, block.points, block.tangents, block.iterations, start)
-
-    def _read(self, key: str) -> Evaluations | None:
-        return self.checkpoint.find(key, read)
+        Collective over the group, as `compute` is.
+        """
+        key = self.checkpoint.key(_Block(self.label, asked))
+        self.keys.append(key)
+        first = self.group.rank == 0
+        block: Evaluations | None = self.group.bcast(self.checkpoint.find(key, read) if first else None)
+        if block is not None:
+            return block, False
+        block = compute()
+        if first:
+            self.checkpoint.save(key, block)
+        return block, True
 
     def forget(self) -> None:
         """Remove the blocks, once their results are stored."""
@@ -131,62 +90,25 @@ class KeptEvaluate(OfModel):
 
 
 @dataclass(frozen=True)
-class _Solved:
-    """What determines a solve."""
-
-    label: str
-    parameters: FloatArray
-
-
-@dataclass(frozen=True)
-class _Derived:
-    """What determines derivatives at a solution."""
-
-    solved: _Solved
-    of: str
-    along: FloatArray
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Derivatives on disk."""
-
-    values: FloatArray
-
-    def image(self, note: str) -> bytes:
-        """Return the bytes of an HDF5 file."""
-        with in_memory(creation(HEAD)) as file:
-            file["rows"] = self.values
-            file.attrs["note"] = note
-            return image(file)
-
-
-@dataclass(frozen=True)
 class KeptModel(OneByOne):
-    """A model in one rank group whose solutions are stored, with the derivatives that were asked of them.
+    """A model in one rank group whose solutions are kept, failures included.
 
-    What is on disk is not computed again, failures included; for what is not, the solver starts from the stored state,
-    which meets the tolerance already, so that the solution is the same. Collective over the group.
+    A solution on disk is solved for again only where it is asked for a derivative: from its state, which meets the
+    tolerance already, so that the derivative is the same. Collective over the group.
 
     Parameters
     ----------
-    model, group, checkpoint, label
-        As in `KeptEvaluate`.
+    model
+        The model.
+    kept
+        Where its solutions are kept and found.
     log
         Every solve is added to it, without its point, which may have as many numbers as the mesh has nodes.
-
-    Attributes
-    ----------
-    keys
-        Names of the solves and derivatives so far.
     """
 
     model: ForwardModel
-    group: Any
-    checkpoint: Checkpoint
-    label: str
+    kept: Kept
     log: list[Evaluations] = field(default_factory=list)
-    keys: list[str] = field(default_factory=list)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -208,94 +130,48 @@ class KeptModel(OneByOne):
         """Whether solutions have derivatives."""
         return self.model.differentiable
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> KeptSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Return the solution at parameters (d,), the stored one if there is one; errors as for the model."""
-        solved = _Solved(self.label, np.array(parameters))
-        key = self.checkpoint.key(solved)
-        self.keys.append(key)
-        block = self._read(key, read)
-        if block is None:
-            return self._solved(solved, key, guess)
-        self._note(block)
+        solutions: list[Solution] = []
+        point = np.array(parameters)
+
+        def solved() -> Evaluations:
+            begin = time.process_time()
+            try:
+                solution = self.model.solve(point, guess)
+            except SolveError as error:
+                return _failed(self.outputs, error, time.process_time() - begin)
+            seconds = time.process_time() - begin
+            solutions.append(solution)
+            return _answered(self.model, point, solution, seconds)
+
+        block, _ = self.kept.found(point, solved)
+        self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
         for failure in block.failures:
             refused = InadmissibleError if failure.inadmissible else SolveError
             work, stability = Work(*block.work[0].tolist()), Stability(block.stability[0])
             raise refused(failure.reason, failure.history, work, stability)
+        if solutions:
+            return solutions[0]
         state = scattered(self.model, block.fields)[0]
-        return KeptSolution(
-            self, solved, block, state, lambda: self.model.solve(parameters, replace(guess or Guess(), state=state))
-        )
-
-    def _solved(self, solved: _Solved, key: str, guess: Guess | None) -> KeptSolution:
-        """Solve, and store what was found."""
-        begin = time.process_time()
-        try:
-            solution = self.model.solve(solved.parameters, guess)
-        except SolveError as error:
-            self._keep(key, _failed(self.outputs, error, time.process_time() - begin))
-            raise
-        seconds = np.array([time.process_time() - begin])
-        whole = gathered(self.model, np.asarray(solution.state)[None])
-        work = solution.work.as_array()[None]
-        residual, converged = np.array([solution.residual]), np.array([solution.converged])
-        outputs = np.array(solution.outputs)[None]
-        known = np.array([solution.stability], dtype=np.int8)
-        state = np.zeros((0, 0)) if whole is None else whole
-        block = Evaluations(
-            solved.parameters[None], outputs, None, (), seconds, work, residual, converged, known, state
-        )
-        self._keep(key, block)
-        return KeptSolution(self, solved, block, solution.state, lambda: solution)
-
-    def derived(self, what: _Derived, find: Callable[[], FloatArray], *, states: bool = False) -> FloatArray:
-        """Return derivatives, the stored ones if there are any; those of `states` (k, U_local) are distributed."""
-        key = self.checkpoint.key(what)
-        self.keys.append(key)
-        kept = self._read(key, lambda path: stored_array(path, "rows"))
-        if kept is not None:
-            return scattered(self.model, kept) if states else kept
-        rows = find()
-        whole = gathered(self.model, rows) if states else rows
-        if self.group.rank == 0 and whole is not None:
-            self.checkpoint.save(key, _Rows(whole))
-        return rows
-
-    def _read(self, key: str, load: Callable[[Path], T]) -> T | None:
-        found: T | None = self.group.bcast(self.checkpoint.find(key, load) if self.group.rank == 0 else None)
-        return found
-
-    def _keep(self, key: str, block: Evaluations) -> None:
-        if self.group.rank == 0:
-            self.checkpoint.save(key, block)
-        self._note(block)
-
-    def _note(self, block: Evaluations) -> None:
-        self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
-
-    def forget(self) -> None:
-        """Remove states and derivatives, once their results are stored."""
-        if self.group.rank == 0:
-            self.checkpoint.drop(self.keys)
-        self.keys.clear()
+        return KeptSolution(block, state, lambda: self.model.solve(point, replace(guess or Guess(), state=state)))
 
 
 class KeptSolution:
-    """A solution as it is stored; its model solves for it only where a derivative is asked that is not.
+    """A solution as it is stored; its model solves for it once a derivative is asked for.
 
     Parameters
     ----------
-    kept, solved, block
-        The model, what determines the solution, and what is stored of it.
+    block
+        What is stored of it.
     state
         This rank's part (U_local,) of the state.
     solve
         Returns the solution of the model itself.
     """
 
-    def __init__(
-        self, kept: KeptModel, solved: _Solved, block: Evaluations, state: FloatArray, solve: Callable[[], Solution]
-    ) -> None:
-        self._kept, self._solved, self._solve = kept, solved, solve
+    def __init__(self, block: Evaluations, state: FloatArray, solve: Callable[[], Solution]) -> None:
+        self._solve = solve
         self.outputs, self.state = block.outputs[0], state
         self.residual, self.converged = float(block.residuals[0]), bool(block.converged[0])
         self.stability, self.work = Stability(block.stability[0]), Work(*block.work[0].tolist())
@@ -306,19 +182,15 @@ class KeptSolution:
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
-        what = _Derived(self._solved, "tangent", np.asarray(direction))
-        return self._kept.derived(what, lambda: self._solution.tangent(direction))
+        return self._solution.tangent(direction)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        what = _Derived(self._solved, "adjoint", np.asarray(weights))
-        return self._kept.derived(what, lambda: self._solution.adjoint(weights))
+        return self._solution.adjoint(weights)
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U_local,) along a `direction` (d,), or of k of them."""
-        what = _Derived(self._solved, "state tangent", np.asarray(direction))
-        rows = self._kept.derived(what, lambda: np.atleast_2d(self._solution.state_tangent(direction)), states=True)
-        return rows if np.ndim(direction) == 2 else rows[0]
+        return self._solution.state_tangent(direction)
 
     def mesh_error(self) -> MeshError | None:
         """Estimate the error of the mesh."""
@@ -327,6 +199,23 @@ class KeptSolution:
     def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh."""
         return self._solution.saturation(spare)
+
+
+def _answered(model: ForwardModel, point: FloatArray, solution: Solution, seconds: float) -> Evaluations:
+    """A solve with an answer; its state is complete on the group's first rank."""
+    whole = gathered(model, np.asarray(solution.state)[None])
+    return Evaluations(
+        point[None],
+        np.array(solution.outputs)[None],
+        None,
+        (),
+        np.array([seconds]),
+        solution.work.as_array()[None],
+        np.array([solution.residual]),
+        np.array([solution.converged]),
+        np.array([solution.stability], dtype=np.int8),
+        np.zeros((0, 0)) if whole is None else whole,
+    )
 
 
 def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:

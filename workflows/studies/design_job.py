@@ -18,7 +18,7 @@ from inverse.designs.candidates import NEAR, Values
 from inverse.designs.fields import of_field
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.kept import KeptModel
+from uq.evaluation.kept import Kept, KeptModel
 from workflows.studies.design_values import of_outputs
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import has_mesh
@@ -89,12 +89,12 @@ def _of_field(
     method, spec = study.method, cast("Specimen", study.spec)
     prior = spec.fields[0].prior(spec.body)
     names = [f"draw {number}" for number in range(method.draws)]
-    solving: list[KeptModel] = []  # of the draw at hand
+    solving: list[Kept] = []  # of the draw at hand
     goals = method.candidates(values)[1]
 
     def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
-        kept = KeptModel(model, ensemble.group, checkpoint, names[number], log=solved)
-        solving.append(kept)
+        solving.append(Kept(checkpoint, ensemble.group, names[number]))
+        kept = KeptModel(model, solving[-1], solved)
         whitened = method.whitened(number, len(model.parameters))
         try:
             solution = kept.solve(prior.root(whitened))

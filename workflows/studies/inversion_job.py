@@ -17,8 +17,8 @@ from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
-from uq.evaluation.evaluate import Recorder
-from uq.evaluation.kept import KeptEvaluate, KeptModel
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.kept import Kept, KeptModel
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from inverse.methods.record import Record
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.kept import KeptEvaluate, KeptModel
     from workflows.studies.predicted import FieldPredictions
 
 BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
@@ -192,21 +191,21 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
     method, errors = study.method, study.data.errors
     names = [one.name for one in study.data.sets]
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
-    solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
+    solving: list[Kept] = []  # of the data set at hand
     reduced = _reduced(study)
     expanded = cache(partial(_expanded, study, made, ensemble, checkpoint))
 
-    def beside(name: str, model: ForwardModel) -> KeptEvaluate:
+    def kept(name: str) -> Kept:
+        solving.append(Kept(checkpoint, ensemble.group, name))
+        return solving[-1]
+
+    def beside(name: str, model: ForwardModel) -> SerialEvaluate:
         """Solve other models, on finer meshes or at moved points, which are no solves of the model."""
-        kept = KeptEvaluate(model, ensemble.group, checkpoint, name, lambda done, failed: None)
-        solving.append(kept)
-        return kept
+        return SerialEvaluate(model, kept=kept(name))
 
     def states_of(name: str, model: ForwardModel) -> KeptModel:
         """Keep the solves for what is predicted from a field."""
-        states = KeptModel(model, ensemble.group, checkpoint, name)
-        solving.append(states)
-        return states
+        return KeptModel(model, kept(name))
 
     invert_field = _inverting_field(study, made, ensemble, states_of) if study.field else None
     predicting = None if study.predict is None or study.field else _predicting(study, ensemble, beside)
@@ -227,19 +226,16 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
         finer = _solved(made.finer(observed), lambda model: solved_by(beside(f"{names[number]}/{FINER}", model)))
         shared = _shared(made.shared(number), lambda model: beside(f"{names[number]}/{MOVED}", model))
         if invert_field is not None:
-            states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
-            solving.append(states)
-            return invert_field(number, states, finer or NOT_LOOKED, shared)
-        kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
-        solving.append(kept)
+            return invert_field(number, KeptModel(observed, kept(names[number]), solved), finer or NOT_LOOKED, shared)
+        evaluate = Recorder(SerialEvaluate(observed, ensemble.count, kept=kept(names[number])), log=solved)
         data = study.measured(number)
         if reduced is not None:
             _alone(shared)
             cheap, by_reduced = reduced(observed), named("inverse.methods.by_reduced:invert_by_reduced")
-            posterior: xr.Dataset = by_reduced(study.inputs, kept, cheap, data, method, errors, finer, ensemble.say)
+            posterior: xr.Dataset = by_reduced(study.inputs, evaluate, cheap, data, method, errors, finer, ensemble.say)
             return posterior
         return invert_by_group(
-            study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say, shared
+            study.inputs, observed, data, method, made.look, errors, finer, evaluate, ensemble.say, shared
         )
 
     def forget() -> None:
@@ -269,8 +265,8 @@ def _expanded(
 ) -> tuple[SharedExpansion, list[Evaluations]]:
     """Solve for the expansion that all data sets share; every group does so, or reads what others have solved."""
 
-    def kept(model: ForwardModel, label: str) -> KeptEvaluate:
-        return KeptEvaluate(model, ensemble.group, checkpoint, label, ensemble.count)
+    def kept(model: ForwardModel, label: str) -> Recorder:
+        return Recorder(SerialEvaluate(model, ensemble.count, kept=Kept(checkpoint, ensemble.group, label)))
 
     there, samples = made.finer(made.model), study.method.expansion
     model, why = (None, "") if there is None else there

@@ -358,7 +358,7 @@ from workflows.__main__ import main
 known, seen = KeptModel.solve, []
 
 def solve(self, *given):
-    seen.extend([1] if "predicted" in self.label and "prior" not in self.label else [])
+    seen.extend([1] if "predicted" in self.kept.label and "prior" not in self.kept.label else [])
     return os._exit(9) if len(seen) > 3 else known(self, *given)
 
 KeptModel.solve = solve

@@ -1,4 +1,4 @@
-"""Solutions and derivatives that a rank group has stored are not computed again."""
+"""Solves and blocks that a rank group has stored are not computed again."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,9 @@ from mpi4py import MPI
 from forward.model import FunctionModel, Guess, InadmissibleError, OneByOne, SolveError
 from tests.states import WithState
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.kept import KeptModel
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.kept import Kept, KeptModel
+from uq.evaluation.request import Request
 
 NAMES = ("a", "b")
 POINT = np.array([0.3, -0.2])
@@ -21,12 +23,14 @@ class Counted(OneByOne):
 
     model: FunctionModel
     asked: list[str] = field(default_factory=list)
+    guesses: list[Guess | None] = field(default_factory=list)
 
     def __getattr__(self, name):
         return getattr(self.model, name)
 
     def solve(self, parameters, guess=None):
         self.asked.append("solve")
+        self.guesses.append(guess)
         return Derivatives(self.model.solve(parameters, guess), self.asked)
 
 
@@ -56,9 +60,12 @@ def jacobian(p):
     return np.array([[2 * p[0], 0], [p[1], p[0]], [0, 1]])
 
 
+def counted():
+    return Counted(WithState(function, NAMES, ("u", "v", "w"), jacobian, lambda p: np.array([p[0], p[0] * p[1]])))
+
+
 def kept(folder, label="one", identity="study"):
-    model = Counted(WithState(function, NAMES, ("u", "v", "w"), jacobian, lambda p: np.array([p[0], p[0] * p[1]])))
-    return KeptModel(model, MPI.COMM_SELF, Checkpoint(folder, identity), label)
+    return KeptModel(counted(), Kept(Checkpoint(folder, identity), MPI.COMM_SELF, label))
 
 
 def use(model):
@@ -72,28 +79,31 @@ def use(model):
     return [solution.outputs, solution.state, moved, one, back, step, there.outputs, there.adjoint(np.ones(3))]
 
 
-def test_nothing_is_computed_twice(tmp_path):
+def test_nothing_is_solved_twice(tmp_path):
+    """What a restart solves for is the linearisation of a solution at its state, once, where a derivative is asked."""
     first, again = kept(tmp_path), kept(tmp_path)
     found = use(first)
-    assert first.model.asked == ["solve", *["tangent"] * 2, "adjoint", "state_tangent", "solve", "adjoint"]
+    asked = ["solve", *["tangent"] * 2, "adjoint", "state_tangent", "solve", "adjoint"]
+    assert first.model.asked == asked
     np.testing.assert_allclose(found[2], jacobian(POINT).T)
     for one, other in zip(found, use(again), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert again.model.asked == []
+    assert again.model.asked == asked
+    assert [guess is not None and guess.state is not None for guess in again.model.guesses] == [True, True]
     assert [one.work.tolist() for one in again.log] == [one.work.tolist() for one in first.log]
-    again.forget()
+    assert [one.seconds.tolist() for one in again.log] == [one.seconds.tolist() for one in first.log]
+    again.kept.forget()
     assert not list((tmp_path / "evaluations").iterdir())
 
 
-def test_what_is_missing_is_found_at_the_stored_state(tmp_path):
-    """A derivative along another direction: one solve, which starts from the state, and that derivative alone."""
+def test_a_stored_solution_is_not_solved_for_without_derivatives(tmp_path):
     use(kept(tmp_path))
     again = kept(tmp_path)
-    use(again)
     solution = again.solve(POINT)
-    np.testing.assert_allclose(solution.tangent(np.array([0.0, 3.0])), 3 * jacobian(POINT)[:, 1])
-    solution.tangent(np.array([3.0, 0.0]))
-    assert again.model.asked == ["solve", "tangent", "tangent"]
+    np.testing.assert_array_equal(solution.outputs, function(POINT))
+    np.testing.assert_array_equal(solution.state, [POINT[0], POINT[0] * POINT[1]])
+    assert (solution.converged, solution.work.snaps) == (True, 0)
+    assert again.model.asked == []
 
 
 def test_other_models_and_studies_are_others(tmp_path):
@@ -103,17 +113,48 @@ def test_other_models_and_studies_are_others(tmp_path):
         assert len(other.model.asked) == 7
 
 
-def test_a_damaged_derivative_is_computed_again(tmp_path, capsys):
+def test_a_damaged_solution_is_computed_again(tmp_path, capsys):
     first = kept(tmp_path)
     found = use(first)
-    path = first.checkpoint.path(first.keys[3])  # an adjoint, after the state and two tangents
+    path = first.kept.checkpoint.path(first.kept.keys[0])
     bytes_ = bytearray(path.read_bytes())
     bytes_[-8] ^= 1
     path.write_bytes(bytes(bytes_))
     again = kept(tmp_path)
     np.testing.assert_array_equal(use(again)[4], found[4])
-    assert again.model.asked == ["solve", "adjoint"]
+    assert again.model.guesses[0] is None
     assert "computed again" in capsys.readouterr().err
+
+
+def test_blocks_of_a_request_are_solved_once(tmp_path):
+    """Another label, or derivatives beside the values, are other blocks; the record is the same after a restart."""
+    points = np.random.default_rng(0).uniform(0, 1.02, (40, 2))
+    records, solves = [], []
+    for label, tangents in (("one", False), ("one", False), ("one", True), ("two", False)):
+        model, told, log = counted(), [], []
+        where = Kept(Checkpoint(tmp_path, "study"), MPI.COMM_SELF, label)
+        evaluate = Recorder(SerialEvaluate(model, lambda *given, told=told: told.append(given), kept=where), log=log)
+        found = evaluate(Request(points, tangents=tangents))
+        plain = SerialEvaluate(counted())(Request(points, tangents=tangents))
+        np.testing.assert_array_equal(found.outputs, plain.outputs)
+        assert [one.index for one in found.failures] == [one.index for one in plain.failures] != []
+        assert (found.tangents is not None) == tangents
+        assert np.sum(told, axis=0).tolist() == [40, len(found.failures)]
+        assert len(where.keys) == 10
+        records.append([(one.outputs.tobytes(), one.seconds.tobytes(), one.tangents) for one in log])
+        solves.append(model.asked.count("solve"))
+    assert solves == [40, 0, 40, 40]
+    assert records[0] == records[1]
+
+
+def test_a_block_with_errors_of_the_mesh_is_another(tmp_path):
+    keys = []
+    for request in (Request(POINT[None]), Request(POINT[None], mesh_errors=True)):
+        where = Kept(Checkpoint(tmp_path, "study"), MPI.COMM_SELF, "one")
+        found = SerialEvaluate(counted(), kept=where)(request)
+        assert (found.mesh_errors is not None) == request.mesh_errors
+        keys += where.keys
+    assert len(set(keys)) == 2
 
 
 @pytest.mark.parametrize(("at", "kind"), [((2.0, 0.0), InadmissibleError), ((0.0, 2.0), SolveError)])
