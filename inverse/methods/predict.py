@@ -141,7 +141,7 @@ def mesh_error_at(draws: Draws, evaluate: Evaluate) -> FloatArray:
         return nothing
     factors, shifts = np.ones(len(nothing)), np.zeros(len(nothing))
     if found.saturations is not None:
-        factors, shifts, _ = np.nan_to_num(found.saturations[0, :-2]).reshape(3, -1)
+        factors, shifts = (np.nan_to_num(found.saturations[0][name]) for name in ("factors", "shifts"))
         factors = np.where(factors == 0, 1.0, factors)
     return np.asarray(found.mesh_errors[0] * factors + shifts)
 

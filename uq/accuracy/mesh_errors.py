@@ -176,10 +176,10 @@ def estimate(
         parts.append(replace(found, fields=found.fields[:0], saturations=None))
         if calibrated is not None:
             assert found.saturations is not None
-            *of_outputs, of_state, measured = found.saturations[0]
-            factors, shifts, doubts = np.reshape(of_outputs, (3, -1))
-    displaced = float(_factors(np.array(of_state))) * np.vstack(states) if states else None
-    return MeshErrors(merge(parts), displaced, factors, bool(measured == 1), shifts, doubts)
+            known = found.saturations[0]
+    displaced = float(_factors(known["state"])) * np.vstack(states) if states else None
+    measured = bool(known["measured"] == 1)
+    return MeshErrors(merge(parts), displaced, known["factors"], measured, known["shifts"], known["doubts"])
 
 
 def _factors(saturation: FloatArray) -> FloatArray:

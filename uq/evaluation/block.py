@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from forward.model import (
     SolveError,
     gathered,
 )
-from uq.evaluation.request import CompactSum, Evaluations, Failure, FieldSum, Request, audited
+from uq.evaluation.request import CompactSum, Evaluations, Failure, FieldSum, Request, audited, calibration
 
 TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
 
@@ -126,11 +126,11 @@ class BlockSolver:
 
 
 class _MeshErrors:
-    """Errors of the mesh (n, m) of solutions, and what calibrates them (n, 3m + 2) where it is asked for."""
+    """Errors of the mesh (n, m) of solutions, and what calibrates them (n,) where it is asked for."""
 
     def __init__(self, n: int, m: int, *, saturations: float | None) -> None:
         self.errors = np.full((n, m), np.nan)
-        self.saturations = np.full((n, 3 * m + 2), np.nan) if saturations is not None else None
+        self.saturations = np.full(n, np.nan, calibration(m)) if saturations is not None else None
         self._spare = saturations
 
     def take(self, i: int, solution: Solution) -> None:
@@ -151,11 +151,10 @@ class _MeshErrors:
         except SolveError:
             return
         if factors is not None:
-            shifts, doubts = (
-                np.full(len(factors.outputs), nothing) if known is None else known
-                for known, nothing in ((factors.shifts, 0.0), (factors.doubts, np.nan))
-            )
-            self.saturations[i] = [*factors.outputs, *shifts, *doubts, factors.state, factors.measured]
+            row = self.saturations[i]
+            row["factors"], row["state"], row["measured"] = factors.outputs, factors.state, factors.measured
+            row["shifts"] = 0.0 if factors.shifts is None else factors.shifts
+            row["doubts"] = np.nan if factors.doubts is None else factors.doubts
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
@@ -223,30 +222,11 @@ class Merger:
     def result(self) -> Evaluations:
         """Return everything added so far as one."""
         self._form()
-
-        def joined(pick: Callable[[Evaluations], FloatArray | None]) -> Iterator[FloatArray]:
-            for block in self._blocks:
-                part = pick(block)
-                if part is not None:
-                    yield part
-
-        tangents, mesh_errors = list(joined(lambda b: b.tangents)), list(joined(lambda b: b.mesh_errors))
-        saturations = list(joined(lambda b: b.saturations))
-        return Evaluations(
-            np.concatenate(list(joined(lambda b: b.points))),
-            np.concatenate(list(joined(lambda b: b.outputs))),
-            np.concatenate(tangents) if tangents else None,
-            tuple(self._failures),
-            np.concatenate(list(joined(lambda b: b.seconds))),
-            np.concatenate([b.work for b in self._blocks]),
-            np.concatenate(list(joined(lambda b: b.residuals))),
-            np.concatenate([b.converged for b in self._blocks]),
-            np.concatenate([b.stability for b in self._blocks]),
-            self._fields,
-            np.concatenate(self._sketches) if self._sketches else None,
-            np.concatenate(mesh_errors) if mesh_errors else None,
-            np.concatenate(saturations) if saturations else None,
-        )
+        parts = [block.rows for block in self._blocks]
+        names = dict.fromkeys(name for part in parts for name in part)
+        rows = {name: np.concatenate([part[name] for part in parts if name in part]) for name in names}
+        sketches = np.concatenate(self._sketches) if self._sketches else None
+        return Evaluations.of(rows, self._failures, self._fields, sketches)
 
 
 def _together(progress: Callable[[int, int], None], size: int, n: int) -> Callable[[int, int], None]:

@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
 from uq.evaluation.hdf5 import creation, image, in_memory
-from uq.evaluation.request import Evaluations, Failure
+from uq.evaluation.request import ON_REQUEST, ROWS, Evaluations, Failure
 
 T = TypeVar("T")
-OPTIONAL = ("mesh_errors", "saturations")  # arrays that evaluations have on request
 HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
 
 
@@ -179,21 +178,11 @@ def _image(blocks: Mapping[str, Evaluations], note: str = "") -> bytes:
 
 def write(group: h5py.Group, block: Evaluations) -> None:
     """Write evaluations into a group of a file."""
-    group["points"] = block.points
-    group["outputs"] = block.outputs
-    group["seconds"] = block.seconds
-    group["work"] = block.work
+    for name, array in block.rows.items():
+        group[name] = array
     group["work"].attrs["columns"] = list(WORK)
-    group["residuals"] = block.residuals
-    group["converged"] = block.converged
-    group["stability"] = block.stability
     group["stability"].attrs["values"] = [known.name.lower().replace("_", " ") for known in Stability]
     group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
-    if block.tangents is not None:
-        group["tangents"] = block.tangents
-    for name in OPTIONAL:
-        if getattr(block, name) is not None:
-            group[name] = getattr(block, name)
     if block.fields.size:
         group["fields"] = block.fields
 
@@ -266,18 +255,8 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]), f["inadmissible"])
                 for f in json.loads(file["failures"][()])
             )
-            return Evaluations(
-                np.asarray(file["points"]),
-                np.asarray(file["outputs"]),
-                np.asarray(file["tangents"]) if "tangents" in file else None,
-                failures,
-                np.asarray(file["seconds"]),
-                _counts(np.asarray(file["work"])),
-                np.asarray(file["residuals"]),
-                np.asarray(file["converged"]),
-                np.asarray(file["stability"]),
-                np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
-                **{name: np.asarray(file[name]) for name in OPTIONAL if name in file},
-            )
+            rows = {name: np.asarray(file[name]) for name in ROWS if name in file or name not in ON_REQUEST}
+            rows["work"] = _counts(rows["work"])
+            return Evaluations.of(rows, failures, np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)))
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

@@ -7,9 +7,9 @@ in order. So the result does not depend on which rank computed which block.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,29 @@ OWN = ""  # name of the first model of an evaluation
 COMPANY, FEW = 16, 16  # points in a block that begin from predictions, and blocks that there are before it is so large
 AUDITED, ENOUGH = 0.005, 64  # share of samples whose path is followed; from how many samples on at least one is
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
+
+
+ON_REQUEST = ("tangents", "mesh_errors", "saturations")
+ROWS = (
+    "points",
+    "outputs",
+    "seconds",
+    "work",
+    "residuals",
+    "converged",
+    "stability",
+    *ON_REQUEST,
+)  # one for each point
+
+
+def calibration(outputs: int) -> np.dtype[Any]:
+    """Names and sizes of what calibrates errors of the mesh.
+
+    `factors` of the errors of outputs (m,); `shifts`, what is added then; `doubts`, how far that may be wrong; the
+    factor of the `state`; and whether they were `measured` here (1) or are typical ones (0).
+    """
+    whole = [(name, float, (outputs,)) for name in ("factors", "shifts", "doubts")]
+    return np.dtype([*whole, ("state", float), ("measured", float)])
 
 
 @dataclass(frozen=True)
@@ -74,9 +97,8 @@ class Evaluations:
     mesh_errors
         Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
     saturations
-        What calibrates estimated errors (n, 3m + 2), where it was asked for: factors of outputs, what is added then,
-        and how far that may be wrong; the factor of the state; whether they were measured here (1) or are typical
-        ones (0). NaN where there is none.
+        What calibrates estimated errors (n,), where it was asked for, by the names of `calibration`; NaN where there is
+        nothing.
     """
 
     points: FloatArray
@@ -91,7 +113,23 @@ class Evaluations:
     fields: FloatArray
     sketches: FloatArray | None = None
     mesh_errors: FloatArray | None = None
-    saturations: FloatArray | None = None
+    saturations: NDArray[Any] | None = None
+
+    @property
+    def rows(self) -> dict[str, NDArray[Any]]:
+        """Arrays with a row for each point, by their names."""
+        return {name: array for name in ROWS if (array := getattr(self, name)) is not None}
+
+    @classmethod
+    def of(
+        cls,
+        rows: Mapping[str, NDArray[Any]],
+        failures: Sequence[Failure],
+        fields: FloatArray,
+        sketches: FloatArray | None = None,
+    ) -> Evaluations:
+        """Return evaluations from arrays with a row for each point, by their names."""
+        return cls(**{**dict.fromkeys(ON_REQUEST), **rows}, failures=tuple(failures), fields=fields, sketches=sketches)  # type: ignore[arg-type]
 
     @property
     def joined(self) -> NDArray[np.bool_]:

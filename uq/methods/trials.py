@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -118,14 +118,11 @@ def _one_by_one(found: Evaluations) -> list[Evaluations]:
     if n == 1:
         return [found]
     failures = {failure.index: replace(failure, index=0) for failure in found.failures}
-    columns = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "fields"}
-    arrays = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
     return [
-        replace(
-            found,
-            failures=(failures[i],) if i in failures else (),
-            fields=np.zeros((0, 0)),
-            **{name: column[i : i + 1] for name, column in arrays.items()},
+        Evaluations.of(
+            {name: rows[i : i + 1] for name, rows in found.rows.items()},
+            (failures[i],) if i in failures else (),
+            np.zeros((0, 0)),
         )
         for i in range(n)
     ]

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel, ModelError, SolveError
+from uq.evaluation.block import merge
 from uq.evaluation.checkpoint import Checkpoint, DamagedError, read
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import SerialEvaluate
-from uq.evaluation.request import BLOCKS, Request
+from uq.evaluation.request import BLOCKS, ROWS, Evaluations, Request, calibration
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.chaos import Chaos
@@ -46,6 +47,42 @@ def test_failures_are_kept_with_their_reason():
         assert failure.history == ("iteration 0",)
         assert failure.parameters == tuple(POINTS[failure.index])
         assert np.isnan(evaluations.outputs[failure.index]).all()
+
+
+@pytest.mark.unit
+def test_arrays_are_kept_by_their_names(tmp_path):
+    """Two blocks are joined, written, read: each array is what it was, also those with names of their own."""
+    known = np.zeros(200, calibration(2))
+    for number, name in enumerate(known.dtype.names):
+        known[name] = number + np.random.default_rng(number).random(known[name].shape)
+    whole = SerialEvaluate(MODEL)(Request(POINTS[:200], tangents=True))
+    whole = replace(whole, mesh_errors=whole.outputs / 7, saturations=known)
+    parts = [
+        Evaluations.of({name: rows[some] for name, rows in whole.rows.items()}, failures, whole.fields)
+        for some, failures in (
+            (slice(120), [one for one in whole.failures if one.index < 120]),
+            (slice(120, None), [replace(one, index=one.index - 120) for one in whole.failures if one.index >= 120]),
+        )
+    ]
+    checkpoint = Checkpoint(tmp_path, "study")
+    checkpoint.save("joined", merge(parts))
+    found = read(checkpoint.path("joined"))
+    assert found.rows.keys() == whole.rows.keys() == set(ROWS)
+    for name, rows in whole.rows.items():
+        np.testing.assert_array_equal(found.rows[name], rows)
+        assert found.rows[name].dtype == rows.dtype
+    assert found.failures == whole.failures != ()
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", ["points", "residuals", "work"])
+def test_a_file_without_one_of_the_arrays_is_damaged(tmp_path, name):
+    checkpoint = Checkpoint(tmp_path, "study")
+    checkpoint.save("block", SerialEvaluate(MODEL)(Request(POINTS[:5])))
+    with h5py.File(checkpoint.path("block"), "r+") as file:
+        del file[name]
+    with pytest.raises(DamagedError):
+        read(checkpoint.path("block"))
 
 
 @pytest.mark.unit
