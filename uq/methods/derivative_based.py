@@ -42,9 +42,9 @@ from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
+from uq.inputs.by_name import Chaospy
 from uq.inputs.distributions import (
     Beta,
-    Chaospy,
     Distribution,
     Gamma,
     LogNormal,
