@@ -87,7 +87,9 @@ class Corners(Method):
 class Ends(Section):
     """The smallest and largest outputs of `Corners`."""
 
-    needs = ("smallest",)
+    def applies(self, results: Results) -> bool:
+        """Whether the method was `Corners`."""
+        return "smallest" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """Yield a table."""
