@@ -7,6 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from tests import COMPILED
+
+if sys.dont_write_bytecode:
+    # To compile all modules and tests anew, in every worker, takes longer than all that else is done before the first
+    # test. Programs that tests start keep theirs in the same folder.
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = sys.pycache_prefix or COMPILED
+
 if find_spec("cftime") is None:
     # For each dataset xarray looks for it twenty times, which takes as long as the study of a small model in a test:
     # pytest's own search for modules comes on top. Python does not search for what is known to be absent.

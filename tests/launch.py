@@ -3,13 +3,13 @@
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 import xarray as xr
 
 from forward.native import library
+from tests import COMPILED
 
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
@@ -39,7 +39,7 @@ def environment():
     """
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PMI_"))}
     if clean.pop(NOT_KEPT, ""):
-        clean.setdefault("PYTHONPYCACHEPREFIX", f"{tempfile.gettempdir()}/tissuq-tests-{os.getuid()}")
+        clean.setdefault("PYTHONPYCACHEPREFIX", COMPILED)
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     shared = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
     shared |= {"OMPI_MCA_hwloc_base_binding_policy": "none"}  # other tests run beside, on the same cores if bound
