@@ -1,10 +1,13 @@
 """A study of a population: what the posteriors of specimens say on specimens in general.
 
-Nothing is solved, but for specimens whose draws do not reach the population (`workflows.studies.redrawn`).
+Nothing is solved, but for specimens whose draws do not reach the population: the study that they came from runs again
+for one of its data sets or groups of data, with a prior like the population.
 """
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,21 +15,34 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import model_validator
 
 from forward.findings import Finding
+from forward.model import SolveError
 from forward.registry import named
+from inverse.data.files import distinct, files
+from inverse.data.table import DataError
 from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.of_draws import findings_of_few
 from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
+from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Parallel
 from workflows.config.mistakes import StudyError, refused
 from workflows.config.report import Report
-from workflows.studies.job import Job
-from workflows.studies.posteriors import digest_of, specimens
+from workflows.studies.job import ArvizGroups, Job, Texts
+from workflows.studies.posteriors import candidate_of, digest_of, draws_in, prior_of, source_blocks, specimens
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import xarray as xr
+
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.request import Evaluations
+    from uq.evaluation.tasks import Outcome
+    from uq.evaluation.turns import Progress
+
+KEPT = ("model", "data", "method", "candidates", "parameters", "correlations")  # blocks that a posterior depends on
 
 
 class PopulationStudy(StudyKind):
@@ -92,18 +108,20 @@ class PopulationStudy(StudyKind):
     @cached_property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for the models of the specimens."""
-        found: tuple[str, ...] = named("workflows.studies.redrawn:modules")(self)
-        return found
+        source = _source(self)
+        return () if source is None else source.modules
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Fit on the first rank, and draw specimens again on all of them where that is needed."""
-        made: Job = named("workflows.studies.redrawn:PopulationJob")(self, name, directory)
-        return made
+        return PopulationJob(self, name, directory)
 
     def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the parameters, as the study of the specimens has them."""
-        found: dict[str, str] = named("workflows.studies.redrawn:units")(self)
-        return found
+        """SI units of the parameters, as the study of the specimens has them; none where that is gone."""
+        source = _source(self)
+        if source is None:
+            return {}
+        by_candidate = hasattr(source, "candidates")
+        return source.units_of(candidate_of(self.method.source, self.method.model) if by_candidate else "/")
 
     def summary(self, job: Job) -> dict[str, Any]:
         """There is more in results.nc."""
@@ -130,3 +148,159 @@ class PopulationStudy(StudyKind):
             refused("Population", [(place, message, self.method.source)])
         object.__setattr__(self.method, "digest", found)
         return self
+
+
+def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
+    """Return the study of a specimen of a population, with another prior.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or its data are not there any more.
+    """
+    from workflows.config.study import parse
+
+    method = study.method
+    blocks = {key: value for key, value in source_blocks(method.source).items() if key in KEPT}
+    parameters = {name: one.model_dump(mode="json") for name, one in prior.marginals.items()}
+    correlations = [{"between": [a, b], "value": value} for a, b, value in prior.correlations]
+    known = {"parameters": parameters, "correlations": correlations}
+    folder = Path(method.source) if method.study is None else Path(method.study).parent
+    if "candidates" in blocks:
+        name = candidate_of(method.source, method.model)
+        tests = [one for one in blocks["data"]["tests"] if one["group"] == specimen]
+        blocks["candidates"] = {name: blocks["candidates"][name] | known}
+        blocks["data"] = {**blocks["data"], "tests": tests}
+        once = {"other_noises": {}, "subsets": {}, "held_out": False}
+        blocks["method"] = {key: value for key, value in blocks["method"].items() if key != "check"} | once
+    else:
+        if set(parameters) != set(blocks.get("parameters", {})):
+            message = "random fields are among the unknowns, whose distribution is that of the model"
+            raise ValueError(message)
+        path = _file(blocks["data"], specimen, folder)
+        data = {key: value for key, value in blocks["data"].items() if key not in {"files", "sets"}}
+        blocks |= known | {"data": {**data, "files": [str(path)]}}
+    return parse(blocks | {"parallel": study.parallel.model_dump()}, folder=folder)
+
+
+def _file(data: dict[str, Any], specimen: str, folder: Path) -> Path:
+    """Return the file of a data set, which has to be as it was; errors as of `of_one`."""
+    from workflows.studies.measured import digest_of as digest_of_file
+
+    known = {one["name"]: one for one in data.get("sets", [])}
+    where = "expected method.study, the file of the study that the source is of"
+    if specimen not in known:
+        message = f"the data of {specimen} are in no file"
+        raise ValueError(message)
+    try:
+        paths = files(data["files"], [folder, Path()])
+    except DataError:
+        paths = []
+    path = dict(zip(distinct(paths), paths, strict=True)).get(specimen)
+    if path is None or not path.is_file():
+        message = f"{known[specimen]['file']} is not in {folder} or here, {where}"
+        raise ValueError(message)
+    if digest_of_file(path) != known[specimen]["digest"]:
+        message = f"{path} has changed since {specimen} was inverted"
+        raise ValueError(message)
+    return path.resolve()
+
+
+@dataclass(frozen=True)
+class PopulationJob:
+    """The fit of a population on the first rank, and specimens that all ranks draw again.
+
+    Attributes
+    ----------
+    study, name, directory
+        The study, its name, and where results go.
+    evaluations
+        What was solved for specimens, by their names and how often it was.
+    own
+        Processor time (s) of the fit, and of what each specimen took besides its solves.
+    """
+
+    study: PopulationStudy
+    name: str
+    directory: Path
+    evaluations: dict[str, Evaluations] = field(default_factory=dict)
+    own: list[float] = field(default_factory=list)
+
+    @property
+    def own_seconds(self) -> float:
+        """Processor time (s) of the fit, and of what each specimen took besides its solves."""
+        return sum(self.own)
+
+    @property
+    def labelled(self) -> Callable[[xr.Dataset], xr.Dataset]:
+        """There is nothing to add."""
+        return lambda found: found
+
+    @property
+    def arviz_groups(self) -> ArvizGroups:
+        """There are none."""
+        return lambda _: {}
+
+    @property
+    def texts(self) -> Texts:
+        """There are none."""
+        return lambda _: {}
+
+    @property
+    def outcomes(self) -> Sequence[Outcome]:
+        """There are no tasks."""
+        return ()
+
+    def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
+        """Fit on rank 0; collective over all ranks."""
+        method, drawn = self.study.method, list[str]()
+
+        def again(specimen: str, prior: Inputs) -> Draws | str:
+            drawn.append(specimen)
+            times = drawn.count(specimen)
+            part = checkpoint.part(f"{specimen}, {times}")
+            try:
+                one = ensemble.together(lambda: of_one(self.study, specimen, prior))
+                job = ensemble.together(lambda: one.job(ensemble, self.name, self.directory, part))
+                found = job.run(ensemble, part, progress, blocks)
+                if found is None:
+                    return ""
+                self._keep(job, f"{specimen}, {times}")
+                return draws_in(job.labelled(found), one.method.kind)
+            except (ValueError, StudyError, SolveError) as error:
+                return "; ".join(map(str, error.args))
+
+        def task(asked: Callable[[tuple[str, Inputs]], Draws | str]) -> xr.Dataset:
+            posteriors = self.study.posteriors
+            prior = prior_of(method.source, method.model, next(iter(posteriors.values())).names)
+            asking = 0.0
+
+            def timed(*one: Any) -> Draws | str:
+                nonlocal asking
+                begun = time.process_time()
+                found = asked(one)
+                asking += time.process_time() - begun
+                return found
+
+            begin = time.process_time()
+            fitted = method.run(posteriors, prior, timed)
+            self.own.append(time.process_time() - begin - asking)
+            return fitted
+
+        return ensemble.led(task, lambda asked: again(*asked))
+
+    def _keep(self, job: Job, label: str) -> None:
+        self.own.append(job.own_seconds)
+        for part, found in job.evaluations.items():
+            self.evaluations[label if part == "/" else f"{label}/{part}"] = found
+
+
+def _source(study: PopulationStudy) -> StudyKind | None:
+    """Return the study that the source is of; None where that is gone."""
+    from workflows.config.study import parse
+
+    try:
+        named("workflows.run.own_code:make_visible")(Path(study.method.source))
+        return parse(source_blocks(study.method.source), folder=Path(study.method.source))
+    except (StudyError, ValueError, OSError):
+        return None
