@@ -156,7 +156,8 @@ class DesignStudy(Sourced, StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model; collective."""
-        found: Job = named("workflows.studies.design_job:job")(self, ensemble, checkpoint)
+        make = named("workflows.studies.design_job:job")
+        found: Job = make(self.method, self.spec, self.inputs, ensemble, checkpoint, field=self.field)
         return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -29,34 +29,41 @@ if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray, ForwardModel, Solution
     from forward.spec import ModelSpec
+    from inverse.methods.design import Design
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate, Evaluations
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.design import DesignStudy
-    from workflows.studies.design_of_models import DesignOfModels
+    from uq.inputs.random_parameters import Inputs
     from workflows.studies.job import Job
 
 
-def job(study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint) -> Job:
-    """Make the model; collective over the group."""
-    model = study.spec.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
-    derivable(model, study.model.kind)
-    values = values_of(study.spec, model)
-    if study.field:
-        return _of_field(study, ensemble, checkpoint, model, values)
+def job(
+    method: Design, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, checkpoint: Checkpoint, *, field: bool
+) -> Job:
+    """Make the model, whose parameters or `field` of nodal values are unknown; collective over the group."""
+    model = spec.build(ensemble.group, spec.coefficients if field else inputs.names)
+    derivable(model, spec.kind)
+    values = values_of(spec, model)
+    if field:
+        return _of_field(method, cast("Specimen", spec), ensemble, checkpoint, model, values)
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        return study.method.run(study.inputs, recorders["/"], values, evaluate if has_mesh(study.spec) else None)
+        return method.run(inputs, recorders["/"], values, evaluate if has_mesh(spec) else None)
 
-    return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(study, found))
+    return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(spec, found))
 
 
-def job_of_models(study: DesignOfModels, ensemble: Ensemble) -> MethodJob:
+def job_of_models(
+    method: Design,
+    specs: Mapping[str, ModelSpec],
+    inputs: Mapping[str, Inputs],
+    weights: Mapping[str, float],
+    ensemble: Ensemble,
+) -> MethodJob:
     """Make the models, which are all observed at the places of the first one; collective over the group."""
-    specs, inputs = study.of_candidates, study.inputs
     first, *others = specs
     model = specs[first].build(ensemble.group, inputs[first].names)
     values = values_of(specs[first], model)
@@ -75,18 +82,18 @@ def job_of_models(study: DesignOfModels, ensemble: Ensemble) -> MethodJob:
     def task(evaluate: Evaluate) -> xr.Dataset:
         for name in specs:
             recorders[name] = Recorder(evaluate if name == first else evaluate.on(name))
-        weights = {name: one.weight for name, one in study.candidates.items()}
-        return study.method.run_models(inputs, weights, recorders, values)
+        return method.run_models(inputs, weights, recorders, values)
 
     makers = {name: partial(made, name) for name in others}
-    return MethodJob(model, makers, task, recorders, lambda found: found, texts=lambda found: files(study, found))
+    return MethodJob(
+        model, makers, task, recorders, lambda found: found, texts=lambda found: files(specs[first], found)
+    )
 
 
 def _of_field(
-    study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
+    method: Design, spec: Specimen, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
-    method, spec = study.method, cast("Specimen", study.spec)
     prior = spec.fields[0].prior(spec.body)
     names = [f"draw {number}" for number in range(method.draws)]
     solving: list[Kept] = []  # of the draw at hand
@@ -125,7 +132,7 @@ def _of_field(
         forget,
         results,
         lambda found: found,
-        texts=lambda found: files(study, found),
+        texts=lambda found: files(spec, found),
     )
 
 
@@ -153,10 +160,10 @@ def values_of(spec: ModelSpec, model: Any) -> Values:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def files(study: DesignStudy | DesignOfModels, found: xr.Dataset) -> dict[str, str]:
+def files(spec: ModelSpec, found: xr.Dataset) -> dict[str, str]:
     """Return a table of the chosen observations, and of a specimen what other studies take, by their names."""
     texts = {"design.csv": _table(found)}
-    if isinstance(study.specs[0], Specimen):
+    if isinstance(spec, Specimen):
         lines = "".join(f"    {_inline(block)},\n" for block in observed(found))
         texts["observed.toml"] = f"# What was chosen, for the block [model] of a specimen.\nobserved = [\n{lines}]\n"
         texts["observed.csv"] = _form(found)

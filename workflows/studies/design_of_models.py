@@ -110,7 +110,9 @@ class DesignOfModels(StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the models; collective."""
-        found: Job = named("workflows.studies.design_job:job_of_models")(self, ensemble)
+        weights = {name: one.weight for name, one in self.candidates.items()}
+        make = named("workflows.studies.design_job:job_of_models")
+        found: Job = make(self.method, self.of_candidates, self.inputs, weights, ensemble)
         return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
