@@ -78,9 +78,7 @@ FAULTS = {
     "degrees-of-freedom": Fault(
         "uq/estimators/moments.py", 'int(dataset["scramble"].max())', 'int(dataset["scramble"].max()) + 1'
     ),
-    "mesh-error-sign": Fault(
-        "uq/accuracy/effects.py", "dataset[estimated].to_numpy() + error", "dataset[estimated].to_numpy() - error"
-    ),
+    "mesh-error-sign": Fault("uq/estimators/estimate.py", "value + mesh, left", "value - mesh, left"),
     "error-of-root": Fault("uq/estimators/moments.py", "upper = std / 2 * np.expm1", "upper = std * np.expm1"),
     "laplace-evidence": Fault("inverse/low_dimensional/laplace.py", "[1] / 2)", "[1])"),
     "variance-between": Fault("uq/estimators/averaged.py", "(p * away**2)", "(p**2 * away**2)"),

@@ -246,13 +246,13 @@ def test_data_of_a_specimen_have_errors():
     effectivity = (error.outputs / (exact - solution.outputs))[large]
     assert ((effectivity > 0.8) & (effectivity < 1.2)).all(), effectivity
     assert error.state.shape == solution.state.shape
-    seen = selected(solution._model, (3, 3, 0)).solve(np.zeros(0)).mesh_error()
+    seen = selected(solution.model, (3, 3, 0)).solve(np.zeros(0)).mesh_error()
     np.testing.assert_array_equal(seen.outputs, error.outputs[[3, 3, 0]])
     saturation = solution.saturation()
     assert ((saturation.outputs >= 0.5) & (saturation.outputs <= 3)).all()
     effectivity = (error.calibrated(saturation).outputs / (exact - solution.outputs))[large]
     assert ((effectivity > 0.85) & (effectivity < 1.25)).all(), effectivity
-    other = solution._model.observing(np.array([[1.0, 1.0, 1.0]]), (2,), (1,)).solve(np.zeros(0)).mesh_error()
+    other = solution.model.observing(np.array([[1.0, 1.0, 1.0]]), (2,), (1,)).solve(np.zeros(0)).mesh_error()
     assert other.outputs == pytest.approx(error.outputs[8:9], rel=1e-9)
 
 

@@ -429,7 +429,7 @@ def test_what_cannot_be_predicted_of_a_specimen(specimens, change, said):
 
 @pytest.mark.unit
 def test_estimates_of_the_mesh_of_predictions_that_failed_are_an_error():
-    numbers = {"mean_error": [0.0, 0.0], "std": [1.0, 1.0], "mesh_error": [np.nan, np.nan]}
+    numbers = {"mean": [1.0, 1.0], "mean_error": [0.0, 0.0], "std": [1.0, 1.0], "mesh_error": [np.nan, np.nan]}
     found = xr.Dataset(
         {"prediction_why": "", **{f"prediction_{name}": ("goal", values) for name, values in numbers.items()}},
         {"goal": ["sag", "stress"]},
