@@ -25,13 +25,14 @@ from uq.inputs.sampling import random_points, sobol_points
 from uq.surrogates.linearisation import linearise
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
+from workflows.studies.reduce import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel, Solution
+    from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
-    from workflows.studies.reduction import Reduce, ReductionStudy
 
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
@@ -80,10 +81,9 @@ class ReductionJob(MethodJob):
     told: dict[str, Any] = field(default_factory=dict)
 
 
-def job(study: ReductionStudy, ensemble: Ensemble, directory: Path) -> Job:
+def job(method: Reduce, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, directory: Path) -> Job:
     """Make the body on every group; collective over the group."""
-    inputs = study.inputs
-    model = cast("HyperelasticModel", study.spec.build(ensemble.group, inputs.names))
+    model = cast("HyperelasticModel", spec.build(ensemble.group, inputs.names))
     recorders: dict[str, Recorder] = {}
     told: dict[str, Any] = {}
 
@@ -92,20 +92,18 @@ def job(study: ReductionStudy, ensemble: Ensemble, directory: Path) -> Job:
 
         if ensemble.group.size == 1:
             return model
-        return cast("HyperelasticModel", study.spec.build(MPI.COMM_SELF, inputs.names))
+        return cast("HyperelasticModel", spec.build(MPI.COMM_SELF, inputs.names))
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        made = _Making(study.method, inputs, recorders["/"], alone(), ensemble.say)
+        made = _Making(method, inputs, recorders["/"], alone(), ensemble.say)
         data, found = made.run()
-        from workflows.studies.reduction import FILE
-
         save(data, directory / FILE)
         kept = {key: value for key, value in data.about.items() if key not in {"spread", "lowest", "highest"}}
         told.update(kept | {"seconds": made.seconds, "file": FILE})
         return found
 
-    units = {output.name: output.unit for output in study.spec.returned}
+    units = {output.name: output.unit for output in spec.returned}
     return ReductionJob(model, {}, task, recorders, lambda found: label(found, units, None, None, 0), told=told)
 
 
