@@ -16,7 +16,7 @@ from forward.model import (
     ForwardModel,
     Guess,
     MeshError,
-    NodalSpace,
+    OfOne,
     OneByOne,
     Saturation,
     Solution,
@@ -28,32 +28,6 @@ from forward.model import (
 def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:
     """Return the product (…, n) of a matrix (n, m) with a vector (m,), or with each of k rows (k, m)."""
     return np.asarray((matrix @ np.asarray(rows).T).T)
-
-
-class OfOne(OneByOne):
-    """What a model has of the one `model` that it is made of."""
-
-    model: ForwardModel
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.model.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.model.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have tangents and adjoints."""
-        return self.model.differentiable
-
-    @property
-    def space(self) -> NodalSpace | None:
-        """Where the states live."""
-        return self.model.space
 
 
 @dataclass(frozen=True, eq=False)

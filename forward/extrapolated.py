@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.sparse import csr_matrix, identity, kron
 
-from forward.combine import Joined, JoinedSolution, OfOne, Rows
-from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from forward.combine import Joined, JoinedSolution, Rows
+from forward.model import FloatArray, ForwardModel, Guess, OfOne, Solution, SolveError
 
 Begun = tuple[tuple[FloatArray, FloatArray], ...]
 # Where all cells are halved, errors at held faces fall slowly, whatever the degree: 1/(2^1.6 − 1).

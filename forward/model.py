@@ -459,6 +459,32 @@ class OneByOne:
             yield found
 
 
+class OfOne(OneByOne):
+    """What a model has of the one `model` that it is made of."""
+
+    model: ForwardModel
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have tangents and adjoints."""
+        return self.model.differentiable
+
+    @property
+    def space(self) -> NodalSpace | None:
+        """Where the states live."""
+        return self.model.space
+
+
 def displacements(model: ForwardModel) -> int:
     """Return the number of displacements with which a state of a model begins; 0 without states."""
     return 0 if model.space is None else model.space.displacements

@@ -17,8 +17,7 @@ from forward.model import (
     Guess,
     InadmissibleError,
     MeshError,
-    NodalSpace,
-    OneByOne,
+    OfOne,
     Saturation,
     Solution,
     SolveError,
@@ -90,7 +89,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class KeptModel(OneByOne):
+class KeptModel(OfOne):
     """A model in one rank group whose solutions are kept, failures included.
 
     A solution on disk is solved for again only where it is asked for a derivative: from its state, which meets the
@@ -109,26 +108,6 @@ class KeptModel(OneByOne):
     model: ForwardModel
     kept: Kept
     log: list[Evaluations] = field(default_factory=list)
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.model.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.model.outputs
-
-    @property
-    def space(self) -> NodalSpace | None:
-        """As for the model."""
-        return self.model.space
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
-        return self.model.differentiable
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Return the solution at parameters (d,), the stored one if there is one; errors as for the model."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,12 @@ from inverse.data.registration import UncertainMotion
 from inverse.data.scans import Reading
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import check_readings, onto, read_on
+from workflows.studies.measured import Positive, check_readings, onto, read_on
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray, ForwardModel
     from inverse.data.shared_motion import SharedMotion
-
-Positive = Annotated[float, Field(gt=0)]
 
 
 class DisplacementFile(Reading):

@@ -20,13 +20,11 @@ from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from inverse.methods.invert import derivable
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import check_signs
+from workflows.studies.measured import Positive, check_signs
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel
-
-Positive = Annotated[float, Field(gt=0)]
 
 
 class OutputFile(Settings):

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
 
 
+Positive = Annotated[float, Field(gt=0)]
 LISTED = 5  # points that do not belong to a body
 
 

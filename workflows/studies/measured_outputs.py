@@ -16,10 +16,9 @@ from inverse.data.errors import NORMAL, Errors
 from inverse.data.outputs import OutputData, read_outputs, stated
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import DataSet, FileNames, Found, check_signs, read_files
+from workflows.studies.measured import DataSet, FileNames, Found, Positive, check_signs, read_files
 
 STATED = "outputs"  # name of the data set given in the study itself
-Positive = Annotated[float, Field(gt=0)]
 
 
 class OutputNoise(Settings):

@@ -29,7 +29,7 @@ from workflows.config.report import Report
 from workflows.studies.listed_displacements import ListedDisplacements
 from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE
-from workflows.studies.measured import as_block, data_as
+from workflows.studies.measured import Positive, as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 SECONDS = 1e-3  # of a solve about which nothing is known
 _SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
-Positive = Annotated[float, Field(gt=0)]
 
 
 class ModelCandidate(Settings):
