@@ -44,5 +44,8 @@ TABLE: dict[str, str | Words] = {
     "the spot.",
     "body-size": "model.body.unit = {unit:g} makes the body {extent} long: is that meant? Coordinates in millimetres "
     "have unit = 1e-3",
+    "slit": "The mesh has a closed slit of {area}{named}: faces that lie on each other with points of their own, which "
+    "part under load, and pass through each other where they are pressed together. If it is meant, name its boundary "
+    "in model.body.slits; if not, merge the double points of the file.",
 }
 register(TABLE)

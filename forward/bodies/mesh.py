@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from forward.bodies import hexahedra
 from forward.model import FloatArray, ModelError
@@ -16,6 +17,7 @@ Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
+APART = 1e-6, 1e-3  # how far lips of closed slits are drawn apart, over that extent, and at most over the shortest edge
 FACES = {
     "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
     "hexahedron": hexahedra.FACES.tolist(),
@@ -59,6 +61,8 @@ class Loaded:
         Names of the regions.
     region
         Number of the region of each cell.
+    slits
+        Areas (m²) of closed slits by the names of their boundaries; "" for what is in none.
     """
 
     points: FloatArray
@@ -67,6 +71,7 @@ class Loaded:
     boundaries: dict[str, IntArray]
     regions: tuple[str, ...]
     region: IntArray
+    slits: dict[str, float] = field(default_factory=dict)
 
 
 class Contents(Settings):
@@ -90,6 +95,8 @@ class Contents(Settings):
         Names of the boundaries, each with its area (m²).
     regions
         Names of the regions, each with its volume (m³).
+    slits
+        Areas (m²) of closed slits by the names of their boundaries; "" for what is in none.
     """
 
     digest: str
@@ -103,6 +110,58 @@ class Contents(Settings):
     boundaries: dict[str, tuple[Point, ...]]
     areas: dict[str, float]
     regions: dict[str, float]
+    slits: dict[str, float] = Field(default={})
+
+
+def places_of(points: FloatArray) -> IntArray:
+    """Return the number (n,) of the place of each of points (n, 3): equal for those that coincide."""
+    grid = np.round((points - points.min(axis=0)) / (CLOSE * np.ptp(points, axis=0).max())).astype(np.int64)
+    return np.asarray(np.unique(grid, axis=0, return_inverse=True)[1].ravel())
+
+
+def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, IntArray]:
+    """Draw the lips of closed slits apart; return the points, and the faces (k, 3 or 4) of the lips.
+
+    Lips are faces of the surface that lie on each other, corner on corner. Of points at one place, that of the cell
+    which comes first stays; others move a little into their cells. So each node has a place of its own: the canonical
+    order, and whatever looks for places, needs no word about slits; a place on a slit is on the lip that stays.
+    Double points elsewhere stay as they are.
+    """
+    places = places_of(points)
+    if places.max() + 1 == len(points):
+        return points, np.zeros((0, len(FACES[cell][0])), dtype=np.int64)
+    faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = faces[first[count == 1]]
+    _, which, count = np.unique(np.sort(places[outer], axis=1), axis=0, return_inverse=True, return_counts=True)
+    lips = outer[count[which.ravel()] > 1]
+    holder = np.full(len(points), len(cells))  # of each point, the cell that comes first
+    np.minimum.at(holder, cells, np.arange(len(cells))[:, None])
+    staying = np.full(len(points), len(cells))
+    np.minimum.at(staying, places, holder)
+    moving = np.intersect1d(lips, np.flatnonzero(holder > staying[places]))
+    moved = points.copy()
+    for point in moving:
+        its = cells[(cells == point).any(axis=1)]
+        edges = points[its] - points[point]
+        inwards = edges.mean(axis=(0, 1))
+        shortest = np.linalg.norm(edges[its != point], axis=-1).min()
+        step = min(APART[0] * np.ptp(points, axis=0).max(), APART[1] * shortest)
+        moved[point] += step * inwards / np.linalg.norm(inwards)
+    return moved, lips
+
+
+def slits_of(points: FloatArray, lips: IntArray, boundaries: dict[str, IntArray]) -> dict[str, float]:
+    """Return the area (m²) of the slits between lips, by the names of boundaries that they are in; "" for none."""
+    places = places_of(points)
+    faces = {tuple(sorted(places[face].tolist())): face for face in lips}
+    found, left = {}, set(faces)
+    for name, facets in boundaries.items():
+        its = {tuple(row) for row in np.sort(places[facets], axis=1).tolist()} & set(faces)
+        if its:
+            found[name] = area(points[[faces[face] for face in sorted(its)]])
+        left -= its
+    return found | ({"": area(points[[faces[face] for face in sorted(left)]])} if left else {})
 
 
 def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
@@ -165,7 +224,9 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
         return np.asarray(np.stack([np.stack(part, axis=1) for part in parts], axis=1).reshape(-1, 3))
 
     boundaries = {name: quartered(facets) for name, facets in mesh.boundaries.items()}
-    return Loaded(points, cells.reshape(-1, 4), mesh.cell, boundaries, mesh.regions, np.repeat(mesh.region, 8))
+    return replace(
+        mesh, points=points, cells=cells.reshape(-1, 4), boundaries=boundaries, region=np.repeat(mesh.region, 8)
+    )
 
 
 def divided_contents(found: Contents) -> Contents:
@@ -220,12 +281,13 @@ def contents(mesh: Loaded, digest: str) -> Contents:
         bounds=((low[0], high[0]), (low[1], high[1]), (low[2], high[2])),
         longest_edge=float(np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max()),
         boundaries={name: _spanning(points[np.unique(facets)]) for name, facets in mesh.boundaries.items()},
-        areas={name: float(f"{_area(points[facets]):.6g}") for name, facets in mesh.boundaries.items()},
+        areas={name: float(f"{area(points[facets]):.6g}") for name, facets in mesh.boundaries.items()},
         regions={name: float(f"{volume:.6g}") for name, volume in zip(mesh.regions, sums, strict=True)},
+        slits=mesh.slits,
     )
 
 
-def _area(corners: FloatArray) -> float:
+def area(corners: FloatArray) -> float:
     """Return the area of facets (n, 3 or 4, 3) together."""
     around = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
     a, b, c = np.moveaxis(corners[:, around], 2, 0)

@@ -59,6 +59,9 @@ class MeshFile(Settings):
         a curved body does not become more accurate.
     divide
         Then divide every cell into eight once more, with thinner ones at these boundaries (``[]``: uniformly).
+    slits
+        Names of boundaries that are closed slits: faces that lie on each other but have points of their own, so that
+        they can part. Where the file has others, a finding says so.
     contents
         What the file holds; it need not be given.
     """
@@ -72,12 +75,18 @@ class MeshFile(Settings):
     tags: str | None = None
     levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0
     divide: tuple[str, ...] | None = None
+    slits: tuple[str, ...] = ()
     contents: Contents | None = None
 
     @model_validator(mode="after")
     def _read(self) -> MeshFile:
         if self.contents is None:
             object.__setattr__(self, "contents", contents(self.load(), digest_of(self.file)))
+        wrong = [name for name in self.slits if name not in self.found.slits]
+        if wrong:
+            there = ", ".join(filter(None, self.found.slits)) or "none in this file"
+            message = f"slits: '{wrong[0]}' is no boundary whose faces lie on each other, expected such a one: {there}"
+            raise ValueError(message)
         lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
         needed = lowest[self.cell, self.degree]
         if self.quadrature < needed:
@@ -201,6 +210,10 @@ class MeshFile(Settings):
         extent = max(high - low for low, high in self.bounds)
         if not SMALL <= extent <= LARGE:
             yield Finding("body-size", "warning", {"unit": self.unit, "extent": told(extent, "m", 3)})
+        for name, area in self.found.slits.items():
+            if name not in self.slits:
+                named = f" on '{name}'" if name else ""
+                yield Finding("slit", "warning", {"area": f"{area:.3g} m²", "named": named})
 
     def contains(self, point: Point) -> bool:
         """Whether a point (m) lies in a box around the body; where the mesh is made, it must lie in a cell."""

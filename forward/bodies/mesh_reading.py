@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh import CLOSE, CORNERS, FACES, IntArray, Loaded
+from forward.bodies.mesh import CORNERS, FACES, IntArray, Loaded, opened, places_of, slits_of
 from forward.files import meshes
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
@@ -71,8 +71,10 @@ def load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...]
     points = unit * np.asarray(mesh.points, dtype=float)[used]
     if points.shape[1] != 3 or not np.isfinite(points).all():
         refuse("its points are not finite ones in three dimensions")
+    given = points
+    points, lips = opened(points, cells, cell)
     _check_geometry(points, cells, cell, refuse)
-    _check_joints(points, cells, cell, refuse)
+    _check_joints(given, cells, cell, refuse)
     new = np.full(len(mesh.points), -1)
     new[used] = np.arange(len(used))
     present = np.unique(facet_numbers)
@@ -85,7 +87,8 @@ def load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...]
         refuse(f"names no boundary, expected {_SURFACES[cell]}s of the surface with numbers (gmsh: physical surfaces)")
     present = np.unique(region_numbers)
     regions = tuple(words.get((3, int(n)), ALL if len(present) == 1 and not n else f"{n}") for n in present)
-    return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers))
+    slits = {name: float(f"{area:.6g}") for name, area in slits_of(given, lips, boundaries).items()}
+    return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers), slits)
 
 
 def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
@@ -200,10 +203,17 @@ def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any)
     flat = ~((volumes > FLAT * size[:, None]).all(axis=1) | (volumes < -FLAT * size[:, None]).all(axis=1))
     if flat.any():
         refuse(f"{flat.sum()} of {len(cells)} cells have no volume or are turned inside out")
-    grid = np.round((points - points.min(axis=0)) / (CLOSE * np.ptp(points, axis=0).max())).astype(np.int64)
-    twins = len(points) - len(np.unique(grid, axis=0))
+    _check_twins(points, refuse)
+
+
+def _check_twins(points: FloatArray, refuse: Any) -> None:
+    """Refuse points that lie where others lie."""
+    twins = len(points) - places_of(points).max() - 1
     if twins:
-        refuse(f"{twins} points lie where others lie: its parts are not joined, expected a mesh without double points")
+        refuse(
+            f"{twins} points lie where others lie: its parts are not joined, expected a mesh without double points, "
+            "except on closed slits, whose faces lie on each other"
+        )
 
 
 def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
@@ -223,6 +233,7 @@ def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -
     a, b = owners[inner].T
     parts, part = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(len(cells),) * 2), directed=False)
     if parts > 1:
+        _check_twins(points, refuse)
         sizes = ", ".join(f"{n:,}" for n in sorted(np.bincount(part).tolist(), reverse=True)[:5])
         refuse(f"its cells are {parts} parts that share no face (of {sizes} cells), expected one body")
     corners = points[faces[inner[:, 0]]]
