@@ -52,7 +52,7 @@ class Invert(MeshTreatment, Settings):
     samples
         Solves that correct Laplace's Gaussian: by default 256 for few parameters, or eight for each if these are more,
         none for a field. With 64, 90 %
-        intervals contained the truth in 82 % of specimens with thin and curved posteriors (docs/design.md).
+        intervals contained the truth in 82 % of specimens with thin and curved posteriors (docs/measurements.md).
     noise
         Prior of the factor on all standard deviations of the errors; by default these are as stated.
     chains
