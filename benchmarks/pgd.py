@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from docs.examples.separated import Operator, Separated, Stencil, alternating, cubic_stencil, from_snapshots
 from forward.model import FloatArray
-from forward.reduced.separated import Operator, Separated, Stencil, alternating, cubic_stencil, from_snapshots
 
 ORGAN = Path(__file__).parent.parent / "configs" / "organ.toml"
 SPREAD = 0.015  # m: width of a fingertip

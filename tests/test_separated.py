@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from benchmarks.pgd import beam_mesh, elasticity, rod, tip
-from forward.reduced.separated import (
+from docs.examples.separated import (
     Operator,
     Separated,
     alternating,
@@ -132,6 +132,6 @@ def test_the_beam_of_the_literature_stretches_as_elasticity_says():
 
 
 def test_no_finite_elements_are_needed():
-    code = "import sys, forward.reduced.separated; print([m for m in sys.modules if m in ('dolfinx', 'ufl', 'mpi4py')])"
+    code = "import sys, docs.examples.separated; print([m for m in sys.modules if m in ('dolfinx', 'ufl', 'mpi4py')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
