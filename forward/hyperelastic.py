@@ -34,8 +34,7 @@ from forward.settings import nearest, shown
 from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
 from forward.spec import UNREFINED
-from forward.terms.displacement import Displacement, too_far
-from forward.terms.steps import Block, lists
+from forward.terms.displacement import Block, Displacement, lists, too_far
 from forward.terms.support import Support
 from forward.terms.term import Load
 

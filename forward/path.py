@@ -23,8 +23,7 @@ from forward.readable import scale
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
-from forward.terms.displacement import too_far
-from forward.terms.steps import Block, label, lists
+from forward.terms.displacement import Block, label, lists, too_far
 from forward.words import number, with_unit
 
 LEAST = 2  # steps of a path

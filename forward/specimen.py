@@ -19,7 +19,7 @@ from forward.fem.mesh_error_cost import Estimate
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError, SolveError
-from forward.observables.displacement import PointDisplacement
+from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from annotated_types import Ge, Gt, Unit
 
+from forward.observables.functionals import Integral
 from forward.observables.observable import Observable
 from forward.terms.term import Term
 from uq.evaluation.request import Evaluate, Request
@@ -54,8 +55,6 @@ class Swept(Observable):
     def functional(self, equations: Any) -> Any:
         """Return the integral of the normal displacement."""
         import ufl
-
-        from forward.observables.functionals import Integral
 
         normal = ufl.FacetNormal(equations.mesh)
         return Integral(equations, ufl.dot(equations.u, normal), measure=equations.surface(self.on))

@@ -1,1 +1,1 @@
-"""Outputs: what is computed from a deformed body, one file each."""
+"""Outputs: what is computed from a deformed body."""

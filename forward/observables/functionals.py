@@ -1,4 +1,4 @@
-"""Functionals shared by several outputs; they import UFL, so outputs import them only when they are evaluated."""
+"""Functionals shared by several outputs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import ufl
 
 from forward.model import FloatArray
 from forward.observables.observable import Equations
@@ -58,12 +57,11 @@ class Integral:
     @cached_property
     def _by_fields(self) -> tuple[tuple[Any, Any], ...]:
         """The random fields on which the density depends, with its derivative by their values at the vertices."""
+        import ufl
+
         equations = self._equations
         return tuple(
-            (
-                field,
-                equations.by_vertices(field.test * ufl.diff(self.density, field.log) * self.measure),
-            )
+            (field, equations.by_vertices(field.test * ufl.diff(self.density, field.log) * self.measure))
             for field in equations.fields
             if field.inside(self.density)
         )

@@ -1,6 +1,6 @@
 """What every output is: a block of settings with a unit that knows its value and its derivatives.
 
-An output is a class in its own file, here or beside a study (``kind = "my_tissue.Lengthening"``):
+An output is a class, here or in a file beside a study (``kind = "my_tissue.Lengthening"``):
 
     class Lengthening(Observable):
         "Mean of λ² − 1 along x."
@@ -9,8 +9,6 @@ An output is a class in its own file, here or beside a study (``kind = "my_tissu
         unit: ClassVar[str] = "1"
 
         def functional(self, equations: Equations) -> Functional:
-            from forward.observables.functionals import Integral
-
             return Integral(equations, (equations.F.T * equations.F)[0, 0] - 1, equations.volume)
 
 A field called `on` is the name of a boundary, a field called `at` is a point (m) of the undeformed body. UFL
@@ -210,16 +208,16 @@ class Observable(Settings):
 OUTPUTS = Kinds(
     "output",
     {
-        "max-displacement": "forward.observables.max_displacement:MaxDisplacement",
-        "displacement": "forward.observables.displacement:PointDisplacement",
-        "mean-displacement": "forward.observables.mean_displacement:MeanDisplacement",
-        "reaction": "forward.observables.reaction:Reaction",
-        "strain-energy": "forward.observables.strain_energy:StrainEnergy",
-        "volume-change": "forward.observables.volume_change:VolumeChange",
-        "max-von-mises": "forward.observables.max_von_mises:MaxVonMises",
-        "force": "forward.observables.force:Force",
-        "contact-area": "forward.observables.contact_area:ContactArea",
-        "max-pressure": "forward.observables.max_pressure:MaxPressure",
+        "max-displacement": "forward.observables.largest:MaxDisplacement",
+        "displacement": "forward.observables.integrals:PointDisplacement",
+        "mean-displacement": "forward.observables.integrals:MeanDisplacement",
+        "reaction": "forward.observables.integrals:Reaction",
+        "strain-energy": "forward.observables.integrals:StrainEnergy",
+        "volume-change": "forward.observables.integrals:VolumeChange",
+        "max-von-mises": "forward.observables.largest:MaxVonMises",
+        "force": "forward.observables.integrals:Force",
+        "contact-area": "forward.observables.integrals:ContactArea",
+        "max-pressure": "forward.observables.largest:MaxPressure",
     },
     Observable,
 )

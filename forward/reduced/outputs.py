@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from forward.fem.model import HyperelasticModel
 from forward.model import FloatArray, ModelError
 from forward.observables.functionals import Integral, Linear
-from forward.observables.max_displacement import MaxDisplacement
-from forward.observables.max_von_mises import MaxVonMises
-from forward.observables.reaction import Reaction
+from forward.observables.integrals import Reaction
+from forward.observables.largest import MaxDisplacement, MaxVonMises
 from forward.reduced.data import Output
 from forward.reduced.integrands import Sampler, of_density
 from forward.reduced.kernels import Kernel

@@ -1,1 +1,1 @@
-"""What acts on a body: loads, one file each, and prescribed displacements."""
+"""What acts on a body: loads and prescribed displacements."""

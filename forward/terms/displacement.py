@@ -1,9 +1,9 @@
-"""Displacements that are prescribed on a boundary."""
+"""Displacements that are prescribed on a boundary; and what has a list in place of a number, for several steps."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from annotated_types import Unit
 from pydantic import model_validator
@@ -11,7 +11,12 @@ from pydantic import model_validator
 from forward.bodies.geometry import AXES, Axis, Body
 from forward.findings import Finding
 from forward.readable import told
+from forward.registry import KindError
+from forward.scalars import numbers
 from forward.settings import Named
+from forward.terms.term import LOADS
+
+Block = Literal["loads", "displacements"]
 
 
 class Displacement(Named):
@@ -49,3 +54,22 @@ def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[F
         if path.startswith("displacements.") and abs(largest) > extent:
             far, long = told(largest, "m", 3), told(extent, "m", 3)
             yield Finding("displacement-far", "warning", {"path": path, "far": far, "long": long})
+
+
+def lists(block: Block, item: Any) -> dict[str, Any]:
+    """Return the numbers of an item of a block, as it was written, that are lists, by the names of its fields."""
+    if not isinstance(item, Mapping):
+        return {}
+    names: tuple[str, ...] = AXES if block == "displacements" else ()
+    if block == "loads":
+        try:
+            names = numbers(LOADS[item.get("kind", "")])
+        except (KindError, TypeError):
+            return {}
+    return {name: item[name] for name in names if isinstance(item.get(name), list | tuple) and item[name]}
+
+
+def label(block: Block, item: Mapping[str, Any]) -> str:
+    """Return the name of an item of a block in parameter paths."""
+    known: Any = Displacement if block == "displacements" else LOADS[item["kind"]]
+    return str(known.model_construct(**{key: item[key] for key in ("name", "kind", "on") if key in item}).label)

@@ -1,6 +1,6 @@
 """What every load is: a block of settings that adds to the potential of a body, or to the virtual work done on it.
 
-A load is a class in its own file, here or beside a study (``kind = "my_tissue.Springs"``):
+A load is a class, here or in a file beside a study (``kind = "my_tissue.Springs"``):
 
     class Springs(Term):
         "Springs that hold a boundary: the traction −k u."
@@ -198,10 +198,10 @@ class Term(Named):
 LOADS = Kinds(
     "load",
     {
-        "gravity": "forward.terms.gravity:Gravity",
-        "traction": "forward.terms.traction:Traction",
-        "pressure": "forward.terms.pressure:Pressure",
-        "spot": "forward.terms.spot:Spot",
+        "gravity": "forward.terms.loads:Gravity",
+        "traction": "forward.terms.loads:Traction",
+        "pressure": "forward.terms.loads:Pressure",
+        "spot": "forward.terms.loads:Spot",
         "indenter": "forward.terms.indenter:Indenter",
     },
     Term,

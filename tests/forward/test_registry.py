@@ -12,7 +12,7 @@ from forward.settings import Settings
 
 pytestmark = pytest.mark.unit
 
-LOADS = Kinds("load", {"gravity": "forward.terms.gravity:Gravity", "traction": "forward.terms.traction:Traction"})
+LOADS = Kinds("load", {"gravity": "forward.terms.loads:Gravity", "traction": "forward.terms.loads:Traction"})
 
 
 class Body(Settings):

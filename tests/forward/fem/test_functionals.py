@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.observables.strain_energy import StrainEnergy
-from forward.observables.volume_change import VolumeChange
+from forward.observables.integrals import StrainEnergy, VolumeChange
 from tests.bodies import loaded_body
 
 pytestmark = pytest.mark.fem

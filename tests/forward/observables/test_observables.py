@@ -16,6 +16,7 @@ pytestmark = pytest.mark.fem
 OUTSIDE = '''
 from typing import ClassVar
 
+from forward.observables.functionals import Integral
 from forward.observables.observable import Equations, Functional, Observable
 
 
@@ -29,8 +30,6 @@ class Flux(Observable):
     def functional(self, equations: Equations) -> Functional:
         import ufl
 
-        from forward.observables.functionals import Integral
-
         normal = ufl.FacetNormal(equations.mesh)
         return Integral(equations, ufl.dot(equations.u, normal), measure=equations.surface(self.on))
 
@@ -42,8 +41,6 @@ class Density(Observable):
     unit: ClassVar[str] = "Pa²"
 
     def functional(self, equations: Equations) -> Functional:
-        from forward.observables.functionals import Integral
-
         return Integral(equations, equations.stored_energy**2, equations.volume)
 
 

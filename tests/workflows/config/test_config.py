@@ -8,8 +8,8 @@ import pytest
 
 from forward.bodies.geometry import Box
 from forward.hyperelastic import Hyperelastic
-from forward.observables.max_displacement import MaxDisplacement
-from forward.terms.gravity import Gravity
+from forward.observables.largest import MaxDisplacement
+from forward.terms.loads import Gravity
 from uq.inputs.distributions import Normal, Uniform
 from uq.methods.monte_carlo import MonteCarlo
 from workflows.__main__ import main

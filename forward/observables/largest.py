@@ -1,0 +1,214 @@
+"""Largest values over a body: of displacements, stresses, and pressures under a tool."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.geometry import AXES
+from forward.materials import kinematics
+from forward.model import FloatArray
+from forward.observables.functionals import Integral
+from forward.observables.observable import Equations, Functional, Observable
+
+
+class _Largest(Observable):
+    """The largest of some sizes."""
+
+    @property
+    def negative(self) -> bool:
+        """Whether it can be below 0."""
+        return False
+
+
+class MaxDisplacement(_Largest):
+    """Largest |u_c| over the nodes (m), or largest |u| where `component` is "magnitude".
+
+    Differentiable where only one node attains it; derivatives are those at that node.
+    """
+
+    kind: Literal["max-displacement"] = "max-displacement"
+    component: Literal["x", "y", "z", "magnitude"] = "magnitude"
+
+    def functional(self, equations: Equations) -> Functional:
+        """Prepare the evaluation."""
+        return _MaxDisplacement(equations, None if self.component == "magnitude" else AXES.index(self.component))
+
+
+class MaxVonMises(_Largest):
+    """Largest von Mises stress (Pa, Cauchy) over the quadrature points; derivatives are those at that point."""
+
+    kind: Literal["max-von-mises"] = "max-von-mises"
+    unit: ClassVar[str] = "Pa"
+    estimable: ClassVar[bool] = False  # at an edge that is held it grows without end as the mesh is refined
+
+    def functional(self, equations: Equations) -> Functional:
+        """Prepare the evaluation."""
+        return _MaxVonMises(equations)
+
+
+class MaxPressure(_Largest):
+    """Largest pressure (Pa, per undeformed area) of a tool at vertices of the mesh; derivatives are those at that one.
+
+    Pressures at vertices are averages over the facets that meet there, weighted by hat functions, so that they make up
+    the force; those at single quadrature points scatter where a tool curves within a facet. Under a sharp edge the
+    largest one grows as the mesh is refined.
+    """
+
+    kind: Literal["max-pressure"] = "max-pressure"
+    unit: ClassVar[str] = "Pa"
+    estimable: ClassVar[bool] = False
+    tool: str = "indenter"
+
+    def functional(self, equations: Equations) -> Functional:
+        """Prepare the evaluation."""
+        return _MaxPressure(equations, self.tool)
+
+
+def _over_ranks(equations: Equations, values: FloatArray) -> float:
+    """Return the largest of values ≥ 0 of all ranks."""
+    from forward.fem import ranks
+
+    return -ranks.smallest(equations.comm, -float(values.max(initial=0.0)))
+
+
+def _first(equations: Equations, here: NDArray[np.intp]) -> bool:
+    """Whether this is the first rank that has any of what is listed."""
+    holders = equations.comm.allgather(len(here) > 0)
+    return True in holders and holders.index(True) == equations.comm.rank
+
+
+class _MaxDisplacement:
+    """ψ = max over the nodes of |u_c|, or of |u|; of tied nodes, the first in canonical order counts."""
+
+    def __init__(self, equations: Equations, axis: int | None) -> None:
+        self._equations = equations
+        self._axis = axis
+
+    def _candidates(self) -> FloatArray:
+        u = self._equations.displacements()
+        return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
+
+    def value(self) -> float:
+        return _over_ranks(self._equations, self._candidates())
+
+    def place(self) -> int:
+        """Number of the node of this rank at which it is largest."""
+        candidates = self._candidates()
+        return int(_tied(candidates, candidates.max(initial=0.0))[0])
+
+    def gradient(self) -> FloatArray:
+        from forward.fem import ranks
+
+        candidates, top = self._candidates(), self.value()
+        ties = _tied(candidates, top)
+        position = self._equations.layout.positions[ties]
+        first = ranks.smallest(self._equations.comm, float(position.min(initial=np.iinfo(np.int64).max)))
+        g = np.zeros((len(candidates), 3))
+        if top > 0:
+            for node in ties[position == first]:
+                u = self._equations.displacements()[node]
+                if self._axis is None:
+                    g[node] = u / np.linalg.norm(u)
+                else:
+                    g[node, self._axis] = np.sign(u[self._axis])
+        return self._equations.with_pressures(g.ravel())
+
+    def partial(self) -> FloatArray:
+        return np.zeros(len(self._equations.parameters))
+
+
+def _tied(candidates: FloatArray, top: float) -> NDArray[np.intp]:
+    """Number the nodes at which candidates (n,) are the largest but for rounding."""
+    return np.flatnonzero(candidates >= top * (1 - 1e-10))
+
+
+class _MaxVonMises:
+    """ψ = max of the von Mises stress over the quadrature points; of tied points, the first of the lowest rank.
+
+    The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
+    so that its derivatives are those of an integral.
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        import ufl
+
+        from forward.fem.dolfinx import spaces
+
+        self._equations = equations
+        # A pressure has no deviator: in the mixed form the isochoric energy is all that is needed.
+        cauchy = equations.stress_of(equations.energy) * equations.F.T / equations.J
+        stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
+        degree = equations.spec.body.quadrature
+        self._values = equations.at_points(stress)
+        self._selector = spaces.function(spaces.quadrature_space(equations.mesh, degree))
+        self.stress = stress
+
+    def value(self) -> float:
+        return _over_ranks(self._equations, self._values())
+
+    def place(self) -> int:
+        """Number of the quadrature point of this rank at which it is largest."""
+        return int(np.argmax(self._values()))
+
+    def _at_place(self) -> Integral:
+        """Return the stress at the point where it is currently largest."""
+        here = np.argwhere(self._values() >= self.value())
+        self._selector.x.array[:] = 0
+        if _first(self._equations, here):
+            cell, point = here[0]
+            self._selector.x.array[self._selector.function_space.dofmap.cell_dofs(cell)[point]] = 1
+        self._selector.x.scatter_forward()
+        self._selected.size = self._weight()
+        return self._selected
+
+    @cached_property
+    def _selected(self) -> Integral:
+        return Integral(self._equations, self._selector * self.stress)
+
+    @cached_property
+    def _weight(self) -> Any:
+        return self._equations.scalar(self._selector * self._equations.dx)
+
+    def gradient(self) -> FloatArray:
+        return self._at_place().gradient()
+
+    def partial(self) -> FloatArray:
+        return self._at_place().partial()
+
+
+class _MaxPressure:
+    """ψ = max ∫p φ_i dS/∫φ_i dS over hat functions φ_i; of tied ones, that of the first vertex of the lowest rank."""
+
+    def __init__(self, equations: Equations, label: str) -> None:
+        from forward.fem.dolfinx import spaces
+
+        self._equations = equations
+        self._pressures = equations.pressures_at_vertices(label)
+        self._hat = spaces.function(spaces.scalar_space(equations.mesh, 1))
+        self._at_hat = Integral(equations, self._pressures.density * self._hat, measure=self._pressures.measure)
+
+    def value(self) -> float:
+        return _over_ranks(self._equations, self._pressures())
+
+    def _choose(self) -> float:
+        """Set the hat function to that of the largest pressure; return its integral (m²)."""
+        values, top = self._pressures(), self.value()
+        here = np.flatnonzero(values >= top) if top > 0 else np.zeros(0, dtype=int)
+        self._hat.x.array[:] = 0.0
+        mine = _first(self._equations, here)
+        if mine:
+            self._hat.x.array[here[0]] = 1.0
+        self._hat.x.scatter_forward()
+        return float(self._equations.comm.allreduce(float(self._pressures.areas[here[0]]) if mine else 0.0)) or 1.0
+
+    def gradient(self) -> FloatArray:
+        area = self._choose()
+        return self._at_hat.gradient() / area
+
+    def partial(self) -> FloatArray:
+        area = self._choose()
+        return self._at_hat.partial() / area
