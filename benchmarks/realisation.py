@@ -16,8 +16,7 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
-from uq.surrogates.basis import orthonormal
-from uq.surrogates.candidates import whole
+from uq.surrogates.basis import orthonormal, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise

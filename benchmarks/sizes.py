@@ -18,8 +18,7 @@ from uq.inputs.sampling import sobol_points
 from uq.methods.compare import Compare
 from uq.methods.derivative_based import DerivativeBased
 from uq.methods.method import METHODS  # noqa: F401, the methods that a comparison names
-from uq.surrogates.basis import orthonormal
-from uq.surrogates.candidates import DICTIONARY, candidates_of
+from uq.surrogates.basis import DICTIONARY, candidates_of, orthonormal
 from uq.surrogates.least_squares import Data, fit_best
 
 SAMPLES = 200  # values of a fit

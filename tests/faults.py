@@ -74,7 +74,7 @@ FAULTS = {
         "inverse/fields/noise.py", "+ self.count * np.log(square", "+ (self.count - 1) * np.log(square"
     ),
     "sobol-total": Fault("uq/estimators/indices.py", "(A - AB) ** 2 / 2]", "(A - AB) ** 2]"),
-    "bias": Fault("uq/methods/multilevel_estimates.py", "/ (2.0**alpha - 1)", "/ 2.0**alpha"),
+    "bias": Fault("uq/methods/multilevel_meshes.py", "/ (2.0**alpha - 1)", "/ 2.0**alpha"),
     "degrees-of-freedom": Fault(
         "uq/estimators/moments.py", 'int(dataset["scramble"].max())', 'int(dataset["scramble"].max()) + 1'
     ),
@@ -85,7 +85,7 @@ FAULTS = {
     "upper-quantile": Fault("uq/estimators/quantiles.py", "_level(1 - p[:, None], ", "_level(p[:, None], "),
     "budget": Fault("uq/methods/stopping.py", "(self.budget_seconds / seconds - 1)", "(self.budget_seconds / seconds)"),
     "digits": Fault("forward/words.py", "1 if error < TWO * 10.0**power", "1 if error > TWO * 10.0**power"),
-    "chains": Fault("uq/estimators/autocorrelation.py", "2 * pairs.sum() - 1", "2 * pairs.sum()"),
+    "chains": Fault("uq/inputs/draws.py", "2 * pairs.sum() - 1", "2 * pairs.sum()"),
 }
 
 

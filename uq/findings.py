@@ -7,7 +7,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from forward.findings import Entry, Finding, Severity
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.findings import Entry, Finding, Severity, entries
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -17,6 +20,9 @@ MANY = 3  # steps at which a list says the same
 UNKNOWN = "mesh_unknown"  # attribute of results, see `keep_unknown`
 NOT_KNOWN = "mesh not known"  # beside every error that is of sampling alone
 DIGITS = 2  # of numbers whose error of the mesh was to be known, and is not
+ROUNDING = 1e-9  # of the largest quantity of the same unit: what is zero by symmetry is smaller
+NUMBER = "1"  # unit of ratios, which differ in size
+LENGTH = "m"  # unit of the displacement field
 
 
 def add(dataset: xr.Dataset, *found: Finding, first: bool = False) -> None:
@@ -140,3 +146,38 @@ def _kept(dataset: xr.Dataset) -> list[Finding]:
 def _keep(dataset: xr.Dataset, found: Iterable[Finding]) -> None:
     kept = [one.kept() for one in found]
     dataset.attrs["findings"] = json.dumps(kept, ensure_ascii=False, default=lambda number: number.item())
+
+
+def only_rounding(dataset: xr.Dataset, units: Mapping[str, str]) -> NDArray[np.bool_]:
+    """Say which outputs (m,) are rounding beside others of the same unit, or beside the displacement field.
+
+    Parameters
+    ----------
+    dataset
+        Results: values at the mean parameters, moments where there are some, fields where there are some.
+    units
+        Of the outputs.
+    """
+    known = [units.get(str(name), "1") for name in dataset["output"].values]
+    sizes = np.zeros(len(known))
+    for name in ("nominal", "mean", "std"):
+        if name in dataset and dataset[name].dims == ("output",):
+            sizes = np.fmax(sizes, np.abs(dataset[name].to_numpy()))
+    largest = {unit: float(sizes[[other == unit for other in known]].max()) for unit in known}
+    for name in ("field_nominal", "field_mean"):
+        if name in dataset and LENGTH in largest and dataset[name].size:
+            largest[LENGTH] = max(largest[LENGTH], float(np.nanmax(np.abs(dataset[name].to_numpy()))))
+    comparable = np.array([unit != NUMBER for unit in known])
+    return np.asarray(comparable & (sizes <= ROUNDING * np.array([largest[unit] for unit in known])))
+
+
+def settled(dataset: xr.Dataset, units: Mapping[str, str]) -> None:
+    """Withdraw what was said of outputs that are rounding, of which nothing can be explained, and say that they are."""
+    names = [str(name) for name in dataset["output"].values[only_rounding(dataset, units)]]
+    if names:
+        withdraw(dataset, names)
+        be = "is" if len(names) == 1 else "are"
+        add(
+            dataset,
+            Finding("only-rounding", "note", {"be": be}, about=entries(names)),
+        )

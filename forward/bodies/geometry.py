@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from forward.bodies.elements import default_quadrature
+from forward.bodies.mesh import default_quadrature
 from forward.bodies.mesh_file import MeshFile
 from forward.findings import Finding
 from forward.model import FloatArray

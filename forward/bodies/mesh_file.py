@@ -18,9 +18,20 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
-from forward.bodies.elements import default_quadrature, node_count
 from forward.bodies.location import nearest_of
-from forward.bodies.mesh import CLOSE, FACES, TETRAHEDRA, Contents, Loaded, Point, contents, divided, divided_contents
+from forward.bodies.mesh import (
+    CLOSE,
+    FACES,
+    TETRAHEDRA,
+    Contents,
+    Loaded,
+    Point,
+    contents,
+    default_quadrature,
+    divided,
+    divided_contents,
+    node_count,
+)
 from forward.bodies.mesh_reading import digest_of, load
 from forward.findings import Finding
 from forward.model import FloatArray, ModelError

@@ -19,7 +19,7 @@ from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.model import FloatArray, ReferenceSolution, Work
 from forward.solvers.anderson import block_galerkin
-from forward.solvers.smoothing import minimised, smoothed
+from forward.solvers.multigrid import minimised, smoothed
 
 if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic

@@ -10,7 +10,7 @@ differences of linear or very coarse meshes tell neither how fast the error fall
 (docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are halved, and graded as those of the body: the
 edge of the contact may be anywhere. Where thin cells at a rim are squeezed until there is no equilibrium, meshes
 without them take their place. A mesh that does not contain the vertices of a random field has another field: cells of
-boxes and blocks with fields are divided, and again at the rims of what is held (`forward.bodies.nested`).
+boxes and blocks with fields are divided, and again at the rims of what is held (`forward.bodies.tetrahedra`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from scipy.sparse import csr_matrix, identity
 
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
-from forward.bodies.nested import RATIO, layers_of, within
 from forward.bodies.random_fields import RandomField
+from forward.bodies.tetrahedra import RATIO, layers_of, within
 from forward.combine import Joined, Mapped, MappedSolution, Rows
 from forward.extrapolated import HALVED, Begun, FromStart, Otherwise, limit
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError

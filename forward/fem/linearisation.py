@@ -13,7 +13,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import assembly, linear, multigrid, nodal_blocks, single, spaces, unknowns
+from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unknowns
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
@@ -110,8 +110,8 @@ class Linearisation(Forms):
         return np.asarray(np.stack(found, axis=-1).reshape(-1, 3, 3, 3, 3))
 
     @cached_property
-    def _of_nodes(self) -> nodal_blocks.NodalBlocks:
-        return nodal_blocks.NodalBlocks(self.space)
+    def _of_nodes(self) -> linear.NodalBlocks:
+        return linear.NodalBlocks(self.space)
 
     @cached_property
     def _blocks_of_boundaries(self) -> linear.BoundaryBlocks | None:

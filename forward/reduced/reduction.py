@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from forward.fem.model import HyperelasticModel
+from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
-from forward.reduced import basis, blocks
-from forward.reduced.at_rest import AtRest
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
 from forward.reduced.level import Level
 from forward.reduced.limits import mistakes
+from forward.reduced.modes import AtRest, boxes, enough
 from forward.reduced.newton import stable
 from forward.reduced.outputs import Outputs
 from forward.reduced.rules import STATES, Rules, Training
-from forward.reduced.snapshots import Snapshots
+from forward.reduced.snapshots import Snapshots, solved
 
 OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
 LOOKED_AT = 4  # snapshots at which the larger model must be stable
@@ -126,7 +127,7 @@ class Reduction:
         if sizes.cut is None:
             none = np.zeros((0, self.equations.size))
             first, squares = self._rest.modes(every, none, sizes.modes or sizes.truncation)
-            n, most = basis.enough(squares, sizes.truncation), basis.enough(squares, sizes.truncation / 10)
+            n, most = enough(squares, sizes.truncation), enough(squares, sizes.truncation / 10)
             n = sizes.modes or n
             left = float(np.sqrt(max(1 - squares[:n].sum() / squares.sum(), 0.0)))
             more = sizes.more // (1 if self.equations.p is None else KINDS)
@@ -198,7 +199,7 @@ class Reduction:
         """Return the block of each cell."""
         if cut != "regions":
             cells, _ = self.equations.layout.cells()
-            return blocks.cut(cells, self.equations.layout.coordinates, cut)
+            return boxes(cells, self.equations.layout.coordinates, cut)
         labels = self.model.space.regions()
         if labels is None:
             message = "the body has no regions, expected numbers of blocks along each axis"
@@ -348,3 +349,27 @@ def _definite(data: ReducedData) -> bool:
         if not stable((K + K.T) / 2, level.pressures):
             return False
     return True
+
+
+def enriched(data: ReducedData, points: FloatArray, cubature: float = 1e-3) -> ReducedData:
+    """Solve the full model at parameters (k, d), and return a reduced model that holds these too.
+
+    Such points are where a reduced model with a tolerance has asked the full one (`ReducedModel.asked`).
+
+    Parameters
+    ----------
+    data
+        The reduced model; it stays as it is.
+    points
+        All its parameters (k, d) at each of the solutions.
+    cubature
+        What the points may miss of the forces, relative.
+
+    Raises
+    ------
+    SolveError
+        Where the full model has no answer.
+    """
+    model = cast("HyperelasticModel", Hyperelastic.model_validate(data.spec).build(MPI.COMM_SELF, data.parameters))
+    answers = solved(model, points, data.spread)
+    return Reduction(model, data.nominal, data.spread).enriched(data, answers, Sizes(cubature=cubature))

@@ -16,7 +16,6 @@ from pydantic_core import PydanticCustomError
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
-from forward.reduced.said import without_answer
 from forward.registry import named
 from forward.scalars import Scalar
 from forward.spec import ModelSpec
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 LETTERS = 16  # of a hash
 BY_CHANCE = 0.01  # so rarely an end of the distribution is farther from all snapshots than a study may go beyond them
 DOUBTFUL = 0.05  # error on unseen samples, relative to the spread of an output, above which it is one
-
 _APART = ("outputs", "solver", "stresses")  # blocks of a body in which one and its reduced model may differ
 
 
@@ -303,3 +301,15 @@ def _shape(body: Hyperelastic, numbers: set[str]) -> dict[str, Any]:
 
     whole = body.model_dump(mode="json", exclude_none=True)
     return {name: block if name == "body" else bare(block) for name, block in whole.items() if name not in _APART}
+
+
+def without_answer(told: Mapping[str, Any]) -> Iterator[Finding]:
+    """Find that the body had no answer at some points: a reduced model knows none of these, and may answer there."""
+    lost = told.get("without an answer", 0) + told.get("unseen without an answer", 0)
+    if lost:
+        unseen, answered = told.get("unseen without an answer", 0), told.get("of these answered all the same", 0)
+        how = f" (at {answered} of {unseen} such unseen samples it does)" if unseen else ""
+        yield Finding("reduced-body-fails", "warning", {"lost": lost, "how": how})
+    own = told.get("unseen that only the body answers", 0)
+    if own:
+        yield Finding("reduced-finds-none", "warning", {"lost": own})

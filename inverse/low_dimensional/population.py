@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
-from uq.estimators.autocorrelation import effective
+from uq.inputs.draws import effective
 
 STRETCH = 2.0  # a of the stretch move
 FREEDOM = 3.0  # of the prior of standard deviations

@@ -12,8 +12,8 @@ from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray
 from forward.readable import told as in_words
 from uq.estimators.estimate import estimate_of, holds
-from uq.estimators.rounding import only_rounding
 from uq.evaluation.request import Evaluations
+from uq.findings import only_rounding
 
 if TYPE_CHECKING:
     import xarray as xr

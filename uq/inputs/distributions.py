@@ -10,9 +10,8 @@ from annotated_types import Gt
 from pydantic import Field
 
 from forward.model import FloatArray
-from uq.inputs.by_name import Chaospy
 from uq.inputs.quadrature import Cut, panels
-from uq.inputs.univariate import Bounded, Univariate
+from uq.inputs.univariate import Bounded, Chaospy, Univariate
 
 PositiveFloat = Annotated[float, Gt(0)]
 

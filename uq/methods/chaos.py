@@ -27,8 +27,17 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.stopping import Amount
-from uq.surrogates.basis import Basis, gauss, orthonormal
-from uq.surrogates.candidates import DICTIONARY, FULL, ROWS_PER_TERM, candidates_of, rows_of, whole
+from uq.surrogates.basis import (
+    DICTIONARY,
+    FULL,
+    ROWS_PER_TERM,
+    Basis,
+    candidates_of,
+    gauss,
+    orthonormal,
+    rows_of,
+    whole,
+)
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,

@@ -42,7 +42,6 @@ from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
-from uq.inputs.by_name import Chaospy
 from uq.inputs.distributions import (
     Beta,
     Distribution,
@@ -56,10 +55,10 @@ from uq.inputs.distributions import (
 )
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
+from uq.inputs.univariate import Chaospy
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
 from uq.methods.stopping import Amount
-from uq.surrogates.basis import gauss, hyperbolic, orthonormal
-from uq.surrogates.candidates import FULL
+from uq.surrogates.basis import FULL, gauss, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import Regression
 

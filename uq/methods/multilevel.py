@@ -1,7 +1,7 @@
 """Multilevel Monte Carlo over nested meshes: the total error, of mesh and sampling, at the least cost.
 
 The meshes, and the terms of the telescoping sums, are in `uq.methods.multilevel_meshes`; what is estimated from them is
-in `uq.methods.multilevel_estimates`.
+in `uq.methods.multilevel_meshes`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
-from uq.methods.multilevel_estimates import RATES, Found, influences, rate
-from uq.methods.multilevel_meshes import Mesh, Pilot, name_of
+from uq.methods.multilevel_meshes import RATES, Found, Mesh, Pilot, influences, name_of, rate
 from uq.methods.stopping import Amount
 from uq.surrogates.linearisation import local_dataset
 

@@ -30,8 +30,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.chaos import Expanded, Probability, expansion_dataset, objection
 from uq.methods.stopping import Amount
-from uq.surrogates.basis import hyperbolic_count, orthonormal
-from uq.surrogates.candidates import whole
+from uq.surrogates.basis import hyperbolic_count, orthonormal, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise

@@ -25,7 +25,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.methods.scrambles import Scrambles
-from uq.surrogates.candidates import FULL, ROWS_PER_TERM
+from uq.surrogates.basis import FULL, ROWS_PER_TERM
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.taylor import expansion, held_expansion, quadratic, tangent

@@ -18,14 +18,7 @@ from pydantic.json_schema import SkipJsonSchema
 from forward.model import FloatArray, SolveError
 from forward.settings import nearest
 from uq.estimators.doubts import of_indices
-from uq.estimators.indices import (
-    Analysis,
-    RowProducts,
-    coefficient_moments,
-    pair_variances,
-    partial_variances,
-    shares,
-)
+from uq.estimators.indices import Analysis, RowProducts, coefficient_moments, pair_variances, partial_variances, shares
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add
@@ -33,9 +26,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two
 from uq.methods.chaos import LARGEST, Chaos, expansion_dataset
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
-from uq.methods.sobol_given_data import checked
-from uq.methods.sobol_rows import Design, Rows
-from uq.methods.sobol_variables import DIMENSIONS, RUNNING, by_output, by_round, with_maps
+from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Design, Rows, by_output, by_round, with_maps
 from uq.methods.stopping import Amount
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
@@ -316,3 +307,41 @@ class Sobol(Amount):
         error = f"errors of the indices up to {reached:.2g}"
         dataset.attrs["stopped"] = self.why_stopped(reached, error, rows.each, last, amount)
         return dataset
+
+
+def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+    """Return the results of another study, which must have the same parameters and outputs.
+
+    Raises
+    ------
+    FileNotFoundError
+        If they are of others.
+    """
+    for what, expected in (("parameter", inputs.names), ("output", evaluate.outputs)):
+        theirs = tuple(source[what].values)
+        if theirs != expected:
+            message = f"{directory}: holds results of {what}s {', '.join(theirs)}, expected {', '.join(expected)}"
+            raise FileNotFoundError(message)
+    if not ("multi_index" in source or "values" in source):
+        message = f"{directory}: holds neither samples nor an expansion, expected results of chaos or of sampling"
+        raise FileNotFoundError(message)
+    ours, written = _as_written(inputs), _distributions(source.attrs.get("config"))
+    if not (
+        np.allclose(source["parameter_mean"], inputs.mean, rtol=1e-10, atol=0)
+        and np.allclose(source["parameter_std"], inputs.std, rtol=1e-10, atol=0)
+        and all(ours[name] == value for name, value in written.items())  # coefficients of fields are not written
+    ):
+        message = f"{directory}: holds results of other distributions, expected those of this study"
+        raise FileNotFoundError(message)
+    return source
+
+
+def _distributions(config: str | None) -> dict[str, Any]:
+    """Return the distributions of a recorded study, if there is a record."""
+    import tomllib
+
+    return dict(tomllib.loads(config or "").get("parameters", {}))
+
+
+def _as_written(inputs: Inputs) -> dict[str, Any]:
+    return {name: marginal.model_dump(mode="json", exclude_none=True) for name, marginal in inputs.marginals.items()}

@@ -22,8 +22,7 @@ from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, So
 from uq.estimators.indices import partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis, orthonormal
-from uq.surrogates.candidates import candidates_of, rows_of
+from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
 from uq.surrogates.gate import Trial, repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation

@@ -19,8 +19,7 @@ from uq.evaluation.block import merge
 from uq.evaluation.evaluate import OfEvaluate
 from uq.evaluation.request import CompactSum, Evaluate, Evaluations, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis, hyperbolic, hyperbolic_count, orthonormal
-from uq.surrogates.candidates import ROWS_PER_TERM, Candidate, Candidates
+from uq.surrogates.basis import ROWS_PER_TERM, Basis, Candidate, Candidates, hyperbolic, hyperbolic_count, orthonormal
 from uq.surrogates.field_regression import StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation

@@ -24,8 +24,7 @@ import numpy as np
 from forward.model import FloatArray, SolveError
 from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis, IntArray
-from uq.surrogates.candidates import FULL, ROWS_PER_TERM, Candidate, Candidates
+from uq.surrogates.basis import FULL, ROWS_PER_TERM, Basis, Candidate, Candidates, IntArray
 
 FOLDS = 10  # parts of the samples that are left out in turn to choose the functions
 ROUNDING = 1e-13  # relative error below which no function is added

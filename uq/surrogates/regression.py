@@ -21,9 +21,17 @@ from uq.estimators.tails import influences
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.basis import Basis, IntArray, orthonormal, recurrence
-from uq.surrogates.candidates import DICTIONARY, FULL, Candidates, candidates_of, rows_of
-from uq.surrogates.hidden import of_std
+from uq.surrogates.basis import (
+    DICTIONARY,
+    FULL,
+    Basis,
+    Candidates,
+    IntArray,
+    candidates_of,
+    orthonormal,
+    recurrence,
+    rows_of,
+)
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.reach import Beyond, beyond
 
@@ -33,6 +41,8 @@ CLOSE = 0.03  # relative leave-one-out error above which the tails of the sample
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
 SYMMETRIC = 0.01  # share of even powers up to which a function is odd, and the reverse
+PULLS = 2.0  # times the largest effect of such a function that is claimed, since others are missing too
+LEAST = 1 / 3  # of the norm that is missing: claimed whatever the functions that were looked at would do
 
 
 @dataclass(frozen=True)
@@ -339,3 +349,54 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     square = (fit.without[:, ~constant] ** 2).sum(axis=1)[fit.held] + mean**2
     f = data.values - offset
     return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
+
+
+def of_std(
+    inputs: Inputs, tails: NDArray[np.bool_], basis: Basis, data: Data, fit: Fit, missing: FloatArray
+) -> FloatArray:
+    """Return errors (m,) of standard deviations by what a fit lacks in tails.
+
+    If a function ψ of norm 1 that the basis lacks is part of an output with the norm t, then the fit leaves it out, and
+    its coefficients c take up what of ψ looks like the basis at the samples: with the columns A = QR of the regression
+    they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and t²/(2σ). For t
+    stands the most that the residuals allow, see `Regression.missing`.
+
+    Parameters
+    ----------
+    tails
+        Which parameters (d,) have some.
+    missing
+        Norms (m,) of what is missed, by the next powers of single parameters.
+    """
+    from scipy.linalg import solve_triangular
+
+    left = data.left(basis)
+    q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
+    columns = data.left(orthonormal(inputs, np.array(list(_neighbours(basis.indices, tails))))).reshape(len(q), -1)
+    along = q.T @ columns
+    sizes = ((columns - q @ along) ** 2).sum(axis=0)
+    varying = (basis.indices != 0).any(axis=1)
+    moved = solve_triangular(triangle, along)[varying]
+    c = fit.coefficients[varying]
+    std = np.linalg.norm(c, axis=0)
+    pulls = np.abs(shares(moved.T @ c, std))
+    norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
+    largest = (norms * pulls).max(axis=0)
+    return np.asarray(np.sqrt((PULLS * largest) ** 2 + (LEAST * missing) ** 2 + shares(missing**2, std) ** 2))
+
+
+def _neighbours(indices: IntArray, tails: NDArray[np.bool_]) -> Iterator[IntArray]:
+    """Go through powers (d,) that a basis (P, d) lacks: the next two of a parameter with a tail, alone and in products.
+
+    Products are with one other parameter; with another tail, of what is the highest power alone too.
+    """
+    known = {tuple(row) for row in indices.tolist()}
+    unit = np.eye(indices.shape[1], dtype=np.int64)
+    for i in np.flatnonzero(tails):
+        following = int(indices[:, i].max()) + 1
+        found = [following * unit[i], (following + 1) * unit[i]]
+        for j in np.flatnonzero(np.arange(len(tails)) != i):
+            found.append(following * unit[i] + unit[j])
+            if tails[j]:
+                found.append(max(following - 1, 1) * unit[i] + unit[j])
+        yield from (one for one in found if tuple(one.tolist()) not in known)

@@ -10,8 +10,7 @@ import numpy as np
 
 from forward.words import NONE, duration, named, places, with_error
 from uq.estimators.estimate import ESTIMATED, single
-from uq.estimators.rounding import only_rounding
-from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
+from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown, only_rounding
 from workflows.report import words
 from workflows.results.summary import inverted
 

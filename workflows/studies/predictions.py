@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import REPORT, START
-from uq.accuracy.budget import SHARE
+from uq.accuracy.goal import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times

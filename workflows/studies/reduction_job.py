@@ -16,8 +16,8 @@ from forward.model import SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
-from forward.reduced.said import without_answer
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
+from forward.reduced.spec import without_answer
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import add

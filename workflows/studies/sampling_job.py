@@ -11,14 +11,13 @@ import numpy as np
 
 from forward.model import SolveError, Stability
 from forward.registry import named
-from uq.accuracy.budget import spare_for
+from uq.accuracy.goal import spare_for
 from uq.estimators import branch
 from uq.estimators.estimate import holds, part
-from uq.estimators.rounding import settled
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN, Evaluate, Evaluations
-from uq.findings import add, keep_unknown, once_for_steps
+from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions

@@ -10,9 +10,8 @@ import numpy as np
 from forward.model import FloatArray
 from inverse.data.table import DataError, read_table
 from inverse.low_dimensional.posterior import NOISE
-from uq.estimators.autocorrelation import effective
 from uq.evaluation.hdf5 import Variable, variables
-from uq.inputs.draws import Draws
+from uq.inputs.draws import Draws, effective
 
 Columns = dict[str, FloatArray]
 WEIGHTS = ("weight", "weights")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from forward.findings import Finding, entries
 from forward.model import ModelError
 from forward.scalars import Mistake
-from uq.accuracy.budget import LEAST, OF_SOLVER
+from uq.accuracy.goal import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
 from uq.methods.stopping import UNASKED
 

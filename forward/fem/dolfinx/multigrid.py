@@ -14,8 +14,7 @@ from forward.model import FloatArray, SolveError
 from forward.solvers import multigrid
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.linear import TIGHT, LinearSolver, NoConvergence
-from forward.solvers.multigrid import MARGIN, Levels
-from forward.solvers.smoothing import minimised
+from forward.solvers.multigrid import MARGIN, Levels, minimised
 from forward.solvers.steps import finish
 
 ITERATIONS = 400  # of conjugate gradients

@@ -7,7 +7,7 @@ from forward.bodies.bisection import FACES as TRIANGLES
 from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
 from forward.bodies.location import locate, shapes
-from forward.bodies.nested import RATIO, layers_of, within
+from forward.bodies.tetrahedra import RATIO, layers_of, within
 from forward.model import ModelError
 
 CORNERS = tuple((2 * x + 0.3 * z * y, y, z + 0.2 * x) for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0))

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
-from forward.reduced import blocks
+from forward.reduced import modes
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots
@@ -83,8 +83,8 @@ def stiffness(reduction):
 
 def parts_of(full, cut, where=None):
     cells, _ = full.space.cells()
-    labels = blocks.cut(cells, full.space.coordinates, cut)
-    return blocks.partition(labels, cells, full.space.coordinates, where)
+    labels = modes.boxes(cells, full.space.coordinates, cut)
+    return modes.partition(labels, cells, full.space.coordinates, where)
 
 
 def test_every_node_belongs_to_the_blocks_of_its_cells(full):
@@ -101,7 +101,7 @@ def test_every_node_belongs_to_the_blocks_of_its_cells(full):
 def test_modes_are_orthonormal_and_those_inside_a_block_stay_there(full, snapshots, stiffness):
     K, free = stiffness
     parts = parts_of(full, (3, 1, 1))
-    found = blocks.modes(parts, K, free, snapshots.states, 100)
+    found = modes.modes_of_blocks(parts, K, free, snapshots.states, 100)
     np.testing.assert_allclose(found @ (K @ found.T), np.eye(len(found)), atol=1e-8)
     assert not np.abs(found[:, ~free]).any()
     # All modes hold all snapshots.
@@ -111,7 +111,7 @@ def test_modes_are_orthonormal_and_those_inside_a_block_stay_there(full, snapsho
     of_unknown = np.repeat(parts.of_node, 3)
     left_block = int(np.flatnonzero(parts.inside & parts.blocks[:, 0])[0])
     inside = free & parts.inside[of_unknown]
-    carried = blocks._carrier(K, inside, free & ~inside)
+    carried = modes._carrier(K, inside, free & ~inside)
     apart = snapshots.states[0] - carried(snapshots.states[:1])[0]
     mixed = np.where(of_unknown == left_block, apart, 0.0)
     assert np.abs(mixed - (mixed @ (K @ found.T)) @ found).max() < 1e-6 * np.abs(mixed).max()
@@ -143,7 +143,7 @@ def test_a_block_kept_in_full_takes_loads_that_no_snapshot_has_seen(full, reduct
 def test_what_cannot_be_cut_is_said(full, snapshots, reduction, monkeypatch):
     with pytest.raises(ModelError, match="no regions, expected numbers of blocks"):
         reduction.reduced(snapshots, Sizes(modes=4, cut="regions"))
-    monkeypatch.setattr("forward.reduced.blocks.MOST_IN_FULL", 10)
+    monkeypatch.setattr("forward.reduced.modes.MOST_IN_FULL", 10)
     with pytest.raises(ModelError, match="expected at most 10: cut finer"):
         reduction.reduced(snapshots, Sizes(modes=4, cut=(2, 1, 1), full=((0.0, 0.0, 0.0),)))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from forward.reduced.basis import enough, orthonormal
-from forward.reduced.cubature import Mixture, chosen
+from forward.reduced.modes import enough, orthonormal
+from forward.reduced.rules import Mixture, chosen
 
 pytestmark = pytest.mark.unit
 

@@ -14,13 +14,12 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS
 from forward.model import InadmissibleError, ModelError
 from forward.reduced.data import load, save
-from forward.reduced.enrichment import enriched
 from forward.reduced.integrands import of_density, of_form
 from forward.reduced.limits import mistakes
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
 from forward.reduced.outputs import NEAR_PEAK
-from forward.reduced.reduction import Reduction, Sizes
+from forward.reduced.reduction import Reduction, Sizes, enriched
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 
 pytestmark = pytest.mark.fem

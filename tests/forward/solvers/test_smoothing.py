@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.solvers.smoothing import minimised, smoothed
+from forward.solvers.multigrid import minimised, smoothed
 
 pytestmark = pytest.mark.unit
 N = 60

@@ -262,9 +262,9 @@ def here(path, out, *changes):
 
 
 THICK = """
-import forward.bodies.nested
+import forward.bodies.tetrahedra
 
-forward.bodies.nested.THINNEST = 1.0  # no thin cells on finer meshes of fields, which take most of the time of these
+forward.bodies.tetrahedra.THINNEST = 1.0  # no thin cells on finer meshes of fields, which take most of the time
 """
 WITHOUT_REPORT = (
     THICK

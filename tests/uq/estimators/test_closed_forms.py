@@ -8,8 +8,7 @@ import pytest
 import xarray as xr
 from scipy import integrate, optimize, signal, stats
 
-from uq.accuracy.budget import estimates_for, spare_for
-from uq.estimators.autocorrelation import effective
+from uq.accuracy.goal import estimates_for, spare_for
 from uq.estimators.averaged import average
 from uq.estimators.blue import informations, weights
 from uq.estimators.indices import (
@@ -39,7 +38,8 @@ from uq.estimators.quantiles import quantiles, quantiles_from_replicates, quanti
 from uq.estimators.scores import rate as rate_of_errors
 from uq.estimators.scores import score
 from uq.estimators.tails import _share_beyond, by_chance, concentration, influences, shown, skewed
-from uq.methods.multilevel_estimates import bias, rate
+from uq.inputs.draws import effective
+from uq.methods.multilevel_meshes import bias, rate
 from uq.methods.stopping import seconds_per_solve
 
 pytestmark = pytest.mark.unit

@@ -20,7 +20,7 @@ from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, 
 from uq.inputs.random_parameters import Inputs
 from uq.methods import chaos
 from uq.methods.chaos import Chaos
-from uq.surrogates import candidates
+from uq.surrogates import basis as bases
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion, OutsideRangeWarning
 from uq.surrogates.linearisation import linearise
@@ -194,7 +194,7 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     def function(p):
         return np.exp(p[0]) / (0.3 + p[1])
 
-    monkeypatch.setattr(candidates, "TRUNCATIONS", (1.0,))
+    monkeypatch.setattr(bases, "TRUNCATIONS", (1.0,))
     monkeypatch.setattr(chaos, "DICTIONARY", 0)  # nothing to select from
     data = run(Chaos(samples=20, max_order=3, gradients=gradients), inputs, function, by_complex_step(function))
     basis = Expansion.of(data).basis

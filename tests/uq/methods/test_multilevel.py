@@ -19,7 +19,7 @@ from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.multilevel import MultilevelMonteCarlo, optimal
-from uq.methods.multilevel_estimates import bias, rate
+from uq.methods.multilevel_meshes import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.report import plots

@@ -6,7 +6,7 @@ import pytest
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates import hidden
+from uq.surrogates import regression
 from uq.surrogates.regression import Regression
 
 INPUTS = Inputs({name: Normal(mean=0.0, std=1.0) for name in "ab"})
@@ -31,7 +31,7 @@ def test_what_a_missing_function_does_to_the_standard_deviation_is_claimed_and_n
     np.testing.assert_array_less(0.95 * SIZE, missing)
     claims = np.array(
         [
-            hidden.of_std(INPUTS, both, one.basis, one.data, one.fit, norm[None])[0]
+            regression.of_std(INPUTS, both, one.basis, one.data, one.fit, norm[None])[0]
             for one, norm in zip(found, missing, strict=True)
         ]
     )
@@ -45,6 +45,6 @@ def test_what_a_missing_function_does_to_the_standard_deviation_is_claimed_and_n
 def test_powers_that_a_basis_lacks():
     basis = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1]])
     tails = np.array([True, False])
-    assert [tuple(one) for one in hidden._neighbours(basis, tails)] == [(3, 0), (4, 0), (3, 1)]
-    both = {tuple(one) for one in hidden._neighbours(basis, np.array([True, True]))}
+    assert [tuple(one) for one in regression._neighbours(basis, tails)] == [(3, 0), (4, 0), (3, 1)]
+    both = {tuple(one) for one in regression._neighbours(basis, np.array([True, True]))}
     assert both == {(3, 0), (4, 0), (3, 1), (2, 1), (0, 2), (0, 3), (1, 2)}

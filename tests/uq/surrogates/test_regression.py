@@ -9,8 +9,7 @@ import pytest
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.basis import hyperbolic, hyperbolic_count, orthonormal
-from uq.surrogates.candidates import DICTIONARY, Candidate, candidates_of
+from uq.surrogates.basis import DICTIONARY, Candidate, candidates_of, hyperbolic, hyperbolic_count, orthonormal
 from uq.surrogates.least_squares import Data, _Products, _select
 from uq.surrogates.regression import Regression
 

@@ -13,11 +13,10 @@ import xarray as xr
 from forward.model import FunctionModel
 from tests.launch import TISSUQ, environment
 from tests.launch import run as on_ranks
-from uq.estimators.autocorrelation import effective
 from uq.estimators.averaged import average
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.hdf5 import netcdf
-from uq.inputs.draws import Draws
+from uq.inputs.draws import Draws, effective
 from uq.inputs.random_parameters import Inputs
 from uq.methods.monte_carlo import MonteCarlo
 from workflows.config.mistakes import StudyError

@@ -12,8 +12,7 @@ from forward.model import FloatArray
 from forward.readable import and_error, margin, quantity, size, spoken
 from forward.words import NONE, duration, number
 from uq.estimators.estimate import estimate_of, holds, single
-from uq.estimators.rounding import only_rounding
-from uq.findings import DIGITS, NOT_KNOWN
+from uq.findings import DIGITS, NOT_KNOWN, only_rounding
 from workflows.report import bodies, plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section, written
