@@ -68,16 +68,11 @@ plots.tornado(data, output).figure
 # %% [markdown]
 # ## Where on the body
 #
-# Indices of the displacement at every node. Bodies are drawn by pyvista without a display; if the machine
-# cannot draw them, there is no picture.
+# Indices of the displacement at every node.
 
 # %%
 strongest = str(data["parameter"].values[data["field_sobol_total"].argmax().item()])
-drawn = bodies.pictures(data, [f"sobol_total {strongest}"])
-if drawn is not None:
-    from IPython.display import Image, display
-
-    display(Image(next(iter(drawn.values())), width=700))
+bodies.body(data, f"Total index of the displacement for {strongest}")
 
 # %% [markdown]
 # The data behind the picture are plain arrays, one row for each node:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from workflows.report import bodies
-
 ROOT = Path(__file__).parent.parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 LONG = {"06_pipeline"}  # four studies
@@ -18,10 +16,9 @@ SHORT = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG)) for 
 @pytest.mark.fem
 @pytest.mark.parametrize("path", SHORT, ids=lambda path: path.stem)
 def test_every_line_runs(path, monkeypatch, tmp_path):
-    """As a script: without reports, and without drawing bodies, which other tests do."""
+    """As a script: without reports, which other tests make."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(bodies, "pictures", lambda dataset, shown: None)
     monkeypatch.setattr("workflows.run.run._report", lambda directory: None)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for name in re.findall(r"TISSUQ_\w+", path.read_text()):

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from workflows.report import plots
+from workflows.report.plots.figure import png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 HALF = 8.0  # inches: wider pictures are not legible on half a page
 
@@ -73,6 +75,11 @@ class Picture:
     def of(cls, png: bytes, caption: str) -> Picture:
         """Show a PNG file."""
         return cls(base64.b64encode(png).decode(), caption)
+
+    @classmethod
+    def painted(cls, figure: Figure, caption: str) -> Picture:
+        """Show a figure whose parts overlap: as a PNG file."""
+        return cls.of(png_of(figure, figure.dpi), caption)
 
     @classmethod
     def drawn(cls, ax: Axes, caption: str) -> Picture:

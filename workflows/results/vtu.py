@@ -40,19 +40,6 @@ class Grid:
     point_data: Mapping[str, Array] = field(default_factory=dict)
     cell_data: Mapping[str, Array] = field(default_factory=dict)
 
-    def pyvista(self) -> Any:
-        """Return the same as a pyvista grid."""
-        import pyvista
-
-        sizes = np.full((len(self.cells), 1), self.cells.shape[1])
-        kinds = np.full(len(self.cells), self.kind)
-        grid: Any = pyvista.UnstructuredGrid(np.hstack([sizes, self.cells]).ravel(), kinds, self.points)
-        for name, values in self.point_data.items():
-            grid.point_data[name] = values
-        for name, values in self.cell_data.items():
-            grid.cell_data[name] = values
-        return grid
-
 
 def vtu(grid: Grid) -> bytes:
     """Return a grid as a VTK XML file of an unstructured grid, its arrays compressed and in base 64.

@@ -9,15 +9,14 @@ import xarray as xr
 from scipy import integrate, stats
 
 from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
-from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
-from workflows.report import bodies, plots, small_density
+from tests.workflows.report.test_report import SVG, solve, study, study_of, write
+from workflows.report import plots, small_density
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
 
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch):
-    monkeypatch.setattr(bodies, "pictures", lambda dataset, shown: dict.fromkeys(shown, PNG))
     monkeypatch.setattr(plots, "svg", lambda ax: SVG)
 
 

@@ -10,11 +10,12 @@ import pytest
 import xarray as xr
 
 from tests.workflows.report.test_report import CUBE, HEXAHEDRON, PNG, solve, study
+from workflows.report.bodies import refined, still
+from workflows.report.plots.figure import png_of
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, packed
 from workflows.report.scene.skin import skin, split
 from workflows.report.scene.sliders import sliders
-from workflows.report.scene.still import still
 from workflows.results.level import crossing, level, tetrahedra
 
 pyvista = pytest.importorskip("pyvista")
@@ -158,6 +159,10 @@ def test_regions_are_surfaces_inside():
     assert volume(points, inside.triangles) == pytest.approx(1.0)
 
 
+def drawn(figure):
+    return png_of(figure, figure.dpi)
+
+
 def test_stills_are_drawn_with_what_is_inside():
     points, cells, kind = lattice(12, 1)
     at, triangles = level(lambda x: np.linalg.norm(x - [1, 0.5, 1.5], axis=1) - 0.3, np.zeros(3), np.array([2, 1, 3]))
@@ -166,20 +171,36 @@ def test_stills_are_drawn_with_what_is_inside():
     for quantity in (Quantity("a $ b", values), Quantity("c", np.round(points[:, 1]), names=["x", "y"])):
         for insides in ([], [Inside("ball", triangles, at, "inside")]):
             scene = Scene(points, cells, kind, np.eye(3)[2], 0.1 * points, [quantity], insides)
-            assert still(scene, quantity).startswith(PNG)
+            assert drawn(still(scene, quantity)).startswith(PNG)
 
 
 def test_stills_show_the_surface_that_the_viewer_begins_with():
     points, cells, kind = lattice(12, 1)
     grows = Quantity("stiffness", points[:, 0])
     views = [Scene(points, cells, kind, np.eye(3)[2], 0 * points, [grows], cut=cut) for cut in ("", "v")]
-    assert len({still(scene, grows) for scene in views}) == 2
+    assert len({drawn(still(scene, grows)) for scene in views}) == 2
     at, triangles = crossing(points, points[:, 0] - 1, tetrahedra(cells, kind))
     np.testing.assert_allclose(at[:, 0], 1)
     corners = at[triangles]
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     across = np.prod(np.ptp(points[:, 1:], axis=0))
     assert np.linalg.norm(sides, axis=1).sum() / 2 == pytest.approx(across)
+
+
+def test_a_refined_mesh_is_drawn_and_what_is_behind_its_worst_cell():
+    points, cells, _ = lattice(10, 1)
+    dataset = xr.Dataset(
+        {
+            "mesh_vertex_position": (("vertex", "axis"), points),
+            "mesh_cell_vertices": (("mesh_cell", "corner"), cells),
+            "mesh_indicator": ("mesh_cell", np.linspace(0, 2 / len(cells), len(cells))),
+        }
+    )
+    whole, cut = (refined(dataset, cut=cut) for cut in (False, True))
+    faces = [len(figure.axes[0].collections[-1].get_paths()) for figure in (whole, cut)]
+    assert faces[0] == 2 * (2 * 1 + 2 * 3 + 1 * 3)  # triangles of the three sides that are seen
+    assert 0 < faces[1] < 4 * len(cells)
+    assert drawn(whole) != drawn(cut)
 
 
 def test_sliders_have_the_distributions_of_parameters():

@@ -106,8 +106,8 @@ class Scene:
         return skin(self.points, self.cells, self.kind)
 
 
-def forward_scene(dataset: xr.Dataset, study: Any = None) -> Scene:
-    """Return the scene of a body that was deformed by its loads."""
+def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False) -> Scene:
+    """Return the scene of a body that was deformed by its loads; with `every` parameter, not only the strongest."""
     points, cells, kind = _mesh(dataset)
     mean = "field_mean" if "field_mean" in dataset else "field_nominal"
     return Scene(
@@ -116,7 +116,7 @@ def forward_scene(dataset: xr.Dataset, study: Any = None) -> Scene:
         kind,
         up_of(dataset),
         dataset[mean].to_numpy(),
-        list(_quantities(dataset, mean)),
+        list(_quantities(dataset, mean, every=every)),
         [*_regions(dataset, points, cells, kind), *_inclusions_of(dataset, study, points), *_tools(dataset, points)],
         sliders=None if study is None else sliders(dataset, study),
         motion_name="its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters",
@@ -180,7 +180,7 @@ def _size(values: Any) -> FloatArray:
     return np.asarray(np.linalg.norm(np.asarray(values), axis=-1))
 
 
-def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
+def _quantities(of: xr.Dataset, mean: str, *, every: bool) -> Iterator[Quantity]:
     name = "Mean displacement" if mean == "field_mean" else "Displacement at the mean parameters"
     yield Quantity(name, _size(of[mean]), "m")
     if "field_std" in of:
@@ -195,13 +195,13 @@ def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
     names = of["parameter"].to_numpy() if "parameter" in of.coords else np.zeros(0, dtype=str)
     if "field_derivative_rms" in of:
         effects = of["field_derivative_rms"] * of["parameter_std"]
-        for parameter in names[np.argsort(-effects.to_numpy())][:DERIVATIVES_SHOWN]:
+        for parameter in names[np.argsort(-effects.to_numpy())][: None if every else DERIVATIVES_SHOWN]:
             values = of["field_derivative"].sel(parameter=parameter) * float(
                 of["parameter_std"].sel(parameter=parameter)
             )
             yield Quantity(f"Displacement by one standard deviation of {parameter}, to first order", _size(values), "m")
     if "dominating" in of:
-        strongest = names[np.argsort(-of["field_sobol_total"].to_numpy())][:MAPS_SHOWN]
+        strongest = names[np.argsort(-of["field_sobol_total"].to_numpy())][: None if every else MAPS_SHOWN]
         for parameter in strongest:
             for which, word in (("total", "Total"), ("first", "First-order")):
                 shares = of[f"node_sobol_{which}"].sel(parameter=parameter).to_numpy()

@@ -42,7 +42,7 @@ def skin(points: FloatArray, cells: IntArray, kind: int) -> Skin:
     if not len(cells):
         none = np.zeros((0, 3), dtype=np.int64)
         return Skin(none, np.zeros(0, dtype=np.int64), none[:, :2])
-    return split(points, outer(cells, faces(points, cells, kind)))
+    return split(points, outer(cells, faces(points, cells, kind))[0])
 
 
 def faces(points: FloatArray, cells: IntArray, kind: int) -> list[tuple[IntArray, IntArray]]:
@@ -90,13 +90,14 @@ def faces(points: FloatArray, cells: IntArray, kind: int) -> list[tuple[IntArray
     return found
 
 
-def outer(cells: IntArray, faces_: list[tuple[IntArray, IntArray]]) -> IntArray:
-    """Return the triangles (t, 3) of the faces that belong to one cell only."""
+def outer(cells: IntArray, faces_: list[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]:
+    """Return the triangles (t, 3) of the faces that belong to one cell only, and the numbers (t,) of these cells."""
     keys = np.concatenate([np.sort(cells[:, corners], axis=1) for corners, _ in faces_])
     _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     single = (counts[inverse.ravel()] == 1).reshape(len(faces_), len(cells))
     parts = [cells[alone][:, triangles].reshape(-1, 3) for (_, triangles), alone in zip(faces_, single, strict=True)]
-    return np.concatenate(parts)
+    owners = [np.repeat(np.flatnonzero(alone), len(of)) for (_, of), alone in zip(faces_, single, strict=True)]
+    return np.concatenate(parts), np.concatenate(owners)
 
 
 def split(points: FloatArray, triangles: IntArray) -> Skin:

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 
 DRAWN = 8  # data sets that have more than a row in the table
 STILLS = 2  # pictures for paper
-NO_BODY = (
-    "The mesh could not be drawn on this machine: that needs pyvista (pip install 'tissuq[vtk]') and OpenGL without a "
-    "display (Debian: libegl1)."
-)
 
 
 class Body(Section):
@@ -102,13 +98,14 @@ def specimen(one: xr.Dataset, results: Results) -> Viewer:
 
 def turning(scene: Scene, label: str, also: str = "") -> Viewer:
     """A body that turns, with pictures of its first quantities for paper."""
+    from workflows.report.bodies import still
     from workflows.report.scene.scene import packed
-    from workflows.report.scene.still import still
 
     told, data = packed(scene)
     stills = []
     for k, quantity in enumerate(scene.quantities[:STILLS]):
-        stills.append(Picture.of(still(scene, quantity), quantity.name + (f", {also}." if also and not k else ".")))
+        caption = quantity.name + (f", {also}." if also and not k else ".")
+        stills.append(Picture.painted(still(scene, quantity), caption))
     return Viewer(label, told, data, Pictures(stills))
 
 

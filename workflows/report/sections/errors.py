@@ -13,10 +13,9 @@ from forward.readable import and_error, margin, quantity, size, spoken
 from forward.words import NONE, duration, number
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.findings import DIGITS, NOT_KNOWN, only_rounding
-from workflows.report import bodies, plots
+from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section, written
-from workflows.report.sections.bodies import NO_BODY
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -341,6 +340,8 @@ class AdaptedMesh(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table of meshes, a picture of their errors, and the last one."""
+        from workflows.report.bodies import refined
+
         dataset, adapt = results.dataset, results.study.model.adapt
         yield Heading("The mesh")
         by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
@@ -355,14 +356,10 @@ class AdaptedMesh(Section):
             [Picture.drawn(plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh.")]
         )
         captions = {
-            "mesh": "The mesh; cells in bright colours contribute most to the error, for their volume.",
-            "mesh cut": "What is behind the cell that contributes most.",
+            False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
+            True: "What is behind the cell that contributes most.",
         }
-        drawn = bodies.pictures(dataset, list(captions))
-        if drawn is None:
-            yield Text(NO_BODY)
-        else:
-            yield Pictures([Picture.of(drawn[name], caption) for name, caption in captions.items()])
+        yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])
 
 
 def cycles(results: Results) -> Table:
