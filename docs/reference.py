@@ -243,9 +243,8 @@ def block(name: str, blocks: dict[str, Any]) -> list[str]:
             continue
         default = "required" if key in required else f"`{json.dumps(of.get('default'), ensure_ascii=False)}`"
         default = "none" if default == "`null`" else default
-        rows.append(
-            f"| `{key}` | {taken(of, blocks)} | {default} | {meanings.get(key, '').replace('|', chr(92) + '|')} |"
-        )
+        meaning = meanings.get(key, of.get("description", "")).replace("|", chr(92) + "|")
+        rows.append(f"| `{key}` | {taken(of, blocks)} | {default} | {meaning} |")
     if rows:
         lines += ["| key | takes | default | meaning |", "|---|---|---|---|", *rows, ""]
     return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ from forward.materials.admissible import Materials
 from forward.model import FloatArray
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
-from uq.inputs.distributions import Distribution
+from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
@@ -27,6 +27,19 @@ LEAST = 0.5  # smallest probability of admissible constants
 def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
     """Return the ranges of parameters, by their paths."""
     return {path: distribution.range for path, distribution in parameters.items()}
+
+
+def inputs_of(
+    parameters: Mapping[str, Distribution],
+    correlations: Iterable[Correlation] = (),
+    coefficients: Iterable[str] = (),
+    materials: Materials | None = None,
+    draws: Draws | None = None,
+) -> Inputs:
+    """Return random parameters: those that are given, and then standard normal coefficients of random fields."""
+    standard = dict.fromkeys(coefficients, Normal(mean=0.0, std=1.0))
+    pairs = tuple((*one.between, one.value) for one in correlations)
+    return Inputs({**parameters, **standard}, pairs, materials, draws=draws)
 
 
 def mistakes_of_draws(

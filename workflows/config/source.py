@@ -11,6 +11,10 @@ from forward.registry import named
 from forward.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from forward.spec import ModelSpec
+    from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
 
 KEPT = "draws.npz"  # beside study.toml: the draws as they were read
@@ -77,6 +81,45 @@ class Sourced(Settings):
     """
 
     source: Source | None = None
+
+    if TYPE_CHECKING:  # fields of these studies
+
+        @property
+        def model(self) -> ModelSpec:
+            """The model."""
+
+        @property
+        def parameters(self) -> dict[str, Distribution]:
+            """Distributions by paths."""
+
+    @cached_property
+    def draws(self) -> Draws | None:
+        """Draws of numbers of the model, if there is a source of them."""
+        if self.source is None:
+            return None
+        found: Draws | None = named(f"{READER}:draws_of")(self.source, self.model.scalars)
+        return found
+
+    @property
+    def given(self) -> dict[str, Distribution]:
+        """The distributions by the paths of the numbers that they replace, those of draws too."""
+        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
+
+    @property
+    def by_contents(self) -> dict[str, Any]:
+        """The blocks that name files, by the contents of these in place of their paths."""
+        found: dict[str, Any] = {"model": self.model.identity()}
+        if self.source is None:
+            return found
+        own = {path: one.model_dump(mode="json") for path, one in self.parameters.items()}
+        return found | {"parameters": {"from": self.source.digest, **own}}
+
+    @property
+    def beside(self) -> Mapping[str, bytes]:
+        """The draws, as they were read."""
+        if self.source is None or self.source.model in (AVERAGED, STACKED):
+            return {}
+        return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
 
     @model_serializer(mode="wrap")
     def _source_among_parameters(self, handler: Any) -> dict[str, Any]:

@@ -225,7 +225,9 @@ def schema() -> dict[str, Any]:
 
 def document(study: StudyKind) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
-    return study.model_dump(mode="json", exclude_none=True)
+    blocks = study.model_dump(mode="json", exclude_none=True)
+    last = {key: blocks.pop(key) for key in WITHOUT_EFFECT if key in blocks}
+    return blocks | last
 
 
 def dump(study: StudyKind) -> str:

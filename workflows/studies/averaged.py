@@ -146,13 +146,12 @@ class AveragedStudy(Study):
         others = {one: partial(part.spec.build, ensemble.group, part.inputs.names) for one, part in parts.items()}
         model = others.pop(next(iter(parts)))()
         units = {output.name: output.unit for output in self.model.returned}
-        if not self.model.meshed:
-            return MethodJob(model, others, task, recorders, lambda found: label(found, units, None, None, 0))
-        space = cast("HyperelasticModel", model).space
-        cells, kind = space.cells()
-        return MethodJob(
-            model, others, task, recorders, lambda found: label(found, units, space.coordinates, cells, kind)
-        )
+        mesh: tuple[Any, ...] = (None, None, 0)
+        if self.model.meshed:
+            space = cast("HyperelasticModel", model).space
+            mesh = (space.coordinates, *space.cells())
+        told = {"candidates": {one.name: one.probability for one in self.candidates}}
+        return MethodJob(model, others, task, recorders, labelled=lambda found: label(found, units, *mesh), told=told)
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Say of each candidate where it has no answer."""
@@ -163,9 +162,10 @@ class AveragedStudy(Study):
 
     def summary(self, job: Job) -> dict[str, Any]:
         """Return the probabilities."""
-        return {"candidates": {one.name: one.probability for one in self.candidates}}
+        return job.told
 
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be averaged."""
         assert self.source is not None
         place, said = ("parameters", "from"), self.source.model
         for what, wrong in (

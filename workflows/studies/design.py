@@ -7,20 +7,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.findings import Finding
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from inverse.methods.design import Design
-from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import refused
-from workflows.config.priors import findings_of_materials, mistakes_of_draws, mistakes_of_priors, ranges
-from workflows.config.report import Report
-from workflows.config.source import AVERAGED, KEPT, READER, Sourced
+from workflows.config.blocks import Correlation
+from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_draws, mistakes_of_priors, ranges
+from workflows.config.source import AVERAGED, READER, Sourced
 from workflows.studies.design_values import mistakes
 from workflows.studies.inversion_plan import PRODUCT
 from workflows.studies.predictions import duration
@@ -29,7 +27,6 @@ from workflows.studies.study import StudyKind
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.inputs.draws import Draws
     from workflows.studies.job import Job
 
 
@@ -52,10 +49,6 @@ class DesignStudy(Sourced, StudyKind):
         Correlations between them.
     method
         What is chosen and how.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "a design"
@@ -65,21 +58,6 @@ class DesignStudy(Sourced, StudyKind):
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Design
-    parallel: Parallel = Parallel()
-    report: Report | None = None
-
-    @cached_property
-    def draws(self) -> Draws | None:
-        """Draws of numbers of the model, if there is a source of them."""
-        found: Draws | None = None
-        if self.source is not None:
-            found = named(f"{READER}:draws_of")(self.source, self.model.scalars)
-        return found
-
-    @property
-    def given(self) -> dict[str, Distribution]:
-        """The distributions by the paths of the numbers that they replace, those of draws too."""
-        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
 
     @property
     def field(self) -> bool:
@@ -92,10 +70,9 @@ class DesignStudy(Sourced, StudyKind):
 
         None for a field of nodal values.
         """
-        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
-        own = self.parameters | standard
-        pairs = tuple((*c.between, c.value) for c in self.correlations)
-        return Inputs(own, pairs, self.model.materials(self.given), draws=self.draws)
+        coefficients = () if self.field else self.model.coefficients
+        materials = self.model.materials(self.given)
+        return inputs_of(self.parameters, self.correlations, coefficients, materials, self.draws)
 
     @cached_property
     def spec(self) -> ModelSpec:
@@ -106,11 +83,6 @@ class DesignStudy(Sourced, StudyKind):
     def specs(self) -> tuple[ModelSpec, ...]:
         """The model."""
         return (self.spec,)
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model."""
-        return self.model.modules
 
     @property
     def planned(self) -> int:
@@ -160,29 +132,12 @@ class DesignStudy(Sourced, StudyKind):
         found: Job = make(self.method, self.spec, self.inputs, ensemble, checkpoint, field=self.field)
         return found
 
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns."""
-        return self.inputs.names
-
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
-        found = super().identity() | {"model": self.model.identity()}
-        if self.source is None:
-            return found
-        own = {path: one.model_dump(mode="json") for path, one in self.parameters.items()}
-        return found | {"parameters": {"from": self.source.digest, **own}}
+        return super().identity() | self.by_contents
 
-    @property
-    def beside(self) -> Mapping[str, bytes]:
-        """The draws, as they were read."""
-        return {} if self.source is None else {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
-
-    @model_validator(mode="after")
-    def _check(self) -> DesignStudy:
-        refused("Design", list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if self.method.criterion == "models":
             yield ("method", "criterion"), "one model, expected several as candidates", "models"
         if self.source is not None:
@@ -204,9 +159,7 @@ class DesignStudy(Sourced, StudyKind):
         if not nodal and not self.inputs.names:
             yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
         yield from self.model.mistakes_of_mesh()
-        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
-            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
-            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        yield from self.mistakes_of_ranks(self.spec)
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         if self.draws is not None:
             yield from mistakes_of_draws(self.model.scalars, self.draws, (), self.model.unavailable)

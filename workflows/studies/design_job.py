@@ -53,7 +53,7 @@ def job(
         recorders["/"] = Recorder(evaluate)
         return method.run(inputs, recorders["/"], values, evaluate if has_mesh(spec) else None)
 
-    return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(spec, found))
+    return MethodJob(model, {}, task, recorders, texts=lambda found: files(spec, found))
 
 
 def job_of_models(
@@ -85,9 +85,7 @@ def job_of_models(
         return method.run_models(inputs, weights, recorders, values)
 
     makers = {name: partial(made, name) for name in others}
-    return MethodJob(
-        model, makers, task, recorders, lambda found: found, texts=lambda found: files(specs[first], found)
-    )
+    return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
 
 
 def _of_field(
@@ -131,7 +129,6 @@ def _of_field(
         lambda number, outcome: None,
         forget,
         results,
-        lambda found: found,
         texts=lambda found: files(spec, found),
     )
 

@@ -7,16 +7,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter
 
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from inverse.methods.design import Design
-from workflows.config.blocks import Parallel
-from workflows.config.mistakes import refused
 from workflows.config.priors import ranges
-from workflows.config.report import Report
 from workflows.studies.design_values import mistakes
 from workflows.studies.model_selection import ModelCandidate, changed, described
 from workflows.studies.predictions import duration
@@ -43,10 +40,6 @@ class DesignOfModels(StudyKind):
         Models by name, as of a comparison.
     method
         What is chosen and how.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "a design"
@@ -55,8 +48,6 @@ class DesignOfModels(StudyKind):
     model: dict[str, Any]
     candidates: dict[str, ModelCandidate] = Field(min_length=2)
     method: Design
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     @cached_property
     def of_candidates(self) -> dict[str, ModelSpec]:
@@ -67,7 +58,7 @@ class DesignOfModels(StudyKind):
         }
 
     @property
-    def inputs(self) -> dict[str, Inputs]:
+    def priors(self) -> dict[str, Inputs]:
         """The unknowns of each candidate."""
         return {name: one.restricted(self.of_candidates[name]) for name, one in self.candidates.items()}
 
@@ -75,11 +66,6 @@ class DesignOfModels(StudyKind):
     def specs(self) -> tuple[ModelSpec, ...]:
         """The models of all candidates."""
         return tuple(self.of_candidates.values())
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the models."""
-        return tuple(dict.fromkeys(module for spec in self.specs for module in spec.modules))
 
     @property
     def planned(self) -> int:
@@ -112,23 +98,19 @@ class DesignOfModels(StudyKind):
         """Make the models; collective."""
         weights = {name: one.weight for name, one in self.candidates.items()}
         make = named("workflows.studies.design_job:job_of_models")
-        found: Job = make(self.method, self.of_candidates, self.inputs, weights, ensemble)
+        found: Job = make(self.method, self.of_candidates, self.priors, weights, ensemble)
         return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the unknowns of a candidate."""
-        return self.inputs[label].names
+        return self.priors[label].names
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the numbers of a candidate's model."""
         return {path: number.unit for path, number in self.of_candidates[label].scalars.items()}
 
-    @model_validator(mode="after")
-    def _check(self) -> DesignOfModels:
-        refused("Design", list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if self.method.criterion != "models":
             yield ("method", "criterion"), "there are candidates, expected 'models'", self.method.criterion
         first = True
@@ -139,9 +121,7 @@ class DesignOfModels(StudyKind):
             if first:  # which the others are observed like
                 yield from mistakes(self.method, spec)
                 first = False
-            if self.parallel.ranks_per_model > 1 and not spec.shareable:
-                message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
-                yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+            yield from self.mistakes_of_ranks(spec)
             if spec.coefficients:
                 message = "random fields, expected numbers only"
                 yield (*place, "model", "fields"), message, len(spec.coefficients)

@@ -21,11 +21,10 @@ from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced, Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import not_installed, refused
+from workflows.config.blocks import Correlation
+from workflows.config.mistakes import not_installed
 from workflows.config.predict import Predict
-from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_priors, ranges
-from workflows.config.report import Report
+from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_factor, mistakes_of_priors, ranges
 from workflows.studies.measured import DataFiles, as_block, data_as
 from workflows.studies.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
@@ -62,10 +61,6 @@ class Inversion(StudyKind):
         What was measured.
     method
         How it is inverted.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     predict
         What else is to be known by the posterior; by default nothing.
     """
@@ -75,8 +70,6 @@ class Inversion(StudyKind):
     correlations: tuple[Correlation, ...] = ()
     data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(as_block)]
     method: Invert = Invert()
-    parallel: Parallel = Parallel()
-    report: Report | None = None
     predict: Predict | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
@@ -109,9 +102,8 @@ class Inversion(StudyKind):
     @cached_property
     def inputs(self) -> Inputs:
         """The unknown parameters; none for a field of nodal values."""
-        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
-        pairs = tuple((*c.between, c.value) for c in self.correlations)
-        return Inputs(self.parameters | standard, pairs, self.model.materials(self.parameters))
+        coefficients = () if self.field else self.model.coefficients
+        return inputs_of(self.parameters, self.correlations, coefficients, self.model.materials(self.parameters))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,12 +132,6 @@ class Inversion(StudyKind):
             return spec, *beside, *(meshes_of(spec) if looked else ())
         except ValueError:  # there are none, which is said elsewhere
             return spec, *beside
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model."""
-        found: tuple[str, ...] = self.model.modules
-        return found if self.predict is None else tuple(dict.fromkeys((*found, *self.predicted.modules)))
 
     @cached_property
     def predicted(self) -> ModelSpec:
@@ -304,12 +290,8 @@ class Inversion(StudyKind):
             return blocks
         return data_as(blocks, DataFiles if usual_kind(blocks.get("model")) == SPECIMEN else MeasuredOutputs)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refused(type(self).__name__, list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if self.specimen is not None:
             yield from self._of_specimen(self.specimen)
         else:
@@ -357,9 +339,7 @@ class Inversion(StudyKind):
             if field.basis == "nodes":
                 message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
-            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
-            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        yield from self.mistakes_of_ranks(self.spec)
         if self.method.reduced is not None:
             yield from self._of_reduced(self.method.reduced)
         if not self.parameters and not self.model.coefficients:

@@ -254,7 +254,7 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
         rows.add,
         forget,
         results,
-        partial(_judged, study, made),
+        labelled=partial(_judged, study, made),
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )
@@ -425,7 +425,7 @@ def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
         others,
         task,
         recorders,
-        partial(_judged, study, made),
+        labelled=partial(_judged, study, made),
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -23,43 +24,52 @@ if TYPE_CHECKING:
     from uq.evaluation.turns import Progress
 
 MOVED = "moved points"  # in names of models
-ArvizGroups = Callable[["xr.Dataset"], Mapping[str, "xr.Dataset"]]
-Texts = Callable[["xr.Dataset"], Mapping[str, str]]
 
 
-class Job(Protocol):
-    """What the ranks do for a study."""
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What the ranks do for a study.
 
-    @property
-    def labelled(self) -> Callable[[xr.Dataset], xr.Dataset]:
-        """Adds to the results what the method does not know."""
+    Attributes
+    ----------
+    labelled
+        Adds to the results what the method does not know.
+    arviz_groups
+        Groups of results.nc besides its own variables.
+    texts
+        Further files of the directory, by name.
+    told
+        What else is in summary.json; once it is done.
+    own
+        Processor times (s) of the methods themselves, in this run, on rank 0; once it is done.
+    outcomes
+        Outcomes of tasks, if there are any, in their order; once they are done.
+    """
 
-    @property
-    def arviz_groups(self) -> ArvizGroups:
-        """Groups of results.nc besides its own variables."""
-
-    @property
-    def texts(self) -> Texts:
-        """Further files of the directory, by name."""
+    labelled: Callable[[xr.Dataset], xr.Dataset] = field(default=lambda found: found)
+    arviz_groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
+    texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
+    told: dict[str, Any] = field(default_factory=dict)
+    own: list[float] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
 
     @property
     def own_seconds(self) -> float:
         """Processor time (s) of the methods themselves, in this run."""
+        return sum(self.own)
 
     @property
+    @abstractmethod
     def evaluations(self) -> dict[str, Evaluations]:
         """What was evaluated, by the name under which it is stored."""
 
-    @property
-    def outcomes(self) -> Sequence[Outcome]:
-        """Outcomes of tasks, if there are any, in their order."""
-
+    @abstractmethod
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Do it: results on rank 0, None on the others; collective over all ranks."""
 
 
 @dataclass(frozen=True)
-class MethodJob:
+class MethodJob(Job):
     """Evaluations that a method requests.
 
     Attributes
@@ -70,8 +80,6 @@ class MethodJob:
         Runs the method on rank 0.
     recorders
         What was evaluated, by the name under which it is stored.
-    labelled, arviz_groups, texts
-        As in `Job`.
     costly
         Whether solves are worth storing: if not, an interrupted study starts again.
     node_volumes
@@ -80,8 +88,6 @@ class MethodJob:
         Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
     passing
         Names of other models of which only the last one is kept in memory.
-    own
-        Processor time (s) that the method took besides evaluations, on rank 0; once it is done.
     meshes_before
         Meshes whose errors were estimated before this one was taken, as `workflows.studies.tolerance` keeps them.
     """
@@ -90,20 +96,11 @@ class MethodJob:
     others: Mapping[str, Callable[[], ForwardModel]]
     task: Callable[[Evaluate], xr.Dataset]
     recorders: dict[str, Recorder]
-    labelled: Callable[[xr.Dataset], xr.Dataset]
     costly: bool = True
-    arviz_groups: ArvizGroups = field(default=lambda _: {})
-    texts: Texts = field(default=lambda _: {})
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
     estimates: Sequence[Evaluations] = ()
     passing: frozenset[str] = frozenset()
     meshes_before: Sequence[Mapping[str, Any]] = ()
-    own: list[float] = field(default_factory=list)
-
-    @property
-    def own_seconds(self) -> float:
-        """Processor time (s) that the method took besides evaluations."""
-        return sum(self.own)
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
@@ -117,11 +114,6 @@ class MethodJob:
                 parts.setdefault(name if alike else f"{name.rstrip('/')}/{model.rsplit('/', 1)[-1]}", []).append(one)
             found |= {label: merge(part) for label, part in parts.items()}
         return found
-
-    @property
-    def outcomes(self) -> Sequence[Outcome]:
-        """There are no tasks."""
-        return ()
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Run the method on rank 0, with an evaluation that all groups work on; collective over all ranks."""
@@ -145,7 +137,7 @@ class MethodJob:
 
 
 @dataclass(frozen=True)
-class TasksJob:
+class TasksJob(Job):
     """Tasks shared by groups of ranks, each of which returns a dataset.
 
     Attributes
@@ -156,10 +148,6 @@ class TasksJob:
         As in `uq.evaluation.tasks.run_tasks`.
     results
         The dataset of the study from the outcomes of all tasks.
-    labelled, arviz_groups, texts
-        As in `Job`.
-    outcomes
-        Those of all tasks, once they are done.
     """
 
     names: Sequence[str]
@@ -167,10 +155,6 @@ class TasksJob:
     arrived: Callable[[int, Outcome], None]
     kept: Callable[[], None]
     results: Callable[[Sequence[Outcome]], xr.Dataset]
-    labelled: Callable[[xr.Dataset], xr.Dataset]
-    arviz_groups: ArvizGroups = field(default=lambda _: {})
-    texts: Texts = field(default=lambda _: {})
-    outcomes: list[Outcome] = field(default_factory=list)
 
     @property
     def own_seconds(self) -> float:

@@ -22,10 +22,9 @@ from inverse.criticism.doubts_of_meshes import not_estimable
 from inverse.methods.selection import SelectSpecimens
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import StudyError, lines, refused
-from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
-from workflows.config.report import Report
+from workflows.config.blocks import Correlation
+from workflows.config.mistakes import StudyError, lines
+from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.studies.listed_displacements import ListedDisplacements
 from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE
@@ -65,7 +64,7 @@ class ModelCandidate(Settings):
     @property
     def inputs(self) -> Inputs:
         """The random parameters."""
-        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+        return inputs_of(self.parameters, self.correlations)
 
     def restricted(self, spec: ModelSpec) -> Inputs:
         """The random parameters, restricted to those that make materials, where there are some."""
@@ -95,18 +94,12 @@ class ModelSelection(Comparison):
         Models by name.
     method
         How the candidates are compared.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     model: dict[str, Any]
     data: Annotated[ListedDisplacements | ListedOutputs, BeforeValidator(as_block)]
     candidates: dict[str, ModelCandidate] = Field(min_length=1)
     method: SelectSpecimens
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     costly: ClassVar[bool] = True
     data_in_file: ClassVar[tuple[type[Settings], ...]] = (ListedDisplacements.in_file, ListedOutputs.in_file)
@@ -197,11 +190,6 @@ class ModelSelection(Comparison):
         return [mesh_check(one) for one in checked]
 
     @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the models."""
-        return tuple(dict.fromkeys(module for spec in self.of_candidates.values() for module in spec.modules))
-
-    @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the models before anything is solved, each once."""
         of_models = (
@@ -283,18 +271,14 @@ class ModelSelection(Comparison):
         """SI units of the numbers of a candidate's model."""
         return {path: number.unit for path, number in self.of_candidates[label.partition("/")[0]].scalars.items()}
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refused(type(self).__name__, list(self._mistakes()))
-        return self
-
     @model_validator(mode="before")
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
         return data_as(blocks, block_of(blocks.get("model"))) if isinstance(blocks, Mapping) else blocks
 
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if isinstance(self.data, ListedDisplacements) and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
             yield ("method", "check"), message, self.method.check
@@ -307,9 +291,7 @@ class ModelSelection(Comparison):
                 yield (*place, "model", "fields"), message, len(spec.coefficients)
             for where, message, given in self.data.unobserved(spec):
                 yield (*place, "model", *where), message, given
-            if self.parallel.ranks_per_model > 1 and not spec.shareable:
-                message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
-                yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+            yield from self.mistakes_of_ranks(spec)
         yield from self.mistakes_of_method()
 
 

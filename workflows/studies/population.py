@@ -12,8 +12,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pydantic import model_validator
-
 from forward.findings import Finding
 from forward.model import SolveError
 from forward.registry import named
@@ -24,22 +22,20 @@ from uq.estimators.of_draws import findings_of_few
 from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Parallel
-from workflows.config.mistakes import StudyError, refused
-from workflows.config.report import Report
-from workflows.studies.job import ArvizGroups, Job, Texts
+from workflows.config.mistakes import StudyError
+from workflows.studies.job import Job
 from workflows.studies.posteriors import candidate_of, digest_of, draws_in, prior_of, source_blocks, specimens
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator
 
     import xarray as xr
 
+    from forward.scalars import Mistake
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluations
-    from uq.evaluation.tasks import Outcome
     from uq.evaluation.turns import Progress
 
 KEPT = ("model", "data", "method", "candidates", "parameters", "correlations")  # blocks that a posterior depends on
@@ -52,17 +48,11 @@ class PopulationStudy(StudyKind):
     ----------
     method
         What is computed and how.
-    parallel
-        Use of ranks, by specimens that are drawn again.
-    report
-        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "a population"
 
     method: Population
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     @cached_property
     def posteriors(self) -> dict[str, Draws]:
@@ -113,7 +103,7 @@ class PopulationStudy(StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Fit on the first rank, and draw specimens again on all of them where that is needed."""
-        return PopulationJob(self, name, directory)
+        return PopulationJob(self, name, directory, told={"specimens": list(self.posteriors)})
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the parameters, as the study of the specimens has them; none where that is gone."""
@@ -123,31 +113,28 @@ class PopulationStudy(StudyKind):
         by_candidate = hasattr(source, "candidates")
         return source.units_of(candidate_of(self.method.source, self.method.model) if by_candidate else "/")
 
-    def summary(self, job: Job) -> dict[str, Any]:
-        """There is more in results.nc."""
-        return {"specimens": list(self.posteriors)}
-
-    @model_validator(mode="after")
-    def _check(self) -> PopulationStudy:
-        place, source, digest = ("method", "source"), Path(self.method.source), self.method.digest
-        if digest and not source.exists():  # results, which are looked at
-            return self
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what is wrong with the source, which is taken as it was when the study was begun."""
+        method, place = self.method, ("method", "source")
+        if method.digest and not Path(method.source).exists():  # results, which are looked at
+            return
         try:
-            posteriors = self.posteriors
-            Scale.of(self.method.distribution, posteriors)
-            Columns.of(self.method.covariates, list(posteriors)).row(self.method.new)
-            found = digest_of(self.method.source)
+            Scale.of(method.distribution, self.posteriors)
+            Columns.of(method.covariates, list(self.posteriors)).row(method.new)
+            found = digest_of(method.source)
         except (ValueError, StudyError) as error:
-            refused("Population", [(place, str(error), self.method.source)])
-            raise
-        if self.method.study is not None and not Path(self.method.study).is_file():
-            message = "is not there, expected the file of the study that the source is of"
-            refused("Population", [(("method", "study"), message, self.method.study)])
-        if digest and found != digest:
-            message = f"has changed since the study was begun: hash {digest} → {found}"
-            refused("Population", [(place, message, self.method.source)])
-        object.__setattr__(self.method, "digest", found)
-        return self
+            yield place, str(error), method.source
+            return
+        if method.study is not None and not Path(method.study).is_file():
+            yield (
+                ("method", "study"),
+                "is not there, expected the file of the study that the source is of",
+                method.study,
+            )
+        if method.digest and found != method.digest:
+            message = f"has changed since the study was begun: hash {method.digest} → {found}"
+            yield place, message, method.source
+        object.__setattr__(method, "digest", found)
 
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
@@ -207,49 +194,26 @@ def _file(data: dict[str, Any], specimen: str, folder: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class PopulationJob:
+class PopulationJob(Job):
     """The fit of a population on the first rank, and specimens that all ranks draw again.
 
     Attributes
     ----------
     study, name, directory
         The study, its name, and where results go.
-    evaluations
+    solved
         What was solved for specimens, by their names and how often it was.
-    own
-        Processor time (s) of the fit, and of what each specimen took besides its solves.
     """
 
     study: PopulationStudy
     name: str
     directory: Path
-    evaluations: dict[str, Evaluations] = field(default_factory=dict)
-    own: list[float] = field(default_factory=list)
+    solved: dict[str, Evaluations] = field(default_factory=dict)
 
     @property
-    def own_seconds(self) -> float:
-        """Processor time (s) of the fit, and of what each specimen took besides its solves."""
-        return sum(self.own)
-
-    @property
-    def labelled(self) -> Callable[[xr.Dataset], xr.Dataset]:
-        """There is nothing to add."""
-        return lambda found: found
-
-    @property
-    def arviz_groups(self) -> ArvizGroups:
-        """There are none."""
-        return lambda _: {}
-
-    @property
-    def texts(self) -> Texts:
-        """There are none."""
-        return lambda _: {}
-
-    @property
-    def outcomes(self) -> Sequence[Outcome]:
-        """There are no tasks."""
-        return ()
+    def evaluations(self) -> dict[str, Evaluations]:
+        """What was solved for specimens, by their names and how often it was."""
+        return self.solved
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Fit on rank 0; collective over all ranks."""
@@ -292,7 +256,7 @@ class PopulationJob:
     def _keep(self, job: Job, label: str) -> None:
         self.own.append(job.own_seconds)
         for part, found in job.evaluations.items():
-            self.evaluations[label if part == "/" else f"{label}/{part}"] = found
+            self.solved[label if part == "/" else f"{label}/{part}"] = found
 
 
 def _source(study: PopulationStudy) -> StudyKind | None:

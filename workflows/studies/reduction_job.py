@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -74,13 +74,6 @@ class KeptStates:
         return rows
 
 
-@dataclass(frozen=True)
-class ReductionJob(MethodJob):
-    """A job that remembers what it has made."""
-
-    told: dict[str, Any] = field(default_factory=dict)
-
-
 def job(method: Reduce, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, directory: Path) -> Job:
     """Make the body on every group; collective over the group."""
     model = cast("HyperelasticModel", spec.build(ensemble.group, inputs.names))
@@ -104,7 +97,9 @@ def job(method: Reduce, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, dir
         return found
 
     units = {output.name: output.unit for output in spec.returned}
-    return ReductionJob(model, {}, task, recorders, lambda found: label(found, units, None, None, 0), told=told)
+    return MethodJob(
+        model, {}, task, recorders, labelled=lambda found: label(found, units, None, None, 0), told={"reduced": told}
+    )
 
 
 class _Making:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -18,20 +17,19 @@ from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.goal import FEWEST, OF_SOLVER, estimates_for, spare_for
-from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Accuracy, Correlation, Parallel
-from workflows.config.mistakes import refused
+from workflows.config.blocks import Accuracy, Correlation
 from workflows.config.priors import (
     findings_of_draws,
+    inputs_of,
     mistakes_of_draws,
     mistakes_of_materials,
     mistakes_of_parameters,
     ranges,
 )
-from workflows.config.report import Report
-from workflows.config.source import AVERAGED, KEPT, READER, STACKED, Sourced
+from workflows.config.source import AVERAGED, READER, STACKED, Sourced
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluations
-    from uq.inputs.draws import Draws
     from workflows.studies.job import Job
 
 
@@ -65,10 +62,6 @@ class Study(Sourced, StudyKind):
         What is computed and how.
     accuracy
         What is asked of errors beside those of sampling. ``mesh_error`` may stand beside the blocks too.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "one linearisation"
@@ -79,8 +72,6 @@ class Study(Sourced, StudyKind):
     correlations: tuple[Correlation, ...] = ()
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Study:
@@ -95,25 +86,7 @@ class Study(Sourced, StudyKind):
     @property
     def inputs(self) -> Inputs:
         """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
-        pairs = tuple((*c.between, c.value) for c in self.correlations)
-        return Inputs(self._marginals, pairs, draws=self.draws)
-
-    @cached_property
-    def draws(self) -> Draws | None:
-        """Draws of numbers of the model, if there is a source of them."""
-        if self.source is None:
-            return None
-        found: Draws | None = named(f"{READER}:draws_of")(self.source, self.model.scalars)
-        return found
-
-    @property
-    def given(self) -> dict[str, Distribution]:
-        """The distributions by the paths of the numbers that they replace, those of draws too."""
-        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
-
-    @property
-    def _marginals(self) -> dict[str, Distribution]:
-        return self.parameters | dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+        return inputs_of(self.parameters, self.correlations, self.model.coefficients, draws=self.draws)
 
     @cached_property
     def spec(self) -> ModelSpec:
@@ -222,16 +195,6 @@ class Study(Sourced, StudyKind):
         """The model, and those beside it."""
         return self.spec, *self.models.values()
 
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model, and for others that the method asks."""
-        return tuple(dict.fromkeys([*self.model.modules, *(one for other in self._others() for one in other.modules)]))
-
-    def _others(self) -> Iterator[ModelSpec]:
-        """Models beside that of the study; none where they cannot be."""
-        with suppress(ModelError, ValidationError):
-            yield from self.models.values()
-
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
         lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, rank_groups)
@@ -263,10 +226,6 @@ class Study(Sourced, StudyKind):
         made: Job = named("workflows.studies.sampling_job:job")(self, ensemble, directory)
         return made
 
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the random parameters."""
-        return self.inputs.names
-
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add how the stability of each sample was tested."""
         with_stability = named("workflows.studies.sampling_job:with_stability")
@@ -287,23 +246,7 @@ class Study(Sourced, StudyKind):
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
         others = {name: other.identity() for name, other in self.models.items()}
-        beside = {"models": others} if others else {}
-        return super().identity() | {"model": self.model.identity()} | beside | self._source_identity
-
-    @property
-    def _source_identity(self) -> dict[str, Any]:
-        return {} if self.source is None else {"parameters": {"from": self.source.digest, **self._written}}
-
-    @property
-    def _written(self) -> dict[str, Any]:
-        return {path: one.model_dump(mode="json") for path, one in self.parameters.items()}
-
-    @property
-    def beside(self) -> Mapping[str, bytes]:
-        """The draws, as they were read."""
-        if self.source is None or self.source.model in (AVERAGED, STACKED):
-            return {}
-        return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
+        return super().identity() | self.by_contents | ({"models": others} if others else {})
 
     @model_validator(mode="before")
     @classmethod
@@ -325,12 +268,8 @@ class Study(Sourced, StudyKind):
         rest = {name: block for name, block in value.items() if name != "mesh_error"}
         return rest | {"accuracy": accuracy | {"mesh_error": value["mesh_error"]}}
 
-    @model_validator(mode="after")
-    def _check(self) -> Study:
-        refused("Study", list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if self.source is not None:
             wrong = list(named(f"{READER}:mistakes")(self.source, self.model, tuple(self.parameters)))
             yield from wrong
@@ -345,10 +284,8 @@ class Study(Sourced, StudyKind):
             yield from named(f"{OF_TOLERANCE}:mistakes")(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
-        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
-            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
-            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
-        inputs = Inputs(self._marginals)
+        yield from self.mistakes_of_ranks(self.spec)
+        inputs = inputs_of(self.parameters, (), self.model.coefficients)
         try:
             inputs = self.inputs
         except ValueError as error:
@@ -371,7 +308,7 @@ class Study(Sourced, StudyKind):
 
     def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         spec = self.spec
-        if not self.given and not self._marginals:
+        if not self.given and not self.model.coefficients:
             or_field = ", or one of model.fields" if spec.meshed else ""
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         materials = spec.materials(self.parameters)

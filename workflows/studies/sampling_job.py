@@ -81,7 +81,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
                 add(found, *of_answers(function, inputs, own))
             return found
 
-        return MethodJob(function, others, task, recorders, described)
+        return MethodJob(function, others, task, recorders, labelled=described)
 
     model = cast("HyperelasticModel", function)
     # Rank 0 may leave the task by an exception: nothing collective may follow it.
@@ -108,7 +108,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         others,
         task,
         recorders,
-        labelled,
+        labelled=labelled,
         node_volumes=volumes,
         estimates=estimates,
         meshes_before=before,

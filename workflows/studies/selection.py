@@ -23,10 +23,9 @@ from inverse.criticism.comparison import Candidate, Data
 from inverse.methods.selection import Select
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import StudyError, not_installed, refused
-from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
-from workflows.config.report import Report
+from workflows.config.blocks import Correlation
+from workflows.config.mistakes import StudyError, not_installed
+from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_factor, mistakes_of_materials
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
 from workflows.studies.study import StudyKind
 
@@ -70,8 +69,7 @@ class CandidateModel(Settings):
     @property
     def inputs(self) -> Inputs:
         """The random constants."""
-        pairs = tuple((*c.between, c.value) for c in self.correlations)
-        return Inputs(self.parameters, pairs, self.materials)
+        return inputs_of(self.parameters, self.correlations, materials=self.materials)
 
     @property
     def materials(self) -> Materials:
@@ -136,8 +134,6 @@ class Comparison(StudyKind):
     data: Any
     candidates: Mapping[str, Any]
     method: Select
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     @property
     def seconds_of_solves(self) -> float:
@@ -320,18 +316,12 @@ class Selection(Comparison):
         Tests that are predicted besides the measured ones, in every group.
     method
         How the candidates are compared.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     data: Measurements
     candidates: dict[str, CandidateModel] = Field(min_length=1)
     predict: tuple[MaterialTest, ...] = ()
     method: Select
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     data_in_file: ClassVar[tuple[type[Settings], ...]] = (DataFile,)
     costly: ClassVar[bool] = False
@@ -392,12 +382,8 @@ class Selection(Comparison):
     def _tests(self, group: str) -> list[MaterialTest]:
         return [*self._measured(group), *self.predict]
 
-    @model_validator(mode="after")
-    def _check(self) -> Selection:
-        refused("Selection", list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         for group in self.data.data_groups:
             labels = [test.label for test in self._tests(group)]
             twice = next((label for label in labels if labels.count(label) > 1), None)

@@ -91,7 +91,7 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         others | finer_ones | moved_ones,
         task,
         recorders,
-        labelled,
+        labelled=labelled,
         arviz_groups=partial(arviz_groups, study),
         costly=study.costly,
         passing=frozenset(finer_ones),

@@ -7,24 +7,28 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
+from pydantic import Field, model_validator
+
 from forward.registry import Kinds, named
 from forward.settings import Settings
+from workflows.config.blocks import Parallel
+from workflows.config.mistakes import refused
+from workflows.config.report import Report
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.findings import Finding
+    from forward.scalars import Mistake
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluations
     from uq.inputs.random_parameters import Inputs
-    from workflows.config.blocks import Parallel
-    from workflows.config.report import Report
     from workflows.studies.job import Job
 
 SAMPLING = "sampling"  # the kind of study whose methods solve at points
-WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
+WITHOUT_EFFECT = ("parallel", "report")  # blocks that results do not depend on
 
 
 class Sampled(NamedTuple):
@@ -54,19 +58,14 @@ class StudyKind(Settings):
     stopped: ClassVar[str] = ""
     explains: ClassVar[bool] = True
 
-    if TYPE_CHECKING:  # fields of every kind
+    parallel: Parallel = Field(default=Parallel(), description="Use of ranks.")
+    report: Report | None = Field(default=None, description="Your own sections of the report.")
+
+    if TYPE_CHECKING:  # a field of every kind
 
         @property
         def method(self) -> Any:
             """What is computed and how: a block with a kind."""
-
-        @property
-        def parallel(self) -> Parallel:
-            """Use of ranks."""
-
-        @property
-        def report(self) -> Report | None:
-            """What the report shows besides the usual sections."""
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
@@ -85,6 +84,21 @@ class StudyKind(Settings):
     def forms(cls) -> Iterator[type[StudyKind]]:
         """Go through the classes that files of this kind are read as."""
         yield cls
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refused(type(self).__name__, list(self.mistakes()))
+        return self
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what is wrong with the blocks together, each of which is right by itself."""
+        yield from ()
+
+    def mistakes_of_ranks(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find that several ranks are asked to share a model that cannot be shared."""
+        if self.parallel.ranks_per_model > 1 and not spec.shareable:
+            message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
 
     @property
     @abstractmethod
@@ -127,7 +141,7 @@ class StudyKind(Settings):
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for its models."""
-        return ()
+        return tuple(dict.fromkeys(module for spec in self.specs for module in spec.modules))
 
     @abstractmethod
     def plan(self, rank_groups: int) -> list[str]:
@@ -146,9 +160,14 @@ class StudyKind(Settings):
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make what the ranks work on; collective."""
 
-    @abstractmethod
+    @property
+    def inputs(self) -> Inputs:
+        """The random or unknown parameters, where the study has one model."""
+        raise NotImplementedError
+
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters of evaluations, by the name under which these are stored."""
+        return self.inputs.names
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of numbers of the model of these evaluations, by their paths."""
@@ -170,7 +189,7 @@ class StudyKind(Settings):
 
     def summary(self, job: Job) -> dict[str, Any]:
         """Return the part of summary.json that is specific to this kind."""
-        return {}
+        return job.told
 
     @property
     def beside(self) -> Mapping[str, bytes]:

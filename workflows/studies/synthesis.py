@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.registry import named
 from forward.scalars import Mistake
@@ -15,12 +15,10 @@ from forward.spec import MEASURED, ModelSpec
 from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
-from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.mistakes import refused
-from workflows.config.priors import mistakes_of_priors, ranges
-from workflows.config.report import Report
+from workflows.config.blocks import Correlation
+from workflows.config.priors import inputs_of, mistakes_of_priors, ranges
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
@@ -49,10 +47,6 @@ class Synthesis(StudyKind):
         Correlations between them.
     method
         Errors, and the points that data sets have.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "all data made"
@@ -62,8 +56,6 @@ class Synthesis(StudyKind):
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Synthesize
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
     @cached_property
     def spec(self) -> ModelSpec:
@@ -73,8 +65,7 @@ class Synthesis(StudyKind):
     @cached_property
     def inputs(self) -> Inputs:
         """What is drawn for each data set."""
-        standard = dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
-        return Inputs(self.parameters | standard, tuple((*c.between, c.value) for c in self.correlations))
+        return inputs_of(self.parameters, self.correlations, self.model.coefficients)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -87,18 +78,9 @@ class Synthesis(StudyKind):
         return (self.spec,)
 
     @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model."""
-        return self.model.modules
-
-    @property
     def planned(self) -> int:
         """Number of solves."""
         return len(self.method.fraction) + 1
-
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of what is drawn."""
-        return self.inputs.names
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is made, and how long that will take."""
@@ -129,14 +111,10 @@ class Synthesis(StudyKind):
         def texts(found: xr.Dataset) -> dict[str, str]:
             return {f"data/{file}": text for file, text in made.files(name, found).items()}
 
-        return MethodJob(made.model, {}, task, recorders, made.labelled, texts=texts)
+        return MethodJob(made.model, {}, task, recorders, labelled=made.labelled, texts=texts)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refused(type(self).__name__, list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
         if isinstance(self.model, Specimen):
             yield from self._mistakes_of_specimen(self.model)
         yield from self.model.mistakes_of_mesh()
