@@ -27,7 +27,7 @@ from workflows.config.study import parse
 from workflows.report import plots
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
-from workflows.studies.findings_selection import findings
+from workflows.studies.selection_results import findings
 
 STUDY = """
 [data]

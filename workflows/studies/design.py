@@ -1,4 +1,4 @@
-"""Studies that say which observations to make: of those that a model could be given, the ones that tell most."""
+"""Studies that say which observations to make: those that tell most on a model, or tell candidate models apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_draws, mistakes_of_priors, ranges
 from workflows.config.source import AVERAGED, READER, Sourced
-from workflows.studies.design_values import mistakes
+from workflows.studies.candidates import ModelCandidate, OfCandidates
+from workflows.studies.design_job import job, job_of_models
+from workflows.studies.design_job import mistakes as mistakes_of_values
 from workflows.studies.inversion_plan import PRODUCT
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
@@ -99,14 +101,13 @@ class DesignStudy(Sourced, StudyKind):
     def forms(cls) -> Iterator[type[StudyKind]]:
         """One model, and several to be told apart."""
         yield DesignStudy
-        yield named("workflows.studies.design_of_models:DesignOfModels")
+        yield DesignOfModels
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> StudyKind:  # type: ignore[override]
         """Check the blocks of a design for one model, or for telling several apart."""
         if "candidates" in blocks:
-            of_models: type[StudyKind] = named("workflows.studies.design_of_models:DesignOfModels")
-            return of_models.model_validate(blocks)
+            return DesignOfModels.model_validate(blocks)
         return cls.model_validate(blocks)
 
     def plan(self, rank_groups: int) -> list[str]:
@@ -128,9 +129,7 @@ class DesignStudy(Sourced, StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model; collective."""
-        make = named("workflows.studies.design_job:job")
-        found: Job = make(self.method, self.spec, self.inputs, ensemble, checkpoint, field=self.field)
-        return found
+        return job(self.method, self.spec, self.inputs, ensemble, checkpoint, field=self.field)
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -163,4 +162,70 @@ class DesignStudy(Sourced, StudyKind):
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         if self.draws is not None:
             yield from mistakes_of_draws(self.model.scalars, self.draws, (), self.model.unavailable)
-        yield from mistakes(self.method, self.model)
+        yield from mistakes_of_values(self.method, self.model)
+
+
+class DesignOfModels(OfCandidates, StudyKind):
+    """What could be observed, and the models that it should tell apart.
+
+    Parameters
+    ----------
+    model
+        What is measured, as far as the candidates have it in common; see `DesignStudy`.
+    candidates
+        Models by name, as of a comparison.
+    method
+        What is chosen and how.
+    """
+
+    stopped: ClassVar[str] = "a design"
+    explains: ClassVar[bool] = False
+
+    candidates: dict[str, ModelCandidate] = Field(min_length=2)
+    method: Design
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The models of all candidates."""
+        return tuple(self.of_candidates.values())
+
+    @property
+    def planned(self) -> int:
+        """Number of solves: one for each draw of each candidate."""
+        return self.method.draws * len(self.candidates)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about the models before anything is solved, each once."""
+        return tuple(dict.fromkeys(self.findings_of_models))
+
+    def plan(self, rank_groups: int) -> list[str]:
+        """Say what can be chosen to tell what apart, and how long that will take."""
+        costs = [spec.cost() for spec in self.specs]
+        seconds = self.method.draws * sum(cost.textbook for cost in costs if cost is not None)
+        return [
+            f"method      {self.method.kind}, criterion {self.method.criterion}",
+            *(f"candidate   {name}: {spec.description}" for name, spec in self.of_candidates.items()),
+            f"chosen      {self.method.wanted}",
+            f"solves      {self.planned}",
+            *([] if None in costs else [f"time        about {duration(seconds)} on 1 core (rough)"]),
+        ]
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the models; collective."""
+        weights = {name: one.weight for name, one in self.candidates.items()}
+        return job_of_models(self.method, self.of_candidates, self.priors, weights, ensemble)
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
+        if self.method.criterion != "models":
+            yield ("method", "criterion"), "there are candidates, expected 'models'", self.method.criterion
+        first = True
+        for _, spec, wrong in self.models_and_mistakes():
+            yield from wrong
+            if spec is None:
+                continue
+            if first:  # which the others are observed like
+                yield from mistakes_of_values(self.method, spec)
+                first = False
+            yield from self.mistakes_of_ranks(spec)

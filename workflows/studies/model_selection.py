@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BeforeValidator, ValidationError, model_validator
 
 from forward.fem.finer import finer
 from forward.findings import Finding
 from forward.model import ForwardModel
 from forward.scalars import Mistake
 from forward.settings import Settings, one_line
-from forward.spec import MEASURED, SPECIMEN, ModelSpec, usual_kind
+from forward.spec import SPECIMEN, ModelSpec, usual_kind
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Candidate, Data
 from inverse.criticism.doubts_of_meshes import not_estimable
 from inverse.methods.selection import SelectSpecimens
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.config.priors import ranges
+from workflows.studies.candidates import OfCandidates, changed, spec_of
+from workflows.studies.findings_solves import of_answers
 from workflows.studies.listed_displacements import ListedDisplacements
 from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE
-from workflows.studies.measured import Positive, as_block, data_as
+from workflows.studies.measured import as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison
 
@@ -37,51 +35,9 @@ if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
 
 SECONDS = 1e-3  # of a solve about which nothing is known
-_SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
 
 
-class ModelCandidate(Settings):
-    """A candidate model, with its prior.
-
-    Parameters
-    ----------
-    model
-        What it changes of the model: blocks and values that replace those there; a block with a kind replaces the whole
-        block.
-    parameters
-        Priors by the paths of the numbers that vary.
-    correlations
-        Correlations between them.
-    weight
-        Its probability before the data, up to a common factor.
-    """
-
-    model: dict[str, Any] = Field(default={})
-    parameters: dict[str, Distribution] = Field(min_length=1)
-    correlations: tuple[Correlation, ...] = ()
-    weight: Positive = 1.0
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random parameters."""
-        return inputs_of(self.parameters, self.correlations)
-
-    def restricted(self, spec: ModelSpec) -> Inputs:
-        """The random parameters, restricted to those that make materials, where there are some."""
-        materials = spec.materials(self.inputs.names)
-        return self.inputs if materials is None else self.inputs.within(materials)
-
-    def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of the priors does not fit the model."""
-        materials = spec.materials(self.parameters)
-        constants = () if materials is None else materials.names
-        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
-        if materials is not None and all(path in spec.scalars for path in self.parameters):
-            with suppress(ValueError):  # correlations, which are reported elsewhere
-                yield from mistakes_of_materials(self.restricted(spec), materials)
-
-
-class ModelSelection(Comparison):
+class ModelSelection(OfCandidates, Comparison):
     """What to compare: candidates change one model, and all are observed in the same way.
 
     Parameters
@@ -96,9 +52,7 @@ class ModelSelection(Comparison):
         How the candidates are compared.
     """
 
-    model: dict[str, Any]
     data: Annotated[ListedDisplacements | ListedOutputs, BeforeValidator(as_block)]
-    candidates: dict[str, ModelCandidate] = Field(min_length=1)
     method: SelectSpecimens
 
     costly: ClassVar[bool] = True
@@ -192,12 +146,7 @@ class ModelSelection(Comparison):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the models before anything is solved, each once."""
-        of_models = (
-            finding
-            for name, one in self.of_candidates.items()
-            for finding in one.findings_over(ranges(self.candidates[name].parameters))
-        )
-        return tuple(dict.fromkeys([*of_models, *super().findings, *self._of_outputs()]))
+        return tuple(dict.fromkeys([*self.findings_of_models, *super().findings, *self._of_outputs()]))
 
     def _of_outputs(self) -> Iterator[Finding]:
         """Say of which measured outputs nothing tells the error of the mesh."""
@@ -208,10 +157,7 @@ class ModelSelection(Comparison):
     @property
     def models(self) -> dict[str, Candidate]:
         """The candidates as the method needs them."""
-        return {
-            name: Candidate(candidate.restricted(self.of_candidates[name]), candidate.weight)
-            for name, candidate in self.candidates.items()
-        }
+        return {name: Candidate(inputs, self.candidates[name].weight) for name, inputs in self.priors.items()}
 
     @property
     def group_names(self) -> tuple[str, ...]:
@@ -263,13 +209,15 @@ class ModelSelection(Comparison):
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
         return self.data.shared(self.of_candidates[name])
 
-    def moved(self, model: ForwardModel, motion: SharedMotion) -> ForwardModel:
+    def moved(self, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
         """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
-        return cast("SpecimenModel", model).observing(*motion.observed)  # type: ignore[arg-type]
+        return cast("SpecimenModel", make()).observing(*motion.observed)  # type: ignore[arg-type]
 
-    def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of a candidate's model."""
-        return {path: number.unit for path, number in self.of_candidates[label.partition("/")[0]].scalars.items()}
+    def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
+        """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
+        if self.of_candidates[name].shareable:
+            return []
+        return [one.of(f"Candidate '{name}'") for one in of_answers(make(), self.candidates[name].inputs)]
 
     @model_validator(mode="before")
     @classmethod
@@ -282,22 +230,14 @@ class ModelSelection(Comparison):
         if isinstance(self.data, ListedDisplacements) and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
             yield ("method", "check"), message, self.method.check
-        for place, spec, mistakes in described(self.candidates, self.model, spec_of):
+        for place, spec, mistakes in self.models_and_mistakes():
             yield from mistakes
             if spec is None:
                 continue
-            if spec.coefficients:
-                message = "random fields, expected numbers only: evidences are of few parameters"
-                yield (*place, "model", "fields"), message, len(spec.coefficients)
             for where, message, given in self.data.unobserved(spec):
                 yield (*place, "model", *where), message, given
             yield from self.mistakes_of_ranks(spec)
         yield from self.mistakes_of_method()
-
-
-def spec_of(block: Mapping[str, Any]) -> ModelSpec:
-    """Return the model that a block describes; a ValidationError for mistakes in it."""
-    return _SPEC.validate_python(dict(block))
 
 
 def block_of(model: Any) -> type[ListedDisplacements | ListedOutputs]:
@@ -309,32 +249,4 @@ def _bytes(specs: Iterable[Any]) -> float:
     found = 0.0
     for cost in (one.cost() for one in specs):
         found += 0.0 if cost is None else cost.bytes
-    return found
-
-
-def described(
-    candidates: Mapping[str, ModelCandidate],
-    block: Mapping[str, Any],
-    make: Callable[[Mapping[str, Any]], ModelSpec],
-) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
-    """Find the place of each candidate in a study, its model (None if it is none), and what is wrong with it."""
-    for name, candidate in candidates.items():
-        place = ("candidates", name)
-        try:
-            spec = make(changed(block, candidate.model))
-        except ValidationError as error:
-            lines = error.errors(include_url=False)
-            yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
-            continue
-        found = (*candidate.mistakes(spec), *spec.mistakes_of_mesh())
-        yield place, spec, [((*place, *where), message, given) for where, message, given in found]
-
-
-def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a block with changed values; a block with a kind replaces what was there."""
-    found = dict(block)
-    for key, value in changes.items():
-        here = found.get(key)
-        inside = isinstance(value, Mapping) and isinstance(here, Mapping) and "kind" not in value
-        found[key] = changed(here, value) if inside else value  # type: ignore[arg-type]
     return found

@@ -3,127 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from forward.bodies.geometry import Vector
 from forward.findings import Finding
-from forward.materials.admissible import Materials
-from forward.materials.material import MATERIALS, constants, incompressible, of_volume, units
+from forward.materials.material import units
 from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
 from forward.model import ForwardModel
-from forward.registry import KindError, named
+from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
-from inverse.criticism.assessment import NEEDED
+from inverse.criticism.assessment import NEEDED, own_seconds
 from inverse.criticism.comparison import Candidate, Data
+from inverse.criticism.finer import Finer
 from inverse.methods.selection import Select
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate
+from uq.findings import add
 from workflows.config.mistakes import StudyError, not_installed
-from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_factor, mistakes_of_materials
+from workflows.config.priors import findings_of_materials, mistakes_of_factor
+from workflows.studies import selection_results as results
+from workflows.studies.candidates import CandidateModel
+from workflows.studies.finer import FINER, once_on_finer_meshes, solved_by
+from workflows.studies.job import MOVED, MethodJob
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
+from workflows.studies.predictions import NOT_ASKED, duration
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from inverse.data.shared_motion import SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from workflows.studies.job import Job
 
 OF_MODELS = "workflows.studies.model_selection:ModelSelection"
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 
 
-class CandidateModel(Settings):
-    """A candidate material with its prior.
-
-    Parameters
-    ----------
-    material
-        Its kind, and the constants that do not vary; without those of the volume (D1) an energy is
-        incompressible. Fibres, where it has them, by their components along the first stretch, along the second one and
-        across both.
-    parameters
-        Priors of the constants that do.
-    correlations
-        Correlations between them.
-    weight
-        Its probability before the data, up to a common factor.
-    """
-
-    material: dict[str, float | str | tuple[Vector, ...]]
-    parameters: dict[str, Distribution] = Field(min_length=1)
-    correlations: tuple[Correlation, ...] = ()
-    weight: Annotated[float, Field(gt=0)] = 1.0
-
-    @property
-    def kind(self) -> str:
-        """Kind of the material."""
-        return str(self.material["kind"])
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random constants."""
-        return inputs_of(self.parameters, self.correlations, materials=self.materials)
-
-    @property
-    def materials(self) -> Materials:
-        """The material as a function of the random constants."""
-        return Materials(self.kind, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
-
-    @property
-    def fixed(self) -> dict[str, float]:
-        """Constants that do not vary."""
-        return {name: value for name, value in self.material.items() if isinstance(value, float)}
-
-    @property
-    def fibres(self) -> tuple[Vector, ...]:
-        """Directions of the families of fibres."""
-        return tuple(self.material.get("fibres", ()))  # type: ignore[arg-type]
-
-    @model_validator(mode="after")
-    def _check(self) -> CandidateModel:
-        kind = self.material.get("kind")
-        if kind is None:
-            message = "material.kind: missing"
-            raise ValueError(message)
-        try:
-            MATERIALS[str(kind)]
-        except KindError as error:
-            message = f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
-            raise ValueError(message) from None
-        numbers = {name for name, value in self.material.items() if isinstance(value, float)}
-        words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
-        if words:
-            message = f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
-            raise ValueError(message)
-        known = constants(self.kind)
-        given = dict.fromkeys([*self.fixed, *self.parameters])
-        for name in given:
-            if name not in known:
-                message = f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
-                raise ValueError(message)
-            if name in self.fixed and name in self.parameters:
-                message = f"'{name}' is given in material and in parameters, expected one of them"
-                raise ValueError(message)
-        left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
-        missing = [name for name in known if name not in given and name not in left_out]
-        if missing:
-            message = f"missing: {', '.join(missing)}, expected in material or parameters"
-            raise ValueError(message)
-        try:
-            wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
-        except ValueError:  # correlations, which are reported elsewhere
-            return self
-        if wrong is not None:
-            message = f"parameters {', '.join(wrong[2])}: {wrong[1]}"
-            raise ValueError(message)
-        return self
+# What data of a quantity are called, and what they are of.
+DATA = {
+    "stress": ("stresses", "tests"),
+    "displacement": ("displacements", "load cases"),
+    "output": ("values", "outputs"),
+}
 
 
 class Comparison(StudyKind):
@@ -169,27 +96,19 @@ class Comparison(StudyKind):
         """Make the model of a candidate in a group on a communicator; collective."""
         raise NotImplementedError
 
-    def build_finer(self, name: str, make: Callable[[], ForwardModel], comm: Any = None) -> ForwardModel:
-        """Make a candidate's model on a finer mesh, if it is checked there (see `unchecked`); collective.
-
-        Parameters
-        ----------
-        name
-            Of the candidate.
-        make
-            Makes its model, or returns the one that was made before.
-        comm
-            As of `build`.
-        """
-        from workflows.studies.finer import once_on_finer_meshes
-
+    def build_finer(self, name: str, make: Callable[[], ForwardModel]) -> ForwardModel:
+        """Make a candidate's model, which `make` returns, on a finer mesh, if it is checked there; collective."""
         return once_on_finer_meshes(make, self.models[name].inputs.mean)
 
     def shared(self, name: str, group: str) -> SharedMotion | None:
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
         return None
 
-    def moved(self, model: ForwardModel, motion: SharedMotion) -> ForwardModel:
+    def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
+        """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
+        return []
+
+    def moved(self, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
         """Return the model, given that of a candidate, that tells what they are; collective."""
         raise NotImplementedError
 
@@ -259,13 +178,99 @@ class Comparison(StudyKind):
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""
-        lines: list[str] = named("workflows.studies.selection_plan:plan")(self)
-        return lines
+        method = self.method
+        evidences = self.evidences
+        sizes = {group: one.values.size for group, one in self.data_groups.items()}
+        own = sum(
+            own_seconds(len(self.candidates[name].parameters), sizes[group], method.samples)
+            for name, group in self.pairs
+        )
+        seconds = self.seconds_of_solves + own * evidences / len(self.pairs)
+        if method.chains == "hmc":
+            seconds += len(self.pairs) * own_seconds(0, 0, 0, "hmc")
+        meshes = self.mesh_checks
+        if self.unchecked and method.treatment is None:
+            meshes = [(0.0, NOT_ASKED)]
+        seconds += sum(once for once, _ in meshes)
+        check = " and nested sampling, which takes minutes" if method.check else ""
+        data = self.data_groups.values()
+        tests = sum(len(self.tests(group)) for group in self.group_names)
+        among = f" in {len(data)} groups" if len(data) > 1 else ""
+        kind, parts = DATA[self.data.quantity]
+        count = f"{sum(one.values.size for one in data)} {kind} of {tests} {parts}"
+        return [
+            f"method      {method.kind}",
+            f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in self.candidates.items())}",
+            f"data        {count}{among}",
+            f"evidences   {evidences}{check}",
+            *(f"mesh check  {words}" for words in dict.fromkeys(words for _, words in meshes)),
+            f"solves      about {self.planned:,}",
+            f"time        about {duration(seconds)} on 1 core (rough)",
+        ]
 
-    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
         """Make the candidates, each for each group of data; collective."""
-        made: Job = named("workflows.studies.selection_job:job")(self, ensemble)
-        return made
+        makers = {pair: cache(partial(self.build, *pair, ensemble.group)) for pair in self.pairs}
+        recorders: dict[str, Recorder] = {}
+        why = self.unchecked
+        checked = [pair for pair in self.pairs if not why.get(pair[0], "none")]
+
+        motions = {pair: found for pair in self.pairs if (found := self.shared(*pair)) is not None}
+
+        def task(evaluate: Evaluate) -> xr.Dataset:
+            moved = {pair: evaluate.on(f"{'/'.join(pair)}/{MOVED}") for pair in motions}
+            shared = {pair: motion.errors_by(moved[pair]) for pair, motion in motions.items()}
+
+            def recorded(name: str, group: str) -> Evaluate:
+                recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
+                return recorders[f"{name}/{group}"]
+
+            def free(name: str, group: str) -> Evaluate:
+                # What nested sampling solves is too much, and too cheap, to keep.
+                return SerialEvaluate(self.build(name, group), ensemble.count)
+
+            def finer(name: str, group: str) -> Finer:
+                if (name, group) not in checked:
+                    return Finer(None, why[name])
+                return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
+
+            look = finer if why else None
+
+            def itself(name: str, group: str) -> ForwardModel:
+                return makers[name, group]()
+
+            method = self.method
+            return method.run(self.models, self.data_groups, recorded, free, look, ensemble.say, shared or None, itself)
+
+        def labelled(found: xr.Dataset) -> xr.Dataset:
+            found = found.assign_attrs(quantity=self.data.quantity)
+            if "mesh_checked" in found:
+                of_files = [str(name) in self.of_files for name in found.model.values]
+                found = found.assign(mesh_of_file=("model", of_files))
+            candidates = {name: candidate.inputs for name, candidate in self.candidates.items()}
+            units = {name: self.units_of(name) for name in candidates}
+            doubts = results.doubts_of_selection(found, candidates, self.method.noise.factor, units)
+            wrong = {name: self.contradictions(name, make) for (name, _), make in makers.items()}
+            of_wrong = [name for name, several in wrong.items() if several]
+            judged = results.trusted_on_meshes(results.with_right_derivatives(found, of_wrong))
+            add(judged, *results.findings(found), *results.untrusted(found, judged, of_wrong), *doubts)
+            add(judged, *(one for several in wrong.values() for one in several))
+            return judged
+
+        others: dict[str, Callable[[], ForwardModel]] = {"/".join(pair): make for pair, make in makers.items()}
+        finer_ones = {f"{n}/{g}/{FINER}": partial(self.build_finer, n, makers[n, g]) for n, g in checked}
+        moved_ones = {f"{n}/{g}/{MOVED}": partial(self.moved, makers[n, g], one) for (n, g), one in motions.items()}
+        first = makers[self.pairs[0]]()
+        return MethodJob(
+            first,
+            others | finer_ones | moved_ones,
+            task,
+            recorders,
+            labelled=labelled,
+            arviz_groups=partial(results.arviz_groups, self.models, self.method.noise.factor, self.method.seed),
+            costly=self.costly,
+            passing=frozenset(finer_ones),
+        )
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters of a candidate."""

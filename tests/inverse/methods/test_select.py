@@ -32,8 +32,8 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.run.plan import plan
 from workflows.starter import starter
-from workflows.studies.findings_selection import doubts_of_selection, findings, grade, untrusted
 from workflows.studies.material_tests import MeasuredTest
+from workflows.studies.selection_results import doubts_of_selection, findings, grade, untrusted
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")

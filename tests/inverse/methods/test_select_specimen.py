@@ -29,10 +29,10 @@ from workflows.config.study import dump, load, parse
 from workflows.report.sections.errors import finer_mesh_table as meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
-from workflows.studies.findings_selection import doubts_of_selection, trusted_on_meshes
 from workflows.studies.finer import solved_on
 from workflows.studies.model_selection import ModelSelection
 from workflows.studies.predictions import meshes_of
+from workflows.studies.selection_results import doubts_of_selection, trusted_on_meshes
 
 pytestmark = pytest.mark.fem
 STUDY = """
@@ -130,7 +130,7 @@ def test_motions_that_are_uncertain_are_integrated_out(study):
     data = it.data_groups["all"]
     model, motion = it.build("right", "all", MPI.COMM_SELF), it.shared("right", "all")
     mode = found["constant_mode"].values[0, 0, :1]
-    G = motion.errors_by(SerialEvaluate(it.moved(model, motion)))(mode)
+    G = motion.errors_by(SerialEvaluate(it.moved(lambda: model, motion)))(mode)
     assert G.shape == (6, len(data.values))
     law = multivariate_normal(np.zeros(len(data.values)), np.diag(data.sigma**2) + G.T @ G)
     grid, prior = np.arange(-2.4, 0.7, 0.08), LogNormal(mean=1.2e4, std=4e3)

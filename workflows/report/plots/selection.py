@@ -12,7 +12,7 @@ from forward.readable import percent
 from forward.words import named, with_error
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, text_of
 from workflows.report.plots.pairs import pairs
-from workflows.studies.findings_selection import by_probability, ranking
+from workflows.studies.selection_results import by_probability, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -22,7 +22,7 @@ from workflows.report.sections.posterior import measured_kind
 from workflows.report.sections.reduced import card as reduced
 from workflows.report.small_density import CURVE, curve_of, smooth
 from workflows.studies.findings_inversion import NEITHER
-from workflows.studies.findings_selection import bayes_factor, by_probability, grade
+from workflows.studies.selection_results import bayes_factor, by_probability, grade
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,7 +13,7 @@ from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Te
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
 from workflows.report.section import Results, Section, written
-from workflows.studies.findings_selection import by_probability, chance, conflicts, ranking
+from workflows.studies.selection_results import by_probability, chance, conflicts, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,7 +15,7 @@ from workflows.report.blocks import Block, Folded, Heading, Picture, Pictures, T
 from workflows.report.plots import selection as selection_plots
 from workflows.report.plots.averaged import within_and_between
 from workflows.report.section import Results, Section, written
-from workflows.studies.findings_selection import bayes_factor, grade, ranking
+from workflows.studies.selection_results import bayes_factor, grade, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -1,0 +1,218 @@
+"""Candidates of comparisons and designs: materials, or what each changes of one model, with their priors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+
+from forward.bodies.geometry import Vector
+from forward.materials.admissible import Materials
+from forward.materials.material import MATERIALS, constants, incompressible, of_volume
+from forward.registry import KindError
+from forward.scalars import Mistake
+from forward.settings import Settings, nearest, shown
+from forward.spec import MEASURED, ModelSpec
+from uq.inputs.distributions import Distribution
+from uq.inputs.random_parameters import Inputs
+from workflows.config.blocks import Correlation
+from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
+
+if TYPE_CHECKING:
+    from forward.findings import Finding
+
+_SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
+
+
+class CandidateBlock(Settings):
+    """What is known of a candidate before the data."""
+
+    parameters: dict[str, Distribution] = Field(
+        min_length=1, description="Priors of the numbers that vary: constants of a material by name, others by path."
+    )
+    correlations: tuple[Correlation, ...] = Field(default=(), description="Correlations between them.")
+    weight: float = Field(default=1.0, gt=0, description="Its probability before the data, up to a common factor.")
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random parameters."""
+        return inputs_of(self.parameters, self.correlations)
+
+
+class CandidateModel(CandidateBlock):
+    """A candidate material with its prior.
+
+    Parameters
+    ----------
+    material
+        Its kind, and the constants that do not vary; without those of the volume (D1) an energy is
+        incompressible. Fibres, where it has them, by their components along the first stretch, along the second one and
+        across both.
+    """
+
+    material: dict[str, float | str | tuple[Vector, ...]]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the material."""
+        return str(self.material["kind"])
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random constants."""
+        return inputs_of(self.parameters, self.correlations, materials=self.materials)
+
+    @property
+    def materials(self) -> Materials:
+        """The material as a function of the random constants."""
+        return Materials(self.kind, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Constants that do not vary."""
+        return {name: value for name, value in self.material.items() if isinstance(value, float)}
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Directions of the families of fibres."""
+        return tuple(self.material.get("fibres", ()))  # type: ignore[arg-type]
+
+    @model_validator(mode="after")
+    def _check(self) -> CandidateModel:
+        kind = self.material.get("kind")
+        if kind is None:
+            message = "material.kind: missing"
+            raise ValueError(message)
+        try:
+            MATERIALS[str(kind)]
+        except KindError as error:
+            message = f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
+            raise ValueError(message) from None
+        numbers = {name for name, value in self.material.items() if isinstance(value, float)}
+        words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
+        if words:
+            message = f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
+            raise ValueError(message)
+        known = constants(self.kind)
+        given = dict.fromkeys([*self.fixed, *self.parameters])
+        for name in given:
+            if name not in known:
+                message = f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+                raise ValueError(message)
+            if name in self.fixed and name in self.parameters:
+                message = f"'{name}' is given in material and in parameters, expected one of them"
+                raise ValueError(message)
+        left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
+        missing = [name for name in known if name not in given and name not in left_out]
+        if missing:
+            message = f"missing: {', '.join(missing)}, expected in material or parameters"
+            raise ValueError(message)
+        try:
+            wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
+        except ValueError:  # correlations, which are reported elsewhere
+            return self
+        if wrong is not None:
+            message = f"parameters {', '.join(wrong[2])}: {wrong[1]}"
+            raise ValueError(message)
+        return self
+
+
+class ModelCandidate(CandidateBlock):
+    """A candidate model, with its prior.
+
+    Parameters
+    ----------
+    model
+        What it changes of the model: blocks and values that replace those there; a block with a kind replaces the whole
+        block.
+    """
+
+    model: dict[str, Any] = Field(default={})
+
+    def restricted(self, spec: ModelSpec) -> Inputs:
+        """The random parameters, restricted to those that make materials, where there are some."""
+        materials = spec.materials(self.inputs.names)
+        return self.inputs if materials is None else self.inputs.within(materials)
+
+    def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what of the priors does not fit the model."""
+        materials = spec.materials(self.parameters)
+        constants = () if materials is None else materials.names
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
+        if materials is not None and all(path in spec.scalars for path in self.parameters):
+            with suppress(ValueError):  # correlations, which are reported elsewhere
+                yield from mistakes_of_materials(self.restricted(spec), materials)
+
+
+class OfCandidates(Settings):
+    """A study of candidates that each change one model.
+
+    Parameters
+    ----------
+    model
+        The model, as far as the candidates have it in common.
+    candidates
+        Models by name.
+    """
+
+    model: dict[str, Any]
+    candidates: dict[str, ModelCandidate] = Field(min_length=1)
+
+    @cached_property
+    def of_candidates(self) -> Mapping[str, ModelSpec]:
+        """The model of each candidate, in the form that suits all values of its parameters."""
+        given = {name: spec_of(changed(self.model, one.model)) for name, one in self.candidates.items()}
+        return {name: spec.over(ranges(self.candidates[name].parameters)) for name, spec in given.items()}
+
+    @property
+    def priors(self) -> dict[str, Inputs]:
+        """The unknowns of each candidate, restricted to those for which there is a material."""
+        return {name: one.restricted(self.of_candidates[name]) for name, one in self.candidates.items()}
+
+    @property
+    def findings_of_models(self) -> Iterator[Finding]:
+        """Findings about the models before anything is solved."""
+        for name, spec in self.of_candidates.items():
+            yield from spec.findings_over(ranges(self.candidates[name].parameters))
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the unknowns of a candidate."""
+        return self.candidates[label.partition("/")[0]].inputs.names
+
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of the numbers of a candidate's model."""
+        return {path: number.unit for path, number in self.of_candidates[label.partition("/")[0]].scalars.items()}
+
+    def models_and_mistakes(self) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
+        """Find the place of each candidate, its model (None if it is none), and what is wrong with it."""
+        for name, candidate in self.candidates.items():
+            place = ("candidates", name)
+            try:
+                spec = spec_of(changed(self.model, candidate.model))
+            except ValidationError as error:
+                lines = error.errors(include_url=False)
+                yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
+                continue
+            wrong = [*candidate.mistakes(spec), *spec.mistakes_of_mesh()]
+            if spec.coefficients:
+                message = "random fields, expected numbers only: candidates have few parameters"
+                wrong.append((("model", "fields"), message, len(spec.coefficients)))
+            yield place, spec, [((*place, *where), message, given) for where, message, given in wrong]
+
+
+def spec_of(block: Mapping[str, Any]) -> ModelSpec:
+    """Return the model that a block describes; a ValidationError for mistakes in it."""
+    return _SPEC.validate_python(dict(block))
+
+
+def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a block with changed values; a block with a kind replaces what was there."""
+    found = dict(block)
+    for key, value in changes.items():
+        here = found.get(key)
+        inside = isinstance(value, Mapping) and isinstance(here, Mapping) and "kind" not in value
+        found[key] = changed(here, value) if inside else value  # type: ignore[arg-type]
+    return found
