@@ -20,7 +20,7 @@ from forward.fem.finer import extrapolated
 from forward.model import FloatArray
 from inverse.data.outputs import OutputData
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import invert_few
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
@@ -109,7 +109,7 @@ def _inverted(
     values = clean + size * rng.standard_normal(len(clean))
     data = OutputData(outputs, values, np.hypot(size, mine.error), outputs).of(outputs, outputs)
     method = Invert(samples=SAMPLES, starts=1, seed=1)
-    return invert_by_group(inputs, mine.model, data, method, None, finer=mine.finer), size
+    return invert_few(inputs, SerialEvaluate(mine.model), data, method, finer=mine.finer).dataset, size
 
 
 def _mesh(mine: SharedExpansion, truth: FloatArray, clean: FloatArray, size: float) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 
 from inverse.criticism.answer import quantiles
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import invert_few
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
@@ -123,7 +123,7 @@ def held(folder: Path, count: int, seed: int, samples: int = SAMPLES) -> tuple[n
             kind: dict(zip(OUTPUTS, map(float, x), strict=True)) for kind, x in (("outputs", data), ("sigma", sigma))
         }
         one = parse(blocks | {"data": given})
-        inverted = invert_by_group(inputs, measured, one.measured(0), one.method, None, finer=None)
+        inverted = invert_few(inputs, SerialEvaluate(measured), one.measured(0), one.method, finer=None).dataset
         record = predicted.of_few(one, inverted, solved, solved, lambda: before)
         found.append([record["prediction_lower"], record["prediction_upper"]])
     truth = np.array([model["predicted"](point) for point in points])

@@ -33,8 +33,9 @@ from inverse.data.approximation_error import ApproximationError, Places, Whiteni
 from inverse.data.errors import NORMAL
 from inverse.data.observations import Components
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.mesh_correction import Treatment, error_of
+from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.studies.findings_inversion import NEITHER
@@ -342,7 +343,8 @@ def inverted(
     begin = time.process_time()
     inputs, model, finer = case
     data = measured(model, clean, noise, seed)
-    found = invert_by_group(inputs, model, data, method, None, finer=finer)
+    start = partial(Nearby.at, model, spread=inputs.std)
+    found = invert_few(inputs, SerialEvaluate(model), data, method, finer=finer, start=start, model=model).dataset
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),

@@ -54,7 +54,7 @@ _installed()
 
 _PUBLIC = {  # MODULE:NAME of each public name, or a module
     "load": "tissuq.studies:load",
-    "run": "workflows.run.from_python:run",
+    "run": "workflows.run.run:results_of",
     "read": "tissuq.studies:read",
     "findings": "uq.findings:findings",
     "Study": "workflows.studies.sampling:Study",
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
     from workflows.config.mistakes import StudyError as StudyError
     from workflows.report import bodies as bodies
     from workflows.report import plots as plots
-    from workflows.run.from_python import run as run
+    from workflows.run.run import results_of as run  # noqa: F401
     from workflows.studies.sampling import Study as Study
 
 

@@ -23,7 +23,7 @@ from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import Inverted, inverted
+from inverse.methods.invert_few import Inverted, invert_few
 from inverse.methods.record import Data
 from uq.evaluation.evaluate import OfEvaluate, Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request
@@ -136,7 +136,7 @@ def invert_by_reduced(
     full, cheap = Recorder(evaluate), Recorder(SerialEvaluate(reduced))
     centre, corrected = _corrected(inputs, full, cheap, data, method, errors)
     for number in range(1, ROUNDS + 1):
-        found = inverted(inputs, corrected, data, method, None, errors, finer, lambda _: None, say, None)
+        found = invert_few(inputs, corrected, data, method, errors=errors, finer=finer, start=lambda _: None, say=say)
         checked, points, left = _checked(found, full, centre, corrected, method)
         share = f"weights worth {100 * checked.share:.0f} % of {method.reduced.solves} draws"
         say(f"posterior by the reduced model against full solves: {share}")

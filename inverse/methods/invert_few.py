@@ -1,14 +1,13 @@
 """Inversion for few parameters: the mode from several starts, Laplace's Gaussian, weighted points that correct it.
 
-The posterior is that of `inverse.low_dimensional.posterior`. With one function a rank group works by itself, with the
-other all groups solve at different points of one posterior.
+The posterior is that of `inverse.low_dimensional.posterior`. A rank group works by itself, with states that it has at
+hand (`Nearby`), or all groups solve at different points of one posterior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,7 +41,7 @@ from inverse.methods.record import (
     of_prior,
     of_test,
 )
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
@@ -97,98 +96,55 @@ class Inverted:
     evidence: Evidence
 
 
-def invert_by_group(
+def invert_few(
     inputs: Inputs,
-    model: ForwardModel,
+    evaluate: Evaluate,
     data: Data,
     method: Invert,
-    look: Look | None,
+    look: Look | None = None,
+    *,
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
-    evaluate: Evaluate | None = None,
+    start: Starts | None = None,
     say: Callable[[str], None] = lambda line: None,
     shared: Shared | None = None,
-) -> xr.Dataset:
-    """Invert a data set on the model of one rank group, or by an evaluation of it; collective over the group.
+    model: ForwardModel | None = None,
+) -> Inverted:
+    """Invert a data set for few parameters.
 
     Parameters
     ----------
-    inputs, model, data, method, errors
+    inputs, evaluate, data, method, errors
         The unknowns, the model, the data, the method, and the distribution of the errors.
     look
         The stiffness of the interior as a function of the parameters; None if there is none.
     finer
         The model on finer meshes; None where it has no mesh.
-    evaluate
-        Of the model.
+    start
+        Predicts states from a solution at parameters (d,); by default by tangents there.
     say
         Shows the user a line before the search.
     shared
         What errors the data share; None if they are independent.
+    model
+        The model itself, whose gradients chains follow.
 
     Raises
     ------
     SolveError
         If the model has no answer where the search needs one.
     """
-    solve = evaluate or SerialEvaluate(model)
-    near = partial(Nearby.at, model, spread=inputs.std)
-    return inverted(inputs, solve, data, method, look, errors, finer, near, say, shared, model).dataset
-
-
-def invert_by_all(
-    inputs: Inputs,
-    evaluate: Evaluate,
-    data: Data,
-    method: Invert,
-    look: Look | None,
-    errors: NormalErrors | StudentErrors = NORMAL,
-    finer: Finer | None = NOT_LOOKED,
-    say: Callable[[str], None] = lambda line: None,
-    shared: Shared | None = None,
-    model: ForwardModel | None = None,
-) -> xr.Dataset:
-    """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
-    return inverted(
-        inputs,
-        evaluate,
-        data,
-        method,
-        look,
-        errors,
-        finer,
-        lambda point: linearise(inputs, evaluate, point).prediction,
-        say,
-        shared,
-        model,
-    ).dataset
-
-
-def inverted(
-    inputs: Inputs,
-    evaluate: Evaluate,
-    data: Data,
-    method: Invert,
-    interior: Look | None,
-    errors: NormalErrors | StudentErrors,
-    finer: Finer | None,
-    start: Starts,
-    say: Callable[[str], None],
-    shared: Shared | None,
-    model: ForwardModel | None = None,
-) -> Inverted:
-    """Invert a data set, as `invert_by_group`; `start` predicts states from a solution at parameters (d,)."""
     counted = Recorder(evaluate)
     of_data_set = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
-    look = None if finer is None else Looked(finer, data.spread, method.treatment)
+    looked = None if finer is None else Looked(finer, data.spread, method.treatment)
     inferred = infer(
         of_data_set,
-        start,
+        start or (lambda point: linearise(inputs, evaluate, point).prediction),
         solves,
         starts=method.starts,
         seed=method.seed,
-        look=look,
+        look=looked,
         shared=shared,
         chains=method.chains,
         model=model,
@@ -207,7 +163,7 @@ def inverted(
     known = answer(posterior, gaussian, found, chains)
     log_evidence, error = one.log_evidence
     drawn = _drawn(posterior, one, at, method)
-    moments = _moments(posterior, gaussian, known, drawn, interior)
+    moments = _moments(posterior, gaussian, known, drawn, look)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),

@@ -22,8 +22,7 @@ from workflows.config.source import AVERAGED, READER, Sourced
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.design_job import job, job_of_models
 from workflows.studies.design_job import mistakes as mistakes_of_values
-from workflows.studies.inversion_plan import PRODUCT
-from workflows.studies.predictions import duration
+from workflows.studies.predictions import PRODUCT, duration
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:

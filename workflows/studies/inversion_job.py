@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert import derivable
-from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
+from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
     from forward.specimen import Specimen
     from inverse.data.outputs import OutputData
-    from inverse.data.shared_motion import Shared, SharedMotion
+    from inverse.data.shared_motion import SharedMotion
+    from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
     from uq.evaluation.checkpoint import Checkpoint
@@ -52,123 +53,86 @@ There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or wh
 
 def job(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
-    made: _Made = (
-        _Outputs.of(study, ensemble) if study.specimen is None else _Specimen.of(study, study.specimen, ensemble)
-    )
+    made = _outputs(study, ensemble) if study.specimen is None else _specimen(study, study.specimen, ensemble)
     derivable(made.model, study.model.kind)
     return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
 
-_InvertField = Callable[[int, ForwardModel, Finer, "Shared | None"], "xr.Dataset"]
+@dataclass(frozen=True)
+class _Observed:
+    """What a data set is compared with.
+
+    Attributes
+    ----------
+    model
+        The model of what was measured.
+    there
+        The same on finer meshes (`forward.extrapolated`).
+    shared
+        What errors the data share, and the model that tells what they are; None if they are independent.
+    """
+
+    model: ForwardModel
+    there: There
+    shared: tuple[SharedMotion, ForwardModel] | None = None
 
 
-class _Made(Protocol):
+@dataclass(frozen=True)
+class _Made:
     """A measured model, as inversions need it.
 
     Attributes
     ----------
     model
         The model.
+    observed
+        What a data set, by its number, is compared with; a SolveError if there is nothing.
     vertices
         Places (N, 3) of the vertices of a specimen, cells, and VTK's number of their kind; None of other models.
     look
         Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices, of a specimen.
     """
 
-    @property
-    def model(self) -> ForwardModel: ...
-    @property
-    def vertices(self) -> Vertices | None: ...
-    @property
-    def look(self) -> Look | None: ...
-
-    def observing(self, number: int) -> ForwardModel:
-        """Return the model with which a data set, by its number, is compared.
-
-        Raises
-        ------
-        SolveError
-            If there is none.
-        """
-
-    def shared(self, number: int) -> tuple[SharedMotion, ForwardModel] | None:
-        """Return what errors the data share, and the model that tells what they are; None if they are independent."""
-
-    def finer(self, observed: ForwardModel) -> There:
-        """Return the model on finer meshes (`forward.extrapolated`)."""
-
-
-@dataclass(frozen=True)
-class _Outputs:
-    """A model with outputs."""
-
-    study: Inversion
     model: ForwardModel
-    there: There
-    vertices: None = None
-    look: None = None
+    observed: Callable[[int], _Observed]
+    vertices: Vertices | None = None
+    look: Look | None = None
 
-    @classmethod
-    def of(cls, study: Inversion, ensemble: Ensemble) -> _Outputs:
-        model = study.spec.build(ensemble.group, study.inputs.names)
-        if not has_mesh(study.spec):
-            hidden = study.spec.hidden
-            return cls(study, model, (None, f"{hidden}; {BY_REDUCED}") if hidden else None)
+
+def _outputs(study: Inversion, ensemble: Ensemble) -> _Made:
+    """Make a model with outputs, of which the data tell which were measured; collective."""
+    model, there = study.spec.build(ensemble.group, study.inputs.names), None
+    if has_mesh(study.spec):
         meshes, why = _meshes(study, model, study.inputs.mean)
-        return cls(study, model, (None if meshes is None else meshes.restricted(), why))
-
-    def observing(self, number: int) -> ForwardModel:
-        """Return the model: the data tell which of its outputs were measured."""
-        return self.model
-
-    def shared(self, number: int) -> None:
-        """Return None: errors of outputs are independent."""
-        return
-
-    def finer(self, observed: ForwardModel) -> There:
-        """Return the same outputs on finer meshes."""
-        return self.there
+        there = (None if meshes is None else meshes.restricted(), why)
+    elif study.spec.hidden:
+        there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
+    return _Made(model, lambda number: _Observed(model, there))
 
 
-@dataclass(frozen=True)
-class _Specimen:
-    """A specimen; making it is collective. `meshes` are finer ones, or `why` there are none."""
+def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
+    """Make a specimen; collective."""
+    names = study.model.coefficients if study.field else study.inputs.names
+    model: SpecimenModel = spec.build(ensemble.group, names)
+    vertices = (model.vertices.coordinates, *model.vertices.cells())
+    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean)
 
-    study: Inversion
-    model: SpecimenModel
-    vertices: Vertices
-    look: Look
-    meshes: FinerMeshes | None
-    why: str
+    def look(points: FloatArray) -> FloatArray:
+        return study.stiffness(vertices[0], points) + model.log_fields(points)
 
-    @classmethod
-    def of(cls, study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Specimen:
-        names = study.model.coefficients if study.field else study.inputs.names
-        model: SpecimenModel = spec.build(ensemble.group, names)
-        vertices = (model.vertices.coordinates, *model.vertices.cells())
-
-        def look(points: FloatArray) -> FloatArray:
-            return study.stiffness(vertices[0], points) + model.log_fields(points)
-
-        start = np.zeros(len(names)) if study.field else study.inputs.mean
-        return cls(study, model, vertices, look, *_meshes(study, model, start))
-
-    def observing(self, number: int) -> SpecimenModel:
-        """Return the model of the displacements of a data set; errors as for every model."""
-        data = self.study.measurements[number].data
+    def observed(number: int) -> _Observed:
+        measured = study.measurements[number]
+        data = measured.data
         try:
-            return self.model.observing(data.places, data.axes, data.cases, data.along)
+            own = model.observing(data.places, data.axes, data.cases, data.along)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
+        there = None if meshes is None else meshes.observing(own)
+        motion = measured.motion(study.model.body)
+        shared = None if motion is None else (motion, model.observing(*motion.observed))
+        return _Observed(own, (there, why), shared)
 
-    def shared(self, number: int) -> tuple[SharedMotion, ForwardModel] | None:
-        """Return the uncertain motions of a data set, and the model that tells what they do; None if nothing is."""
-        found = self.study.measurements[number].motion(self.study.model.body)
-        return None if found is None else (found, self.model.observing(*found.observed))
-
-    def finer(self, observed: ForwardModel) -> There:
-        """Return the model of what is observed on finer meshes."""
-        return None if self.meshes is None else self.meshes.observing(cast("SpecimenModel", observed)), self.why
+    return _Made(model, observed, vertices, look)
 
 
 def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
@@ -181,14 +145,62 @@ def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[F
 def _judged(study: Inversion, made: _Made, found: xr.Dataset) -> xr.Dataset:
     """Add what is to be said of the results; on rank 0."""
     found = judged(found, study)
-    if isinstance(made, _Outputs) and not has_mesh(study.model):
+    if study.specimen is None and not has_mesh(study.model):
         add(found, *of_answers(made.model, study.inputs))
     return found
 
 
+def _inverted(
+    study: Inversion,
+    made: _Made,
+    number: int,
+    seen: _Observed,
+    full: Recorder,
+    on: Callable[[str, ForwardModel], Evaluate],
+    cheap: ForwardModel | None,
+    start: Starts | None,
+    say: Callable[[str], None],
+) -> xr.Dataset:
+    """Invert a data set, by its number, for few parameters.
+
+    Parameters
+    ----------
+    seen, full
+        What it is compared with, and its evaluation.
+    on
+        Evaluates other models, by names.
+    cheap
+        The reduced model that stands for it, if there is one.
+    start, say
+        As of `invert_few`.
+    """
+    data, method, errors = study.measured(number), study.method, study.data.errors
+    finer = _finer(seen.there, lambda model: solved_by(on(FINER, model)))
+    shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
+    if cheap is None:
+        return invert_few(
+            study.inputs,
+            full,
+            data,
+            method,
+            made.look,
+            errors=errors,
+            finer=finer,
+            start=start,
+            say=say,
+            shared=shared,
+            model=seen.model,
+        ).dataset
+    if shared is not None:  # a reduced model would have to know what moved points do
+        message = "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
+        raise SolveError(message)
+    from inverse.methods.by_reduced import invert_by_reduced
+
+    return invert_by_reduced(study.inputs, full, cheap, data, method, errors, finer, say)
+
+
 def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
-    method, errors = study.method, study.data.errors
     names = [one.name for one in study.data.sets]
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
     solving: list[Kept] = []  # of the data set at hand
@@ -217,26 +229,22 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
     def inverted(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
-        if method.expansion is not None:
+        if study.method.expansion is not None:
             found, log = expanded()
             if all(one is None for one in study.measurements[:number]):  # those of the first data set that can be used
                 solved += log
             return _by_expansion(study, found, number, ensemble.say)
-        observed = made.observing(number)
-        finer = _solved(made.finer(observed), lambda model: solved_by(beside(f"{names[number]}/{FINER}", model)))
-        shared = _shared(made.shared(number), lambda model: beside(f"{names[number]}/{MOVED}", model))
+        seen = made.observed(number)
+
+        def on(name: str, model: ForwardModel) -> SerialEvaluate:
+            return beside(f"{names[number]}/{name}", model)
+
         if invert_field is not None:
-            return invert_field(number, KeptModel(observed, kept(names[number]), solved), finer or NOT_LOOKED, shared)
-        evaluate = Recorder(SerialEvaluate(observed, ensemble.count, kept=kept(names[number])), log=solved)
-        data = study.measured(number)
-        if reduced is not None:
-            _alone(shared)
-            cheap, by_reduced = reduced(observed), named("inverse.methods.by_reduced:invert_by_reduced")
-            posterior: xr.Dataset = by_reduced(study.inputs, evaluate, cheap, data, method, errors, finer, ensemble.say)
-            return posterior
-        return invert_by_group(
-            study.inputs, observed, data, method, made.look, errors, finer, evaluate, ensemble.say, shared
-        )
+            return invert_field(number, KeptModel(seen.model, kept(names[number]), solved), seen, on)
+        full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
+        near = partial(Nearby.at, seen.model, spread=study.inputs.std)
+        cheap = None if reduced is None else reduced(seen.model)
+        return _inverted(study, made, number, seen, full, on, cheap, near, ensemble.say)
 
     def forget() -> None:
         """Remove the solves of a data set, whose results are stored."""
@@ -268,7 +276,7 @@ def _expanded(
     def kept(model: ForwardModel, label: str) -> Recorder:
         return Recorder(SerialEvaluate(model, ensemble.count, kept=Kept(checkpoint, ensemble.group, label)))
 
-    there, samples = made.finer(made.model), study.method.expansion
+    there, samples = made.observed(0).there, study.method.expansion
     model, why = (None, "") if there is None else there
     fine = None if model is None else kept(model, f"expansion, {FINER}")
     assert samples is not None
@@ -282,27 +290,42 @@ def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Ca
     missed = found.error[list(data.which)]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
     errors = study.data.errors
-    one = invert_by_group(study.inputs, found.model, wider, study.method, None, errors, found.finer, say=say)
+    evaluate, near = SerialEvaluate(found.model), partial(Nearby.at, found.model, spread=study.inputs.std)
+    one = invert_few(
+        study.inputs,
+        evaluate,
+        wider,
+        study.method,
+        errors=errors,
+        finer=found.finer,
+        start=near,
+        say=say,
+        model=found.model,
+    ).dataset
     size, count = float((missed / data.sigma).max()), found.solves + found.finer_solves
     return one.assign(solves=0.0, expansion_error=size, expansion_solves=float(count))
 
 
 def _inverting_field(
     study: Inversion, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
-) -> _InvertField:
+) -> Callable[[int, ForwardModel, _Observed, Callable[[str, ForwardModel], Evaluate]], xr.Dataset]:
     """Return what inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
 
-    assert isinstance(made, _Specimen)
-    model, prior = made.model, study.model.fields[0].prior(study.model.body)
+    model = cast("SpecimenModel", made.model)
+    prior = study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
     predicting: Callable[[str], FieldPredictions] | None = None
     if study.predict is not None:
         other = named("workflows.studies.predicted:build")(study, ensemble)
         predicting = named("workflows.studies.predicted:of_field")(study, lambda name: states_of(name, other))
 
-    def invert(number: int, states: ForwardModel, finer: Finer, shared: Shared | None) -> xr.Dataset:
+    def invert(
+        number: int, states: ForwardModel, seen: _Observed, on: Callable[[str, ForwardModel], Evaluate]
+    ) -> xr.Dataset:
+        finer = _finer(seen.there, lambda model: solved_by(on(FINER, model))) or NOT_LOOKED
+        shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
         data, errors = study.measured(number), study.data.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
         vertices = Vertices(offset, prior.matern.mass)
@@ -331,17 +354,7 @@ def _predicting(
     return record
 
 
-def _shared(
-    both: tuple[SharedMotion, ForwardModel] | None, evaluation: Callable[[ForwardModel], Evaluate]
-) -> Shared | None:
-    """Return what errors the data share, given the evaluation of the model that tells what they are."""
-    if both is None:
-        return None
-    motion, model = both
-    return motion.errors_by(evaluation(model))
-
-
-def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:
+def _finer(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:
     """Return what finer meshes are solved by; None where there is no mesh."""
     if there is None:
         return None
@@ -367,52 +380,23 @@ def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
     return lambda observed: cast("ForwardModel", specimen.of(observed, models))
 
 
-def _alone(shared: Shared | None) -> None:
-    """Refuse errors that data share: a reduced model would have to know what moved points do.
-
-    Raises
-    ------
-    SolveError
-        If there are any.
-    """
-    if shared is not None:
-        message = "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
-        raise SolveError(message)
-
-
 def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
-    say = ensemble.say
-    observed, data = made.observing(0), study.measured(0)
-    there = made.finer(observed)
+    seen, reduced = made.observed(0), _reduced(study)
     recorders: dict[str, Recorder] = {}
-    reduced = _reduced(study)
-    cheap = None if reduced is None else reduced(observed)
-    others: dict[str, Callable[[], ForwardModel]] = {}
-    model = None if there is None else there[0]
-    if model is not None:
-        others = {FINER: lambda: model}
-    both = made.shared(0)
-    if both is not None:
-        others[MOVED] = lambda: both[1]
+    cheap = None if reduced is None else reduced(seen.model)
+    models = {FINER: None if seen.there is None else seen.there[0], MOVED: seen.shared and seen.shared[1]}
     if study.predict is not None:
-        predicted: ForwardModel = named("workflows.studies.predicted:build")(study, ensemble)
-        others[PREDICTED] = lambda: predicted
+        models[PREDICTED] = named("workflows.studies.predicted:build")(study, ensemble)
+    others = {name: partial(_itself, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
-        recorders["/"] = Recorder(evaluate)
-        finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
-        errors = study.data.errors
-        shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
-        if cheap is not None:
-            _alone(shared)
-            by_reduced = named("inverse.methods.by_reduced:invert_by_reduced")
-            found = by_reduced(study.inputs, recorders["/"], cheap, data, study.method, errors, finer, say)
-        else:
-            full = recorders["/"]
-            found = invert_by_all(
-                study.inputs, full, data, study.method, made.look, errors, finer, say, shared, observed
-            )
+        full = recorders["/"] = Recorder(evaluate)
+
+        def on(name: str, _: ForwardModel) -> Evaluate:
+            return full.on(name) if name == FINER else evaluate.on(name)  # values at moved points are not kept
+
+        found = _inverted(study, made, 0, seen, full, on, cheap, None, ensemble.say)
         if study.predict is not None:
             recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
             before = partial(named("workflows.studies.predicted:prior_band"), study, recorders[PREDICTED])
@@ -421,7 +405,7 @@ def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(
-        observed,
+        seen.model,
         others,
         task,
         recorders,
@@ -429,3 +413,7 @@ def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )
+
+
+def _itself(model: ForwardModel) -> ForwardModel:
+    return model

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from pydantic import BeforeValidator, ValidationError, model_validator
 
@@ -13,7 +13,7 @@ from forward.fem.finer import finer
 from forward.findings import Finding
 from forward.model import ForwardModel
 from forward.scalars import Mistake
-from forward.settings import Settings, one_line
+from forward.settings import Settings, one_line, shown
 from forward.spec import SPECIMEN, ModelSpec, usual_kind
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Candidate, Data
@@ -25,10 +25,11 @@ from workflows.studies.candidates import OfCandidates, changed, spec_of
 from workflows.studies.findings_solves import of_answers
 from workflows.studies.listed_displacements import ListedDisplacements
 from workflows.studies.listed_outputs import ListedOutputs
-from workflows.studies.material_tests import WHOLE
+from workflows.studies.material_tests import WHOLE, expanded
 from workflows.studies.measured import as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
-from workflows.studies.selection import Comparison
+from workflows.studies.selection import Comparison, Selection
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -59,8 +60,19 @@ class ModelSelection(OfCandidates, Comparison):
     data_in_file: ClassVar[tuple[type[Settings], ...]] = (ListedDisplacements.in_file, ListedOutputs.in_file)
 
     @classmethod
-    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
-        """Check the blocks of a study, after its data have been read by the model of the first candidate."""
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """Comparisons of materials, and of models."""
+        yield Selection
+        yield cls
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:  # type: ignore[override]
+        """Check the blocks of a comparison of models, whose data are read by the first one, or of material points."""
+        if not isinstance(blocks.get("model", {}), Mapping):
+            message = f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}"
+            raise StudyError(message)
+        if "model" not in blocks:
+            return Selection.model_validate(expanded(blocks, folder))
         return cls.model_validate(cls._expanded(blocks, folder))
 
     @classmethod

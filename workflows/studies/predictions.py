@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
 NONE_TO_SPARE = -1e9  # solves: for estimates without what calibrates them
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
 NOT_ASKED = "not requested: no result will be called trusted"
 
 

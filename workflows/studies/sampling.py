@@ -197,8 +197,9 @@ class Study(Sourced, StudyKind):
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
-        lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, rank_groups)
-        return lines
+        from workflows.studies.plans import of_sampling
+
+        return of_sampling(self, rank_groups)
 
     def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
         """Refine the mesh, where that is asked for; collective."""

@@ -14,9 +14,8 @@ from forward.findings import Finding
 from forward.materials.material import units
 from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
 from forward.model import ForwardModel
-from forward.registry import named
 from forward.scalars import Mistake
-from forward.settings import Settings, nearest, shown
+from forward.settings import Settings, nearest
 from inverse.criticism.assessment import NEEDED, own_seconds
 from inverse.criticism.comparison import Candidate, Data
 from inverse.criticism.finer import Finer
@@ -24,13 +23,13 @@ from inverse.methods.selection import Select
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate
 from uq.findings import add
-from workflows.config.mistakes import StudyError, not_installed
+from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
 from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
 from workflows.studies.finer import FINER, once_on_finer_meshes, solved_by
 from workflows.studies.job import MOVED, MethodJob
-from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
+from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements
 from workflows.studies.predictions import NOT_ASKED, duration
 from workflows.studies.study import StudyKind
 
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
-OF_MODELS = "workflows.studies.model_selection:ModelSelection"
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 
 
@@ -158,23 +156,6 @@ class Comparison(StudyKind):
         counts = [len(self.tests(group)) for group in self.group_names]
         held_out = sum(count for count in counts if count > 1) if self.method.held_out else 0
         return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
-
-    @classmethod
-    def forms(cls) -> Iterator[type[StudyKind]]:
-        """Comparisons of materials, and of models."""
-        yield Selection
-        yield named(OF_MODELS)
-
-    @classmethod
-    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
-        """Check the blocks of a comparison on a specimen, on another model, or without one on material points."""
-        if not isinstance(blocks.get("model", {}), Mapping):
-            message = f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}"
-            raise StudyError(message)
-        if "model" in blocks:
-            other: type[Comparison] = named(OF_MODELS)
-            return other.made(blocks, folder)
-        return Selection.model_validate(expanded(blocks, folder))
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""

@@ -179,8 +179,8 @@ class StudyKind(Settings):
         return None
 
     def run(self, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False) -> xr.Dataset:
-        """Run the study from Python, in memory or to a directory, as `workflows.run.from_python.run` does."""
-        found: xr.Dataset = named("workflows.run.from_python:run")(self, directory, quiet=quiet, report=report)
+        """Run the study from Python, in memory or to a directory, as `workflows.run.run.results_of` does."""
+        found: xr.Dataset = named("workflows.run.run:results_of")(self, directory, quiet=quiet, report=report)
         return found
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
@@ -212,7 +212,7 @@ STUDIES = Kinds(
     "study",
     {
         SAMPLING: "workflows.studies.sampling:Study",
-        "select": "workflows.studies.selection:Comparison",
+        "select": "workflows.studies.model_selection:ModelSelection",
         "invert": "workflows.studies.inversion:Inversion",
         "synthesize": "workflows.studies.synthesis:Synthesis",
         "population": "workflows.studies.population:PopulationStudy",

@@ -40,21 +40,23 @@ from workflows.run.version import version
 from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
-from workflows.studies.reach import (
+from workflows.studies.sampling_job import told_of
+from workflows.studies.tolerance_asked import (
     AIM,
+    COUNTS,
     HOPELESS,
     RATE,
     STEP,
     Assessed,
     cells,
     factor,
+    goal,
     least_share,
     most_unknowns,
     out_of_reach,
     rate_of,
+    refinement,
 )
-from workflows.studies.sampling_job import told_of
-from workflows.studies.tolerance_asked import COUNTS, goal, refinement
 
 if TYPE_CHECKING:
     import xarray as xr

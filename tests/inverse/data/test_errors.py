@@ -15,7 +15,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import invert_few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
@@ -103,7 +103,7 @@ def test_what_does_not_belong_does_not_decide():
     data = Components(RNG.uniform(size=(15, 3)), np.zeros(15, np.int64), np.zeros(15, np.int64), VALUES, SIGMA)
     method = Invert(samples=128, starts=2)
     plain, heavy = (
-        invert_by_group(Inputs({"a": PRIOR}), MODEL, data, method, lambda p: p[:, :1], errors)
+        invert_few(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), data, method, lambda p: p[:, :1], errors=errors).dataset
         for errors in (NormalErrors(), HEAVY)
     )
     _, mean, std, _ = quadrature()

@@ -10,7 +10,7 @@ from inverse.criticism.doubts import reduced_off
 from inverse.data.outputs import stated
 from inverse.methods.by_reduced import Agreement, Corrected, invert_by_reduced
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import invert_few
 from tests import launch
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
@@ -229,7 +229,7 @@ def by_reduced(body, reduced, **settings):
 
 
 def direct(body):
-    return invert_by_group(INPUTS, body, DATA, Invert(starts=1, samples=256), None, finer=None)
+    return invert_few(INPUTS, SerialEvaluate(body), DATA, Invert(starts=1, samples=256), finer=None).dataset
 
 
 def test_a_wrong_reduced_model_is_corrected_to_the_exact_posterior():

@@ -21,7 +21,7 @@ from inverse.data.rigid import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import Nearby, invert_by_all, invert_by_group
+from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.record import as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
@@ -84,7 +84,7 @@ def exactly(rows):
 
 def test_linear_models_have_the_exact_posterior():
     method = Invert(samples=64, starts=2)
-    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
     prior_std = np.array([p.std for p in PRIORS.values()])
     mean = np.array([p.mean for p in PRIORS.values()])
 
@@ -110,7 +110,7 @@ def test_linear_models_have_the_exact_posterior():
 
 def test_the_noise_can_be_unknown():
     method = Invert(samples=256, starts=1, noise=LogUniform(lower=0.1, upper=10.0))
-    record = invert_by_all(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1])
+    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
     assert len(record["mode"]) == 4
     assert record["lower"][3] < 1 < record["upper"][3]
     assert np.isnan(record["alone_std"][:, 3]).all()
@@ -133,7 +133,7 @@ def test_solves_near_the_mode_are_screened_rather_than_counted():
 def test_what_is_left_is_of_chains_that_have_mixed(kind):
     """Moments, intervals and draws: those of the exact posterior, closer than so few weighted points come."""
     method = Invert(samples=32, starts=1, chains=kind)
-    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
     exact, covariance = exactly(np.arange(12))
     std = np.sqrt(np.diag(covariance))
     assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
@@ -148,7 +148,8 @@ def test_what_is_left_is_of_chains_that_have_mixed(kind):
 
 
 def test_what_is_predicted_is_as_sure_as_the_parameters():
-    record = invert_by_group(Inputs(PRIORS), linear(), DATA, Invert(samples=32, starts=1), lambda points: points[:, :1])
+    method = Invert(samples=32, starts=1)
+    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
     _, covariance = exactly(np.arange(12))
     np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
 

@@ -19,7 +19,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_few import invert_few
 from inverse.methods.selection import Noise, Select, posterior
 from tests.launch import TISSUQ, run, run_script
 from tests.problems import bananas
@@ -673,8 +673,8 @@ def of_bananas(pairs, bend=0.7, **settings):
     named = tuple(f"z{k}" for k in range(d))
     of_outputs = OutputData(named, np.zeros(d), np.ones(d), named, outputs=named, parts=named)
     beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
-    inverted = partial(invert_by_group, curved.inputs, model, of_outputs, beside, None, finer=None)
-    return found.sel(model="it", group="all"), inverted, truth
+    asked = partial(invert_few, curved.inputs, evaluate, of_outputs, beside, finer=None, model=model)
+    return found.sel(model="it", group="all"), lambda: asked().dataset, truth
 
 
 def test_where_points_count_little_a_comparison_says_what_an_inversion_says():

@@ -1,0 +1,270 @@
+"""What studies that sample a model, or invert data, will cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Linear
+from forward.machine import MIB, compiled_forms
+from forward.readable import told
+from uq.evaluation.request import OWN, company_of
+from workflows.config.priors import ranges
+from workflows.studies import tolerance_asked
+from workflows.studies.predictions import (
+    NOT_ASKED,
+    PRODUCT,
+    duration,
+    formulation,
+    mesh_check,
+    never_estimable,
+    times_of,
+)
+
+if TYPE_CHECKING:
+    from forward.specimen import Specimen
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.measured import Measurement
+    from workflows.studies.sampling import Study
+
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+LISTED = 8  # outputs that are named
+
+
+def of_sampling(study: Study, rank_groups: int) -> list[str]:
+    """Say what is sampled, how often, and how long that will take."""
+    method, spec, planned = study.method, study.spec, study.planned
+    open_ended = method.open_ended or study.accuracy.tolerance is not None
+    up_to = "up to " if open_ended and not method.undecided else ""
+    later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.given))),
+    ]
+    for k, mesh in enumerate(study.meshes[1:], 1):
+        cost = mesh.cost()
+        taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
+        lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
+    lines += [
+        f"parameters  {', '.join([*study.given, *_in_series(spec.coefficients)])}",
+        f"outputs     {', '.join(output.name for output in spec.returned)}",
+        f"solves      {up_to}{planned:,}{later}",
+        *(tolerance_asked.plan(study) if study.accuracy.tolerance is not None else ()),
+    ]
+    if spec.cost() is None:  # the time of a solve is unknown
+        return lines
+    if study.estimates:
+        estimates = f"{up_to}{study.estimates} estimates"
+        if study.accuracy.tolerance is not None:  # the study's number is of a method alone
+            estimates = f"{tolerance_asked.COUNTS[0]} to {tolerance_asked.COUNTS[-1]} estimates on each mesh"
+        lines.append(f"mesh error  {estimates} in elements of one degree more; none with accuracy.mesh_error = false")
+        never = never_estimable(spec, [output.name for output in spec.returned])
+        if never:
+            lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")
+    needed = study.memory + BYTES_OF_PROGRAM
+    return [
+        *lines,
+        f"memory      about {needed / MIB:,.0f} MiB for each group of ranks",
+        *_told(parts(study), rank_groups, up_to, later and ", then more", _compilation(study)),
+    ]
+
+
+def _in_series(paths: Sequence[str]) -> Iterator[str]:
+    """Name the coefficients of each random field by the first and the last."""
+    for _, series in groupby(paths, lambda path: path.rpartition(".")[0]):
+        first, *rest = series
+        yield f"{first} to {len(rest)}"
+
+
+class Part(NamedTuple):
+    """Cost of a part of a study: predicted processor time (s), purpose, and whether groups of ranks share it."""
+
+    seconds: float
+    what: str
+    shared: bool = False
+
+
+def parts(study: Study) -> list[Part]:
+    """Predict the cost of a study of a body, part by part.
+
+    Samples are the maximum number; those that multilevel methods add after their pilots are unknown.
+    """
+    method, dimension = study.method, len(study.inputs.names)
+    known = ((name, model.cost()) for name, model in study.models.items())
+    costs = {OWN: times_of(study.spec)} | {name: cost for name, cost in known if cost is not None}
+    found = [times_of(mesh) for mesh in study.meshes]
+    samples = study.planned - len(found)
+    seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and found[0].predicted and found[0].linear != Linear.MULTIGRID
+    each = found[0].in_company(company_of(samples))
+    seconds *= each / found[0].sample
+    further = f"{samples:,} further solves, {each:.2g} s each"
+    return [
+        Part(START, "start of the program"),
+        *([] if _compiled_before() else [Part(_compilation(study), "compilation of the forms")]),
+        Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
+        Part(sum(one.tangents(dimension) for one in found), "its tangents"),
+        *([Part(sum(one.reference_factor(dimension) for one in found), "reference factor")] if corrected else []),
+        *([Part(seconds, further, shared=True)] if samples > 0 else []),
+        *_estimates(study),
+        Part(REPORT, "results and report"),
+    ]
+
+
+def _estimates(study: Study) -> Iterator[Part]:
+    """Estimates of the error of the mesh, each with its solution."""
+    estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
+    if estimating is None:
+        return
+    each = times_of(study.spec).sample + estimating.seconds
+    yield Part(
+        estimating.once + estimating.calibration + study.estimates * each,
+        f"{study.estimates} estimates of the mesh error, {each:.2g} s each",
+        True,
+    )
+
+
+def _compilation(study: Study) -> float:
+    """Seconds of the forms of a body, and of those for the error of its mesh."""
+    estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
+    if estimating is None:
+        return COMPILATION
+    return COMPILATION * (2 if estimating.calibration else 3)  # in elements of one degree more, and perhaps of two
+
+
+def _compiled_before() -> bool:
+    """Whether any forms were compiled on this machine; only a run can tell which."""
+    return any(compiled_forms().glob("forms-*/*/"))
+
+
+def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compilation: float) -> list[str]:
+    """Say how long a study takes by the clock, if every group of ranks has a core, and of what this is the sum."""
+    by_clock = [part.seconds / (rank_groups if part.shared else 1) for part in found]
+    cores = f"{rank_groups} core{'s' if rank_groups > 1 else ''}"
+    lines = [f"time        {up_to}about {duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]
+    lines += [f"            {duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
+    if _compiled_before():
+        lines.append(
+            f"            and {compilation:.0f} s or more where the forms of this kind of body are not compiled yet"
+        )
+    return lines
+
+
+# --- inversions ------------------------------------------------------------------------------------------------------
+
+
+def of_inversion(study: Inversion) -> list[str]:
+    """Say what is inverted, and how long that will take."""
+    return _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
+
+
+def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
+    from workflows.studies.inversion import SOLVES_OF_FIELD
+
+    sets = study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) + len(m.observations.readings) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    cases = [times_of(spec.loaded(case)) for case in spec.cases]
+    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(0, field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = textbook * 15 * study.method.starts + each * study.method.solves(len(study.names), field=False)
+    seconds += each * study.method.chain_solves(len(study.names), field=study.field)
+    once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
+    seconds += once + _seconds_of_predictions(study) + _own_seconds(study, max(counts))
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        formulation(study.model.decision(ranges(study.parameters))),
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {_moved(sum(moved), usable)}"] if sum(moved) else []),
+        *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
+        *(f"warning     {found.clause}" for one in usable for found in one.findings),
+        f"mesh check  {checked}",
+        *_predicted(study),
+        f"time        about {duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _predicted(study: Inversion) -> list[str]:
+    """Say what is predicted, and by how many solves."""
+    if study.predict is None:
+        return []
+    names = [output.name for output in study.predicted.returned]
+    more = f" and {len(names) - LISTED} others" if len(names) > LISTED else ""
+    solves = 1 + study.predict.solves(field=study.field)
+    return [f"predicts    {', '.join(names[:LISTED])}{more}, by {solves} solves, and as many of the prior"]
+
+
+def _seconds_of_predictions(study: Inversion) -> float:
+    """Predict the processor time (s) of what is predicted."""
+    cost = None if study.predict is None else study.predicted.cost()
+    if cost is None or study.predict is None:
+        return 0.0
+    own = 0.0 if study.field else cost.tangents_of_sample(len(study.inputs.names))
+    return 2 * (cost.textbook + study.predict.solves(field=study.field) * (cost.sample + own))
+
+
+def _own_seconds(study: Inversion, data: int) -> float:
+    """Predict the most processor time (s) that an inversion of so many data takes besides solves."""
+    from inverse.criticism.assessment import own_seconds
+
+    if study.field:
+        return 0.0
+    method, size = study.method, len(study.names)
+    return own_seconds(size, data, method.solves(size, field=False), method.chains)
+
+
+def _moved(count: int, usable: list[Measurement]) -> str:
+    where = "" if all(m.on_surface for m in usable) else " outside the body"
+    are = f"point{where} is" if count == 1 else f"points{where} are"
+    farthest = max(m.moved.max(initial=0.0) for m in usable)
+    square = float(np.mean(np.concatenate([m.moved for m in usable]) ** 2))
+    rms = told(np.sqrt(square), "m")
+    return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
+
+
+def _of_outputs(study: Inversion) -> list[str]:
+    from inverse.methods.invert import derivable
+
+    spec, sets, method = study.spec, study.data.sets, study.method
+    counts = [len(found.values) for found in study.measurements if found is not None]
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        *(f"by          {one.description}" for one in study.reduced.values()),
+        f"unknown     {len(study.names)}: {', '.join(study.names)}",
+        f"outputs     {', '.join(study.parts)}",
+        f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
+        f"solves      about {study.solves // len(counts):,} for each",
+        *_predicted(study),
+    ]
+    cost, own = spec.cost(), _own_seconds(study, max(counts))
+    if cost is None:
+        derivable(study.spec.build(None, study.inputs.names), spec.kind)
+        each = f"up to about {duration(own)} for each, " if own else ""
+        lines.append(f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take")
+    else:
+        d = len(study.inputs.names)
+        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
+        seconds += own
+        if method.treatment is not None:
+            once, checked = mesh_check(spec)
+            seconds += once
+            lines.append(f"mesh check  {checked}")
+        else:
+            lines.append(f"mesh check  {NOT_ASKED}")
+        lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")
+    return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]
