@@ -16,10 +16,13 @@ from forward.model import (
     ForwardModel,
     Guess,
     MeshError,
+    NodalSpace,
     OfOne,
     OneByOne,
+    ReferenceSolution,
     Saturation,
     Solution,
+    SolveError,
     Stability,
     Work,
 )
@@ -232,7 +235,22 @@ class Mapped(OfOne):
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> MappedSolution:
         """Solve at q (d,)."""
-        return MappedSolution(self.model.solve(self.by.values(parameters[None])[0], guess), self.by)
+        return MappedSolution(self.model.solve(self.by.values(parameters[None])[0], mapped(guess, self.by)), self.by)
+
+
+def mapped(guess: Guess | None, by: Affine) -> Guess | None:
+    """Return a guess for parameters p of one for parameters q, by the map."""
+    if guess is None or guess.reference is None:
+        return guess
+    near = guess.reference
+    spread = None if near.spread is None else along(by, near.spread)
+    there = ReferenceSolution(by.values(near.parameters[None])[0], near.state, spread, near.joined)
+    return replace(guess, reference=there)
+
+
+def along(by: Affine, directions: FloatArray) -> FloatArray:
+    """Return A q (…, D) of directions q (…, d)."""
+    return by.along(np.atleast_2d(directions)).reshape(*np.shape(directions)[:-1], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,17 +259,13 @@ class MappedSolution(SolutionOfOne):
 
     by: Affine
 
-    def _along(self, direction: FloatArray) -> FloatArray:
-        found = self.by.along(np.atleast_2d(direction))
-        return found.reshape(*np.shape(direction)[:-1], -1)
-
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,); (k, m) for (k, d)."""
-        return self.solution.tangent(self._along(direction))
+        return self.solution.tangent(along(self.by, direction))
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state along a `direction` (d,), or of k of them."""
-        return self.solution.state_tangent(self._along(direction))
+        return self.solution.state_tangent(along(self.by, direction))
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m)."""
@@ -269,10 +283,20 @@ class Joined(OneByOne):
         The models.
     outputs
         Names of all outputs.
+    labels
+        What each is called where it has no answer; empty: nothing.
+    order
+        In which order their states, all of one length, stand side by side; empty: states of several meshes are none of
+        one.
+    space
+        Where these live.
     """
 
     models: tuple[ForwardModel, ...]
     outputs: tuple[str, ...]
+    labels: tuple[str, ...] = ()
+    order: tuple[int, ...] = ()
+    space: NodalSpace | None = None
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -284,19 +308,35 @@ class Joined(OneByOne):
         """Whether solutions have tangents and adjoints."""
         return all(model.differentiable for model in self.models)
 
-    @property
-    def space(self) -> None:
-        """States of several meshes are none of one."""
-        return
-
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
         """Solve all at `parameters` (d,)."""
-        return self.solve_each(parameters, [None] * len(self.models))
+        return self.solve_each(parameters, self.guesses(guess))
+
+    def guesses(self, guess: Guess | None) -> list[Guess | None]:
+        """Split a guess into those of the models."""
+        if guess is None or not self.order:
+            return [None] * len(self.models)
+        near, count = guess.reference, len(self.order)
+        states = [None] * count if guess.state is None else self.states(guess.state)
+        there = [None] * count if near is None else [replace(near, state=one) for one in self.states(near.state)]
+        return [replace(guess, state=u, reference=one) for u, one in zip(states, there, strict=True)]
+
+    def states(self, rows: FloatArray) -> list[FloatArray]:
+        """Split states (…, U), or this rank's part of them, into those of the models."""
+        parts = np.split(rows, len(self.order), axis=-1)
+        return [parts[place] for place in np.argsort(self.order)]
 
     def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess | None]) -> JoinedSolution:
         """Solve all at `parameters` (d,), each with its own guess."""
-        found = (model.solve(parameters, near) for model, near in zip(self.models, guesses, strict=True))
-        return JoinedSolution(tuple(found), len(parameters))
+        found = []
+        for k, (model, near) in enumerate(zip(self.models, guesses, strict=True)):
+            try:
+                found.append(model.solve(parameters, near))
+            except SolveError as error:
+                if not self.labels:
+                    raise
+                raise error.within(self.labels[k]) from error
+        return JoinedSolution(tuple(found), len(parameters), self.order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,14 +349,17 @@ class JoinedSolution:
         The solutions.
     count
         Number d of parameters.
+    order
+        As of `Joined`.
     """
 
     solutions: tuple[Solution, ...]
     count: int
+    order: tuple[int, ...]
 
     def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
         """Return states (…, U_local) of all, or changes of them, as one; of different meshes there is none (…, 0)."""
-        return np.zeros((*states[0].shape[:-1], 0))
+        return side_by_side(states, self.order)
 
     @cached_property
     def outputs(self) -> FloatArray:
@@ -388,11 +431,17 @@ class JoinedSolution:
             max(one.relative for one in known),
             Work.sum_of(one.work for one in known),
             nonlinearity=farthest(one.nonlinearity for one in known),
+            stored=sum(one.stored for one in known),
         )
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the errors of all meshes; None where there are none."""
         return together([(len(one.outputs), one.saturation(spare)) for one in self.solutions])
+
+
+def side_by_side(states: Sequence[FloatArray], order: Sequence[int]) -> FloatArray:
+    """Return states (…, U_local) in an order as one; none (…, 0) without an order."""
+    return np.concatenate([states[0][..., :0], *(states[k] for k in order)], axis=-1)
 
 
 def farthest(nonlinearities: Iterable[float]) -> float:

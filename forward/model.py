@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from itertools import repeat
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,7 +67,7 @@ class Work:
         return cls(*np.sum([work.as_array() for work in works], axis=0).tolist())
 
 
-WORK = tuple(field.name for field in fields(Work))
+WORK = tuple(one.name for one in fields(Work))
 
 
 class Stability(IntEnum):
@@ -116,6 +116,10 @@ class SolveError(Exception):
         self.work = work or Work()
         self.stability = stability
         self.reached = reached
+
+    def within(self, place: str) -> Self:
+        """Return the same with the name of a part of the model in front."""
+        return type(self)(f"{place}: {self.reason}", self.history, self.work, self.stability, self.reached)
 
 
 class InadmissibleError(SolveError):
@@ -240,6 +244,8 @@ class MeshError:
         What the estimate has cost.
     seen
         Errors of the outputs (m,) before they were calibrated; None where they are not.
+    stored
+        Energy (J) that is stored; NaN where nobody asks.
     nonlinearity
         How far its linear step was from solving the equations: 0 if they are linear; from 1 on, or NaN, the estimate
         is worth nothing.
@@ -252,6 +258,7 @@ class MeshError:
     work: Work
     seen: FloatArray | None = None
     nonlinearity: float = 0.0
+    stored: float = math.nan
 
     def calibrated(self, saturation: Saturation, ratios: ArrayLike = 1.0) -> MeshError:
         """Return the estimate of the whole error, with what elements of one degree more do not see.
@@ -563,8 +570,32 @@ class FunctionModel(OneByOne):
         return FunctionSolution(self, point, outputs)
 
 
-class WithoutMesh:
-    """A solution of a model that has no mesh whose error could be estimated."""
+class ExplicitSolution:
+    """A solution without a mesh, of which the derivatives (m, d) of the outputs are known, or quickly found."""
+
+    residual, converged, stability = 0.0, True, Stability.NOT_TESTED
+
+    @property
+    def state(self) -> FloatArray:
+        """No state: an empty array."""
+        return np.empty(0)
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Derivatives (m, d) of the outputs."""
+        raise NotImplementedError
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along `direction` (d,), or (k, m) for k of them."""
+        return np.asarray(direction) @ self.jacobian.T
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
+        return np.asarray(weights) @ self.jacobian
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """No state: empty."""
+        return np.empty((*np.shape(direction)[:-1], 0))
 
     def mesh_error(self) -> None:
         """No mesh."""
@@ -576,51 +607,23 @@ class WithoutMesh:
 
 
 @dataclass(frozen=True)
-class FunctionSolution(WithoutMesh):
+class FunctionSolution(ExplicitSolution):
     """The value of a `FunctionModel` at one parameter vector."""
 
     model: FunctionModel
     parameters: FloatArray
     outputs: FloatArray
+    work: Work = field(default_factory=Work)
 
     @property
-    def state(self) -> FloatArray:
-        """No state: an empty array."""
-        return np.empty(0)
+    def jacobian(self) -> FloatArray:
+        """Derivatives (m, d) of the outputs.
 
-    @property
-    def residual(self) -> float:
-        """Zero: there is nothing to solve."""
-        return 0.0
-
-    @property
-    def converged(self) -> bool:
-        """Always."""
-        return True
-
-    @property
-    def stability(self) -> Stability:
-        """There is no equilibrium that could be unstable."""
-        return Stability.NOT_TESTED
-
-    @property
-    def work(self) -> Work:
-        """No work is counted."""
-        return Work()
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along `direction` (d,), or (k, m) for k of them."""
-        return np.asarray(direction) @ self._jacobian().T
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return np.asarray(weights) @ self._jacobian()
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """No state: empty."""
-        return np.empty((*np.shape(direction)[:-1], 0))
-
-    def _jacobian(self) -> FloatArray:
+        Raises
+        ------
+        DerivativeError
+            If there are none.
+        """
         if self.model.jacobian is None:
             raise DerivativeError("this model was given without a jacobian, so it has no derivatives")
         jacobian = real(self.model.jacobian(self.parameters), "jacobian")

@@ -143,6 +143,12 @@ class Path(Hyperelastic):
         )
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """Which step each is, and the numbers there."""
+        where = [", ".join(f"{p} = {v[k]:g}" for p, v in self.steps.items()) for k in range(self.count)]
+        return tuple(f"step {k} of {self.count} ({numbers})" for k, numbers in enumerate(where, 1))
+
+    @property
     def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
         """Which output and which step each of these is, and the numbers that have steps there."""
         returned = self.returned
@@ -198,7 +204,7 @@ class Path(Hyperelastic):
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms on a communicator; collective. As `Hyperelastic.build`."""
-        model = "history:HistoryModel" if self.frictional else "path:PathModel"
+        model = "history:HistoryModel" if self.frictional else "path:built"
         return named(f"forward.fem.{model}")(self, comm, parameters)
 
     def _mistakes(self) -> Iterator[Mistake]:

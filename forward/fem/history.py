@@ -14,9 +14,11 @@ from typing import NamedTuple, Never
 
 import numpy as np
 
+from forward.combine import side_by_side
 from forward.fem.equations import Discretisation
 from forward.fem.model import RAISES, STIFFER, HyperelasticModel
-from forward.fem.path import PathSpace, joined
+from forward.fem.path import last_first, reached
+from forward.fem.space import JoinedSpace
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, MeshError, OneByOne, Saturation, SolveError, Stability, Work
 from forward.path import Path
@@ -83,7 +85,7 @@ class HistoryModel(OneByOne):
         self._paths = tuple(steps)
         self._each = spec.increments // len(self.values)
         self.equations.increments = spec.increments
-        self.space = PathSpace(self.body.space, len(self.values), self.along)
+        self.space = JoinedSpace(self.body.space, len(self.values), self.along, self.body.space.displacements)
         self.differentiable = True
 
     def along(self, direction: FloatArray) -> FloatArray:
@@ -192,14 +194,11 @@ class HistoryModel(OneByOne):
     ) -> Never:
         """Raise the reason with the outputs of the steps that were reached."""
         known = HistorySolution(self, parameters, tuple(passed), self.equations.work, stiffer).outputs
-        reached = np.full(len(self.outputs), np.nan)
-        reached[: len(known)] = known
-        reason = error.reason
-        if self._paths:
-            k = len(known) // len(self.body.outputs)
-            values = ", ".join(f"{path} = {v:g}" for path, v in zip(self._paths, self.values[k], strict=True))
-            reason = f"step {k + 1} of {len(self.values)} ({values}): {reason}"
-        raise type(error)(reason, history, self.equations.work, error.stability, reached) from error
+        stop = error
+        if isinstance(self.spec, Path):
+            stop = error.within(self.spec.labels[len(known) // len(self.body.outputs)])
+        found = reached([known], len(self.outputs))
+        raise type(error)(stop.reason, history, self.equations.work, error.stability, found) from error
 
 
 class HistorySolution:
@@ -211,7 +210,8 @@ class HistorySolution:
         self._model, self.passed, self.work, self.stiffer = model, passed, work, stiffer
         self.parameters = np.array(parameters, dtype=float)
         steps = [one for one in passed if one.at.returned]
-        self.state = joined([one.state for one in steps]) if len(steps) == len(model.values) else np.zeros(0)
+        whole = len(steps) == len(model.values)
+        self.state = side_by_side([one.state for one in steps], last_first(len(steps))) if whole else np.zeros(0)
         self.residual = max((one.residual for one in passed), default=0.0)
         self.converged = True
         self.stability = Stability.of_all([one.stability for one in passed] or [Stability.NOT_TESTED])
@@ -264,7 +264,7 @@ class HistorySolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
         found = [here for i, here, _ in self._forward(np.atleast_2d(direction)) if self.passed[i].at.returned]
-        return joined(found).reshape(*np.shape(direction)[:-1], -1)
+        return side_by_side(found, last_first(len(found))).reshape(*np.shape(direction)[:-1], -1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""

@@ -19,7 +19,7 @@ from forward.fem.enriched import Enriched, Enrichments
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor, WayFromReference
 from forward.fem.solution import FiniteElementSolution
-from forward.fem.space import BodySpace
+from forward.fem.space import BodySpace, Observation
 from forward.fem.together import by_reference, refused, task
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
@@ -77,6 +77,7 @@ class HyperelasticModel(OneByOne):
         self.equations = Discretisation(spec, comm, parameters)
         self.space = BodySpace(self.equations)
         self.differentiable = True
+        self.rows: Observation | None = None  # what is observed in place of the outputs
         self.functionals = [output.functional(self.equations) for output in spec.outputs]
         self._enrichments = Enrichments(spec, self.equations, self.functionals)
 
@@ -84,6 +85,20 @@ class HyperelasticModel(OneByOne):
     def reference(self) -> ReferenceFactor:
         """The factor at the last reference given."""
         return ReferenceFactor(self.equations)
+
+    def with_rows(self, rows: Observation, names: tuple[str, ...]) -> HyperelasticModel:
+        """Return the same model whose outputs, of these names, are what is observed; collective.
+
+        Raises
+        ------
+        ValueError
+            If a place is farther from the mesh than the mesh can be from the body.
+        """
+        rows.matrix(self.equations)
+        _ = self.reference  # which both share
+        other = copy.copy(self)
+        other.outputs, other.rows = names, rows
+        return other
 
     def with_own_reference(self) -> HyperelasticModel:
         """Return the same model with a reference factor of its own, which shares everything else with this one."""

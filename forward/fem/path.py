@@ -3,48 +3,51 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 from scipy.sparse import eye
 
-from forward.combine import JoinedSolution, MappedSolution, Sparse, together
+from forward.combine import Joined, JoinedSolution, Mapped, MappedSolution, Sparse, along, mapped, together
 from forward.fem.calibration import FinerMesh
+from forward.fem.equations import Discretisation
 from forward.fem.model import HyperelasticModel
 from forward.fem.solution import FiniteElementSolution
-from forward.fem.space import BodySpace, gather_each, scatter_each
-from forward.model import FloatArray, Guess, OneByOne, ReferenceSolution, Saturation, SolveError, Work
+from forward.fem.space import JoinedSpace
+from forward.model import FloatArray, Guess, Saturation, SolveError, Work
 from forward.path import Path
 
 FEW = 16  # parameters up to which derivatives of the states of all steps are kept
 
 
-class PathModel(OneByOne):
+@dataclass(frozen=True, eq=False)
+class PathModel(Joined):
     """A body along a path as a `ForwardModel`.
 
     Its outputs are those of the first step, then of the second, and so on. A state holds that of the last step, so that
     fields are those there, then those of the others in their order. Every step keeps a factor at its reference.
 
-    Parameters
+    Attributes
     ----------
     spec
         The body and its steps.
-    comm, parameters
-        As in `HyperelasticModel`.
+    steps
+        The body as a model at each step.
+    values
+        Values (steps, numbers) of the numbers that have steps.
     """
 
-    def __init__(self, spec: Path, comm: object, parameters: tuple[str, ...]) -> None:
-        self.spec, self.parameters = spec, parameters
-        self.outputs = tuple(output.name for output in spec.returned)
-        whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.steps))
-        self.steps = tuple(whole.with_own_reference() for _ in range(spec.count))
-        self.values = np.array(list(spec.steps.values())).T  # (steps, numbers that have steps)
-        self.equations = whole.equations
-        extended = eye(len(parameters) + len(spec.steps), len(parameters), format="csr")
-        self._maps = [Sparse(extended, np.append(np.zeros(len(parameters)), values)) for values in self.values]
-        self.space = PathSpace(whole.space, spec.count, self._maps[0].along)
-        self.differentiable = True
+    models: tuple[Mapped, ...]
+    _: KW_ONLY
+    spec: Path
+    steps: tuple[HyperelasticModel, ...]
+    values: FloatArray
+
+    @property
+    def equations(self) -> Discretisation:
+        """Those of all steps."""
+        return self.steps[0].equations
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> PathSolution:
         """Find the equilibria of all steps at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
@@ -55,25 +58,25 @@ class PathModel(OneByOne):
             With the step at which the path stops, and the outputs before.
         """
         solutions: list[StepSolution] = []
-        directions = np.eye(len(self.parameters))
+        directions = np.eye(len(parameters))
         soon = guess is not None and guess.derivatives and len(directions) <= FEW
-        for k, (model, given) in enumerate(zip(self.steps, self._guesses(guess or Guess()), strict=True)):
-            known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
+        for label, model, one, given in zip(
+            self.labels, self.steps, self.models, self.guesses(guess or Guess()), strict=True
+        ):
+            known = given
+            if given is None or given.state is None:
+                known = Guess(self._continued(solutions), iterations=None if given is None else given.iterations)
             try:
-                by = self._maps[k]
-                found = StepSolution(model.solve(by.values(parameters[None])[0], known), by)
+                found = StepSolution(model.solve(one.by.values(parameters[None])[0], mapped(known, one.by)), one.by)
                 if soon:  # while its factor is at hand: the next step needs the room
                     found = replace(found, slopes=found.state_tangent(directions))
                 solutions.append(found)
             except SolveError as error:
-                reached = np.full(len(self.outputs), np.nan)
-                for i, solution in enumerate(solutions):
-                    reached[i * len(model.outputs) : (i + 1) * len(model.outputs)] = solution.outputs
-                where = ", ".join(f"{path} = {v:g}" for path, v in zip(self.spec.steps, self.values[k], strict=True))
-                message = f"step {k + 1} of {len(self.steps)} ({where}): {error.reason}"
-                work = Work.sum_of([*(one.work for one in solutions), error.work])
-                raise type(error)(message, error.history, work, error.stability, reached) from error
-        return PathSolution(tuple(solutions), len(parameters), self)
+                stop = error.within(label)
+                stop.work = Work.sum_of([*(before.work for before in solutions), error.work])
+                stop.reached = reached([before.outputs for before in solutions], len(self.outputs))
+                raise stop from error
+        return PathSolution(tuple(solutions), len(parameters), self.order, self.steps[0])
 
     def _continued(self, solutions: Sequence[StepSolution]) -> FloatArray | None:
         """Predict the state (U_local,) of the next step from the last two."""
@@ -83,66 +86,41 @@ class PathModel(OneByOne):
         if len(solutions) == 1:
             return last
         before, here, there = self.values[len(solutions) - 2 : len(solutions) + 1]
-        along = here - before
-        ahead: float = (there - here) @ along / (along @ along)
+        step = here - before
+        ahead: float = (there - here) @ step / (step @ step)
         return last + ahead * (last - solutions[-2].state)
 
-    def _guesses(self, guess: Guess) -> Iterator[Guess]:
-        """Split a guess into those of the steps."""
-        near = guess.reference
-        for k, values in enumerate(self.values):
-            state = None if guess.state is None else self.states(guess.state)[k]
-            if near is None:
-                yield Guess(state, iterations=guess.iterations)
-            else:
-                spread = None
-                if near.spread is not None:
-                    spread = np.concatenate([near.spread, np.zeros((*near.spread.shape[:-1], len(values)))], axis=-1)
-                there = np.append(near.parameters, values)
-                reference = ReferenceSolution(there, self.states(near.state)[k], spread, near.joined)
-                yield Guess(state, reference, guess.iterations, audit=guess.audit)
 
-    def states(self, rows: FloatArray) -> list[FloatArray]:
-        """Split states (…, U) or parts of them into those of the steps, in their order."""
-        last, *others = np.split(rows, len(self.steps), axis=-1)
-        return [*others, last]
-
-
-def joined(parts: Sequence[FloatArray]) -> FloatArray:
-    """Join the states of the steps (…, U), the last first."""
-    *others, last = parts
-    return np.concatenate([last, *others], axis=-1)
+def built(spec: Path, comm: object, parameters: tuple[str, ...]) -> PathModel:
+    """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
+    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.steps))
+    steps = tuple(whole.with_own_reference() for _ in range(spec.count))
+    values = np.array(list(spec.steps.values())).T
+    extended = eye(len(parameters) + len(spec.steps), len(parameters), format="csr")
+    maps = [Sparse(extended, np.append(np.zeros(len(parameters)), of_step)) for of_step in values]
+    return PathModel(
+        tuple(Mapped(step, by, parameters) for step, by in zip(steps, maps, strict=True)),
+        tuple(output.name for output in spec.returned),
+        spec.labels,
+        last_first(spec.count),
+        JoinedSpace(whole.space, spec.count, maps[0].along, whole.space.displacements),
+        spec=spec,
+        steps=steps,
+        values=values,
+    )
 
 
-class PathSpace:
-    """The `NodalSpace` of a path: a state begins with the displacements of the last step.
+def last_first(count: int) -> tuple[int, ...]:
+    """Return the order of the states of steps."""
+    return count - 1, *range(count - 1)
 
-    Parameters
-    ----------
-    one
-        That of the body.
-    count
-        Number of steps.
-    along
-        Extends parameters (…, d) of the path to those of the body.
-    """
 
-    def __init__(self, one: BodySpace, count: int, along: Callable[[FloatArray], FloatArray]) -> None:
-        self.coordinates, self.displacements = one.coordinates, one.displacements
-        self.cells, self.regions, self.variance_kept = one.cells, one.regions, one.variance_kept
-        self._one, self._all, self._along = one, [one] * count, along
-
-    def gather(self, rows: FloatArray) -> FloatArray | None:
-        """Collect (k, U_local) as (k, U) on the first rank."""
-        return gather_each(self._all, np.split(rows, len(self._all), axis=1))
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Take this rank's part (k, U_local) of (k, U)."""
-        return scatter_each(self._all, rows)
-
-    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
-        """Return the factors (n, N) of each random field at parameters (n, d); collective."""
-        return self._one.factors(self._along(points), degree)
+def reached(known: Sequence[FloatArray], count: int) -> FloatArray:
+    """Return the outputs of the first steps among all, which are NaN."""
+    found = np.full(count, np.nan)
+    before = np.concatenate([found[:0], *known])
+    found[: len(before)] = before
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +136,7 @@ class StepSolution(MappedSolution):
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        return self.solution.along(self.state_tangent(direction), self._along(direction))
+        return self.solution.along(self.state_tangent(direction), along(self.by, direction))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +144,7 @@ class PathSolution(JoinedSolution):
     """The equilibria of all steps with their linearisations."""
 
     solutions: tuple[StepSolution, ...]
-    model: PathModel
-
-    def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
-        """Join states of the steps (…, U_local), the last first."""
-        return joined(states)
+    body: HyperelasticModel
 
     def touched(self) -> dict[str, FloatArray]:
         """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
@@ -182,5 +156,5 @@ class PathSolution(JoinedSolution):
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh, step by step on one finer mesh; collective."""
-        finer = FinerMesh(self.model.steps[0], spare)
+        finer = FinerMesh(self.body, spare)
         return together([(len(one.outputs), one.solution.saturation(spare, finer)) for one in self.solutions])

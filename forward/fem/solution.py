@@ -7,58 +7,29 @@ dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.fem.affordable import allowance, richer
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
-from forward.fem.reference import ReferenceFactor, WayFromReference
+from forward.fem.reference import WayFromReference
 from forward.fem.saturation import factors, typical
-from forward.fem.space import BodySpace
-from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Work
-from forward.observables.observable import Functional
 from forward.registry import named
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
 
+if TYPE_CHECKING:
+    from forward.fem.model import HyperelasticModel
+
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
-
-
-class SolvedModel(Protocol):
-    """What a solution asks of the model that found it."""
-
-    spec: Hyperelastic
-    parameters: tuple[str, ...]
-    equations: Discretisation
-    space: BodySpace
-    functionals: list[Functional]
-
-    @property
-    def enriched(self) -> Enriched:
-        """The body in elements of one degree higher, to estimate the error of its mesh."""
-
-    @property
-    def enriched_twice(self) -> Enriched | None:
-        """The same in elements of two degrees more; None where they take too much."""
-
-    def visit(self, solution: FiniteElementSolution) -> Discretisation:
-        """Set parameters and state to those of a solution."""
-
-    def linearise(self, solution: FiniteElementSolution) -> Discretisation:
-        """Factorise the stiffness at a solution."""
-
-    def has_factor(self, solution: FiniteElementSolution) -> bool:
-        """Whether the current factor is that of a solution."""
-
-    def take_reference(self, reference: ReferenceSolution) -> ReferenceFactor:
-        """Return the factor at a reference."""
 
 
 class FiniteElementSolution:
@@ -70,7 +41,7 @@ class FiniteElementSolution:
 
     def __init__(
         self,
-        model: SolvedModel,
+        model: HyperelasticModel,
         parameters: FloatArray,
         found: Found,
         work: Work,
@@ -88,8 +59,22 @@ class FiniteElementSolution:
         self.reference = None if way is None else way.reference
         self._rotation = None if way is None else way.rotation
         model.visit(self)
-        self.outputs = np.array([f.value() for f in model.functionals])
+        outputs = np.array([f.value() for f in model.functionals])
+        self.outputs = self._seen(model.equations, self.state, lambda: outputs)
         self.outputs.flags.writeable = False
+
+    def _seen(self, equations: Discretisation, states: FloatArray, outputs: Callable[[], FloatArray]) -> FloatArray:
+        """What is observed (…, n) of states (…, U_local) and outputs (…, m)."""
+        rows = self._model.rows
+        return outputs() if rows is None else rows.of(equations, states, outputs)
+
+    def _apart(self, weights: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Loads (…, U_local) and weights (…, m) of outputs that weights (…, n) of what is observed are."""
+        rows = self._model.rows
+        if rows is None:
+            return np.asarray(weights @ self._gradients), weights
+        loads, of_outputs = rows.apart(self._model.equations, weights, len(self._model.functionals))
+        return (loads + of_outputs @ self._gradients, of_outputs) if rows.of_outputs else (loads, None)
 
     def touched(self) -> dict[str, FloatArray]:
         """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices under each tool; collective."""
@@ -197,19 +182,22 @@ class FiniteElementSolution:
 
         For k of both, (k, m).
         """
-        return self._model.equations.total(state @ self._gradients.T) + direction @ self._partials.T
+        equations = self._model.equations
+
+        def outputs() -> FloatArray:
+            return equations.total(state @ self._gradients.T) + direction @ self._partials.T
+
+        return self._seen(equations, state, outputs)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        return self.state_adjoint(self.loads(weights)) + self.directly(weights)
+        loads, of_outputs = self._apart(weights)
+        found = self.state_adjoint(loads)
+        return found if of_outputs is None else found + of_outputs @ self._partials
 
     def loads(self, weights: FloatArray) -> FloatArray:
         """Return the derivative (U_local,) of outputs weighted by `weights` (m,) by the state; (k, U_local) of k."""
-        return np.asarray(weights @ self._gradients)
-
-    def directly(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) at this state of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return np.asarray(weights @ self._partials)
+        return self._apart(weights)[0]
 
     def state_adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the state weighted by `weights` (U_local,), or (k, d) for k of them; collective.
@@ -256,12 +244,14 @@ class FiniteElementSolution:
             If the stiffness in the enriched space is singular.
         """
         found, enriched = self.enriched_state, self._model.enriched
-        errors = enriched.values(self, found) - self.outputs
+        errors = self._seen(enriched.equations, found.state, lambda: enriched.values(self, found)) - self.outputs
         change = enriched.down(found.change)
         far = found.nonlinearity
-        return MeshError(errors, change, found.energy, found.relative, found.work, nonlinearity=far)
+        return MeshError(
+            errors, change, found.energy, found.relative, found.work, nonlinearity=far, stored=found.stored
+        )
 
-    def saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
+    def _saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
         """Find the state in elements of two degrees more too, and the factors of state and energy; collective.
 
         None where that takes too much memory, or is too rough.
@@ -299,21 +289,28 @@ class FiniteElementSolution:
         SolveError
             If a stiffness in an enriched space is singular.
         """
+        if self._model.rows is not None:
+            return self._by_degrees()
         if finer is None:
             finer = named("forward.fem.calibration:FinerMesh")(self._model, spare)
         with suppress(SolveError):
             found: Saturation | None = finer.calibrated(self)
             if found is not None:
                 return found
-        seen = self.mesh_error().outputs
         spec = self._model.spec
-        cheap = richer(spec) <= allowance(spec, spare)
-        saturated = self.saturated() if cheap else None
+        if richer(spec) > allowance(spec, spare):
+            return typical(self.mesh_error().outputs, spec.body.degree)
+        return self._by_degrees()
+
+    def _by_degrees(self) -> Saturation:
+        """Calibrate estimates by elements of two degrees more; typical values where that takes too much memory."""
+        seen, degree = self.mesh_error().outputs, self._model.spec.body.degree
+        saturated = self._saturated()
         if saturated is None:
-            return typical(seen, self._model.spec.body.degree)
+            return typical(seen, degree)
         twice, state, of_state, of_energy = saturated
-        more = twice.values(self, state) - self.outputs
-        return Saturation(factors(seen, more, self._model.spec.body.degree), of_state, of_energy)
+        more = self._seen(twice.equations, state.state, lambda: twice.values(self, state)) - self.outputs
+        return Saturation(factors(seen, more, degree), of_state, of_energy)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:
         """Return contributions of this rank's cells to the mesh error of outputs, by `weights` (m,); collective.

@@ -1,12 +1,13 @@
-"""The space in which the states of a finite-element body live, with the factors of its random fields."""
+"""The space in which the states of a finite-element body live, with its random fields, and what is observed there."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import tolerance
 from forward.bodies.mesh_file import MeshFile
@@ -32,32 +33,6 @@ class BodySpace:
         numbers = self._layout.by_cell(meshes.region_numbers(equations.comm, equations.spec.body, equations.mesh))
         return np.asarray(numbers, dtype=np.int64)
 
-    def interpolation(self, points: FloatArray) -> tuple[list[tuple[NDArray[np.int64], FloatArray]], FloatArray]:
-        """Return nodes and weights that interpolate at each of points (n, 3), and how far (n,) these lie outside.
-
-        Collective; on every rank.
-
-        Raises
-        ------
-        ValueError
-            If a point is farther (m) from the mesh than the mesh can be from the body.
-        """
-        equations, spec = self._equations, self._equations.spec.body
-        if not len(points):
-            return [], np.zeros(0)
-        found, distances = spaces.point_weights(equations.space, points)
-        far = np.flatnonzero(distances > max(tolerance(spec), spec.longest_edge))
-        if len(far):
-            where = ", ".join(f"{x:g}" for x in points[far[0]])
-            message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
-            raise ValueError(message)
-        numbers = self._layout.nodes()
-        mine = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
-        held: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
-        for part in equations.comm.allgather(mine):
-            held |= part
-        return [held[i] for i in range(len(points))], distances
-
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), by its name.
 
@@ -76,16 +51,127 @@ class BodySpace:
         return {field.field.label: field.kept for field in self._equations.fields}
 
 
-def gather_each(spaces: Sequence[BodySpace], parts: Sequence[FloatArray]) -> FloatArray | None:
-    """Collect states of several bodies, each (k, U_local), side by side (k, U) on the first rank; collective."""
-    whole = [found for space, part in zip(spaces, parts, strict=True) if (found := space.gather(part)) is not None]
-    return np.concatenate(whole, axis=1) if whole else None
+class JoinedSpace:
+    """The `NodalSpace` of several states of one body, side by side.
+
+    Parameters
+    ----------
+    one
+        That of the body.
+    count
+        Number of states.
+    along
+        Returns the parameters of the body that belong to parameters (n, d).
+    displacements
+        Number of displacements with which all of them begin; 0 if they are no displacement field.
+    """
+
+    def __init__(
+        self, one: BodySpace, count: int, along: Callable[[FloatArray], FloatArray], displacements: int
+    ) -> None:
+        self.coordinates, self.displacements = one.coordinates, displacements
+        self.cells, self.regions, self.variance_kept = one.cells, one.regions, one.variance_kept
+        self._one, self._count, self._along = one, count, along
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) as (k, U) on the first rank."""
+        parts = [self._one.gather(part) for part in np.split(rows, self._count, axis=1)]
+        whole = [part for part in parts if part is not None]
+        return np.concatenate(whole, axis=1) if whole else None
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U)."""
+        return np.concatenate([self._one.scatter(part) for part in np.split(rows, self._count, axis=1)], axis=1)
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d); collective."""
+        return self._one.factors(self._along(points), degree)
 
 
-def scatter_each(spaces: Sequence[BodySpace], rows: FloatArray) -> FloatArray:
-    """Take this rank's part (k, U_local) of states (k, U) of several bodies with equally many unknowns."""
-    parts = np.split(rows, len(spaces), axis=1)
-    return np.concatenate([space.scatter(part) for space, part in zip(spaces, parts, strict=True)], axis=1)
+class Observation:
+    """What is observed of a body, y = B u + S o: displacements at places, and some of its outputs o.
+
+    Parameters
+    ----------
+    places
+        Points (n, 3) of the undeformed body (m); those of outputs do not count.
+    directions
+        Unit vectors (n, 3) along which displacements are observed; zeros of outputs.
+    which
+        Numbers (n,) of the outputs; below 0 for displacements.
+    """
+
+    def __init__(self, places: FloatArray, directions: FloatArray, which: NDArray[np.int64]) -> None:
+        self._places, self._directions = places, directions
+        self._others = np.flatnonzero(which >= 0)
+        self._which = which[self._others]
+        self.of_outputs = len(self._others) > 0
+        self._matrices: dict[int, csr_matrix] = {}
+
+    def matrix(self, equations: Discretisation) -> csr_matrix:
+        """Return B (n, U_local) in the elements of some equations of the body; collective when first asked for.
+
+        Raises
+        ------
+        ValueError
+            If a place is farther from the mesh than the mesh can be from the body.
+        """
+        degree = equations.spec.body.degree
+        if degree not in self._matrices:
+            self._matrices[degree] = interpolation(equations, self._places, self._directions)
+        return self._matrices[degree]
+
+    def of(self, equations: Discretisation, states: FloatArray, outputs: Callable[[], FloatArray]) -> FloatArray:
+        """Return y (…, n) of states (…, U_local) and outputs (…, m), asked for where they count; collective."""
+        return self.with_outputs(equations.total((self.matrix(equations) @ states.T).T), outputs)
+
+    def with_outputs(self, displacements: FloatArray, outputs: Callable[[], FloatArray]) -> FloatArray:
+        """Return y (…, n) of displacements (…, n), which this changes, and outputs (…, m)."""
+        if self.of_outputs:
+            displacements[..., self._others] = outputs()[..., self._which]
+        return displacements
+
+    def apart(self, equations: Discretisation, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return weights (…, n) of y as those (…, U_local) of the state and those (…, count) of the outputs."""
+        of_outputs = weights[..., self._others] @ (self._which[:, None] == np.arange(count))
+        return (self.matrix(equations).T @ weights.T).T, of_outputs
+
+
+def interpolation(equations: Discretisation, places: FloatArray, directions: FloatArray) -> csr_matrix:
+    """Return B (n, U_local) of displacements at places (n, 3) along directions (n, 3); collective.
+
+    Outside the mesh, the displacement of the nearest point is meant. Rows without a direction are empty.
+
+    Raises
+    ------
+    ValueError
+        If a place is farther (m) from the mesh than the mesh can be from the body.
+    """
+    layout, body, moving = equations.layout, equations.spec.body, np.flatnonzero(directions.any(axis=1))
+    if not len(moving):
+        return csr_matrix((len(places), equations.size))
+    points, numbers = np.unique(places[moving], axis=0, return_inverse=True)
+    found, distances = spaces.point_weights(equations.space, points)
+    far = np.flatnonzero(distances > max(tolerance(body), body.longest_edge))
+    if len(far):
+        where = ", ".join(f"{x:g}" for x in points[far[0]])
+        message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
+        raise ValueError(message)
+    nodes = layout.nodes()
+    mine = {i: (nodes[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
+    held = {i: here for part in equations.comm.allgather(mine) for i, here in part.items()}
+    local = np.full(len(layout.coordinates), -1)
+    local[layout.positions] = np.arange(len(layout.positions))
+    rows, columns, values = [], [], []
+    for row, i in zip(moving, numbers.ravel(), strict=True):
+        at, w = held[i]
+        owned = local[at] >= 0
+        for axis in np.flatnonzero(directions[row]):
+            rows.append(np.full(owned.sum(), row))
+            columns.append(3 * local[at][owned] + axis)
+            values.append(directions[row, axis] * w[owned])
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return csr_matrix(entries, shape=(len(places), equations.size))
 
 
 def log_factor(model: Any, points: FloatArray, of: str) -> FloatArray:

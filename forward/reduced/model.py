@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
-from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, WithoutMesh, Work
+from forward.model import (
+    ExplicitSolution,
+    FloatArray,
+    ForwardModel,
+    Guess,
+    OneByOne,
+    Solution,
+    SolveError,
+    Stability,
+    Work,
+)
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
@@ -258,10 +268,8 @@ class ReducedSpace:
         return {label: kept for (label, _), (_, _, kept) in pairs}
 
 
-class ReducedSolution(WithoutMesh):
+class ReducedSolution(ExplicitSolution):
     """An equilibrium of a reduced model, with its linearisation and an estimate of its error."""
-
-    residual, converged = 0.0, True
 
     def __init__(
         self,
@@ -332,14 +340,6 @@ class ReducedSolution(WithoutMesh):
         free = model.level.free
         found = by_state[:, free] @ self.slopes[free] + directly[:, model.places]
         return np.asarray(found)
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
-        return np.asarray(direction) @ self.jacobian.T
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return np.asarray(weights) @ self.jacobian
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U,) along a `direction` (d,), or (k, U) for k of them."""

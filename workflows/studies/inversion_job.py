@@ -376,8 +376,8 @@ def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
     found = zip(study.reduced.values(), bodies, acting, strict=True)
     models = tuple(one.standing_for(body, paths) for one, body, paths in found)
-    specimen = named("forward.reduced.specimen:ReducedSpecimen")
-    return lambda observed: cast("ForwardModel", specimen.of(observed, models))
+    observed_by = named("forward.reduced.specimen:observed_by")
+    return lambda observed: cast("ForwardModel", observed_by(observed, models))
 
 
 def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:

@@ -110,6 +110,7 @@ def test_tangent_and_adjoint_of_a_solution():
         visit=lambda _: equations,
         linearise=lambda _: equations,
         functionals=functionals(equations),
+        rows=None,
     )
     found = SimpleNamespace(state=np.zeros(SIZE), residual=0.0, converged=True, stability=Stability.COUNTED)
     solution = FiniteElementSolution(model, np.zeros(SCALARS + FIELD), found, None, None)
@@ -124,9 +125,13 @@ def test_errors_of_the_mesh_are_what_richer_elements_add():
     equations = Equations(1)
     change, enriched_outputs = RNG.normal(size=SIZE), np.array([3.0, -2.0])
     richer = EnrichedState(change, change, 2.0, 8.0, 0.1, Work(), np.zeros(SIZE), change, np.zeros(SIZE))
-    enriched = SimpleNamespace(state=lambda _: richer, values=lambda *_: enriched_outputs, down=lambda x: 2 * x)
+    enriched = SimpleNamespace(
+        state=lambda _: richer, values=lambda *_: enriched_outputs, down=lambda x: 2 * x, equations=None
+    )
     outputs = [SimpleNamespace(value=lambda: 1.0), SimpleNamespace(value=lambda: 0.5)]
-    model = SimpleNamespace(visit=lambda _: equations, functionals=outputs, enriched=enriched)
+    model = SimpleNamespace(
+        visit=lambda _: equations, functionals=outputs, enriched=enriched, rows=None, equations=None
+    )
     found = SimpleNamespace(state=np.zeros(SIZE), residual=0.0, converged=True, stability=Stability.COUNTED)
     error = FiniteElementSolution(model, np.zeros(2), found, Work(), None).mesh_error()
     np.testing.assert_allclose(error.outputs, [2.0, -2.5])  # exact minus computed

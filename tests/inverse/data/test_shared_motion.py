@@ -54,8 +54,8 @@ def observed(cube, where, states):
     """Values (k, m) of states (k, U) at places, along directions, in load cases."""
     model, _ = cube
     other = model.observing(*where)
-    parts = zip(other.observations, other.states(np.atleast_2d(states)), strict=True)
-    return np.concatenate([(B @ u.T).T for B, u in parts], axis=-1)
+    parts = zip(other.bodies, other.states(np.atleast_2d(states)), strict=True)
+    return np.concatenate([(body.rows.matrix(body.equations) @ u.T).T for body, u in parts], axis=-1)
 
 
 def motion_of(scan, cube, *, root, between=None):
