@@ -56,7 +56,7 @@ def expanded() -> tuple[Inversion, SharedExpansion, SharedExpansion]:
     own, other = study(OWN), study(OTHER)
     names = own.inputs.names
     model: Any = own.spec.build(MPI.COMM_SELF, names)
-    finer = SerialEvaluate(extrapolated(model, own.inputs.mean).restricted())
+    finer = SerialEvaluate(extrapolated(model, own.inputs.mean).of(model))
     mine = shared_expansion(own.inputs, SerialEvaluate(model), finer, SOLVES)
     truth = other.spec.build(MPI.COMM_SELF, names)
     return own, mine, shared_expansion(own.inputs, SerialEvaluate(truth), None, SOLVES)

@@ -52,7 +52,7 @@ def main(specimens: int = 100, inverted: int = 3) -> None:
     assert isinstance(study, Inversion)
     inputs = study.inputs
     model: Any = study.specimen.build(MPI.COMM_SELF, inputs.names)
-    finer = extrapolated(model, inputs.mean).observing(model)
+    finer = extrapolated(model, inputs.mean).of(model)
     truths = inputs.points(random_points(SEED, 0, 2 * specimens, len(inputs.names)))
     made = _made(inputs, truths, specimens)
 

@@ -175,7 +175,7 @@ def main(words: Sequence[str] = ()) -> None:
     given = parser.parse_args(words)
     inputs, mesh = Inputs(PRIORS), f"{given.cells}-{given.degree}-{given.seed}"
     model: SpecimenModel = specimen(given.cells, given.degree).build(MPI.COMM_SELF, PARAMETERS)
-    case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).observing(model)))
+    case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).of(model)))
     truths, clean = balls(model, inputs, max(given.truths, given.inverted), given.seed)
     if given.truths:
         expect(case, [known(case, truth) for truth in truths[: given.truths]], clean[: given.truths])

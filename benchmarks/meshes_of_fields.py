@@ -113,7 +113,7 @@ def _problem(spec: Specimen) -> Problem:
     model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
     prior = spec.fields[0].prior(spec.body)
     root = prior.root(np.eye(len(prior.variance))).T
-    finer = solved_on(extrapolated(model, np.zeros(len(root))).observing(model))
+    finer = solved_on(extrapolated(model, np.zeros(len(root))).of(model))
     return Problem(model, prior, root, model.log_fields(np.zeros((1, len(root))))[0], finer)
 
 

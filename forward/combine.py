@@ -34,55 +34,6 @@ def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class SolutionOfOne:
-    """What a solution has of the one that it is made of."""
-
-    solution: Solution
-
-    @property
-    def outputs(self) -> FloatArray:
-        """Values of the outputs (m,)."""
-        return self.solution.outputs
-
-    @property
-    def state(self) -> FloatArray:
-        """This rank's part of the state."""
-        return self.solution.state
-
-    @property
-    def residual(self) -> float:
-        """Relative residual of the state."""
-        return self.solution.residual
-
-    @property
-    def converged(self) -> bool:
-        """Whether that meets the solver's tolerance."""
-        return self.solution.converged
-
-    @property
-    def stability(self) -> Stability:
-        """What is known of the stability of the equilibrium."""
-        return self.solution.stability
-
-    @property
-    def work(self) -> Work:
-        """What it has cost so far."""
-        return self.solution.work
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state along a `direction` (d,), or of k of them."""
-        return self.solution.state_tangent(direction)
-
-    def mesh_error(self) -> MeshError | None:
-        """Estimate the error that the mesh makes; None without a mesh."""
-        return self.solution.mesh_error()
-
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the error of the mesh; None without a mesh."""
-        return self.solution.saturation(spare)
-
-
-@dataclass(frozen=True, eq=False)
 class Rows(OfOne):
     """A model whose outputs are sums y = S o of the outputs o of another one.
 
@@ -105,9 +56,9 @@ class Rows(OfOne):
         """Names of the sums."""
         return self.names
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> RowsSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
         """Solve as the other model does."""
-        return RowsSolution(self.model.solve(parameters, guess), self.S)
+        return DerivedSolution(self.model.solve(parameters, guess), S=self.S)
 
 
 def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
@@ -118,55 +69,6 @@ def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
     )
     entries = np.ones(len(names)), np.array(which, dtype=np.int64), np.arange(len(names) + 1)
     return Rows(model, csr_matrix(entries, shape=(len(names), len(model.outputs))), numbered)
-
-
-@dataclass(frozen=True, eq=False)
-class RowsSolution(SolutionOfOne):
-    """Sums of the outputs of a solution."""
-
-    S: csr_matrix
-
-    @property
-    def outputs(self) -> FloatArray:
-        """Values of the sums (n,)."""
-        return times(self.S, self.solution.outputs)
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the sums (n,) along a `direction` (d,); (k, n) for (k, d)."""
-        return times(self.S, self.solution.tangent(direction))
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the sums weighted by `weights` (n,); (k, d) for (k, n)."""
-        return self.solution.adjoint(times(self.S.T, weights))
-
-    def mesh_error(self) -> MeshError | None:
-        """Estimate the error that the mesh makes; None without a mesh."""
-        found = self.solution.mesh_error()
-        if found is None:
-            return None
-        seen = None if found.seen is None else times(self.S, found.seen)
-        return replace(found, outputs=times(self.S, found.outputs), seen=seen)
-
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the error of the mesh; None without a mesh.
-
-        The factor of a sum of several outputs is that by which its error grows where theirs grow by their own.
-        """
-        found = self.solution.saturation(spare)
-        if found is None:
-            return None
-        alone = np.diff(self.S.indptr) == 1
-        factors = np.ones(len(alone))
-        factors[alone] = found.outputs[self.S.indices[self.S.indptr[:-1][alone]]]
-        if not alone.all():
-            error = self.solution.mesh_error()
-            assert error is not None  # of a model with a mesh
-            before, after = times(self.S, error.outputs), times(self.S, found.outputs * error.outputs)
-            some = ~alone & (before != 0)
-            factors[some] = after[some] / before[some]
-        shifts = None if found.shifts is None else times(self.S, found.shifts)
-        doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
-        return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
 
 
 class Affine(Protocol):
@@ -233,9 +135,9 @@ class Mapped(OfOne):
         """Names of q."""
         return self.names
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> MappedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
         """Solve at q (d,)."""
-        return MappedSolution(self.model.solve(self.by.values(parameters[None])[0], mapped(guess, self.by)), self.by)
+        return DerivedSolution(self.model.solve(self.by.values(parameters[None])[0], mapped(guess, self.by)), self.by)
 
 
 def mapped(guess: Guess | None, by: Affine) -> Guess | None:
@@ -254,23 +156,90 @@ def along(by: Affine, directions: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class MappedSolution(SolutionOfOne):
-    """A solution with derivatives by other parameters."""
+class DerivedSolution:
+    """A solution by sums S o of the outputs of another one, or by other parameters, or both."""
 
-    by: Affine
+    solution: Solution
+    by: Affine | None = None
+    S: csr_matrix | None = None
+
+    @property
+    def outputs(self) -> FloatArray:
+        """Values of the outputs (n,)."""
+        return self._sums(self.solution.outputs)
+
+    @property
+    def state(self) -> FloatArray:
+        """This rank's part of the state."""
+        return self.solution.state
+
+    @property
+    def residual(self) -> float:
+        """Relative residual of the state."""
+        return self.solution.residual
+
+    @property
+    def converged(self) -> bool:
+        """Whether that meets the solver's tolerance."""
+        return self.solution.converged
+
+    @property
+    def stability(self) -> Stability:
+        """What is known of the stability of the equilibrium."""
+        return self.solution.stability
+
+    @property
+    def work(self) -> Work:
+        """What it has cost so far."""
+        return self.solution.work
+
+    def _sums(self, rows: FloatArray) -> FloatArray:
+        return rows if self.S is None else times(self.S, rows)
+
+    def _directions(self, direction: FloatArray) -> FloatArray:
+        return direction if self.by is None else along(self.by, direction)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,); (k, m) for (k, d)."""
-        return self.solution.tangent(along(self.by, direction))
+        """Return the derivative of the outputs (n,) along a `direction` (d,); (k, n) for (k, d)."""
+        return self._sums(self.solution.tangent(self._directions(direction)))
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state along a `direction` (d,), or of k of them."""
-        return self.solution.state_tangent(along(self.by, direction))
+        return self.solution.state_tangent(self._directions(direction))
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m)."""
-        found = self.by.back(np.atleast_2d(self.solution.adjoint(weights)))
-        return found.reshape(*np.shape(weights)[:-1], -1)
+        """Return the gradient (d,) of the outputs weighted by `weights` (n,); (k, d) for (k, n)."""
+        found = self.solution.adjoint(weights if self.S is None else times(self.S.T, weights))
+        return found if self.by is None else self.by.back(np.atleast_2d(found)).reshape(*np.shape(weights)[:-1], -1)
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the error that the mesh makes; None without a mesh."""
+        found = self.solution.mesh_error()
+        if found is None or self.S is None:
+            return found
+        seen = None if found.seen is None else times(self.S, found.seen)
+        return replace(found, outputs=times(self.S, found.outputs), seen=seen)
+
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh; None without a mesh.
+
+        The factor of a sum of several outputs is that by which its error grows where theirs grow by their own.
+        """
+        found = self.solution.saturation(spare)
+        if found is None or self.S is None:
+            return found
+        alone = np.diff(self.S.indptr) == 1
+        factors = np.ones(len(alone))
+        factors[alone] = found.outputs[self.S.indices[self.S.indptr[:-1][alone]]]
+        if not alone.all():
+            error = self.solution.mesh_error()
+            assert error is not None  # of a model with a mesh
+            before, after = times(self.S, error.outputs), times(self.S, found.outputs * error.outputs)
+            some = ~alone & (before != 0)
+            factors[some] = after[some] / before[some]
+        shifts = None if found.shifts is None else times(self.S, found.shifts)
+        doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
+        return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,13 +20,14 @@ import numpy as np
 from forward.fem.cost import MOST_BYTES
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
-from forward.fem.enriched_equations import EnrichedEquations, Moved, Solved
+from forward.fem.enriched_equations import EnrichedEquations
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
 
 if TYPE_CHECKING:
+    from forward.fem.solution import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
 
 
@@ -162,7 +163,7 @@ class Enriched(EnrichedEquations):
     def _rule(self) -> Rule:
         return RULES[self.way == Way.SMOOTHING, self.equations.spec.mixed]
 
-    def state(self, solution: Solved, bent: float | None = None) -> EnrichedState:
+    def state(self, solution: FiniteElementSolution, bent: float | None = None) -> EnrichedState:
         """Find u_h + e; collective.
 
         Parameters
@@ -187,14 +188,14 @@ class Enriched(EnrichedEquations):
         energy = 0.5 * equations.curvature(change, forces)
         equations.set_state(start)
         stored = float(self._stored())
-        left = self.imbalance(Moved(solution, start + change))
+        left = self.imbalance(solution, start + change)
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         found = EnrichedState(start + change, change, energy, stored, far, Work(), start, change, start)
         if bent is None:
             bent = self._rule.bent
         return self._nearer(solution, found, left, bent, once=True)
 
-    def nearer(self, solution: Solved, found: EnrichedState, bent: float) -> EnrichedState:
+    def nearer(self, solution: FiniteElementSolution, found: EnrichedState, bent: float) -> EnrichedState:
         """Go on from a state that was found until its nonlinearity is below `bent`; collective.
 
         Raises
@@ -203,10 +204,10 @@ class Enriched(EnrichedEquations):
             If the stiffness is singular.
         """
         self.equations.work = Work()
-        return self._nearer(solution, found, self.imbalance(Moved(solution, found.state)), bent, once=False)
+        return self._nearer(solution, found, self.imbalance(solution, found.state), bent, once=False)
 
     def _nearer(
-        self, solution: Solved, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
+        self, solution: FiniteElementSolution, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
     ) -> EnrichedState:
         """Take steps of Newton's method, of which `left` is the imbalance at first; one if its stiffness is an old one.
 
@@ -221,13 +222,12 @@ class Enriched(EnrichedEquations):
             if not near and self.way == Way.SMOOTHING and equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
-            moved = Moved(solution, found.state)
-            at, close = (solution, rule.further) if near else (moved, rule.other)
-            (step,) = self.solve(at, -left[None], close)
+            at, close = (None, rule.further) if near else (found.state, rule.other)
+            (step,) = self.solve(solution, -left[None], close, at=at)
             change = found.change + step
             before, linearised = found.state, start if near else found.state
             found = found._replace(state=start + change, change=change, before=before, step=step, linearised=linearised)
-            left = self.imbalance(Moved(solution, found.state))
+            left = self.imbalance(solution, found.state)
             closer = nonlinearity(found.energy, found.stored, equations.curvature(change, left))
             settled = closer < NEAR and near  # where pressures and displacements cancel, work says little
             far = closer if closer < far or settled else np.inf
@@ -235,22 +235,22 @@ class Enriched(EnrichedEquations):
                 break
         return found._replace(nonlinearity=far, work=equations.work)
 
-    def values(self, solution: Solved, found: EnrichedState) -> FloatArray:
+    def values(self, solution: FiniteElementSolution, found: EnrichedState) -> FloatArray:
         """Return the outputs (m,) at a state found from a solution; NaN where not estimated.
 
         Outputs of the balance of forces are linearised along the last step, as the equations that it solves: at the
         state itself, what is left of second order would count as a force.
         """
         forces = {i: f for i, f in enumerate(self._functionals) if f is not None and self._of_forces[i]}
-        equations = self.visit(Moved(solution, found.linearised))
+        equations = self.visit(solution, found.linearised)
         slopes = {i: equations.dot(f.gradient(), found.step) for i, f in forces.items()}
-        self.visit(Moved(solution, found.before))
+        self.visit(solution, found.before)
         linear = {i: f.value() + slopes[i] for i, f in forces.items()}
-        self.visit(Moved(solution, found.state))
+        self.visit(solution, found.state)
         known = [np.nan if f is None or i in linear else f.value() for i, f in enumerate(self._functionals)]
         return np.array([linear.get(i, value) for i, value in enumerate(known)])
 
-    def adjoints(self, solution: Solved, weights: FloatArray) -> FloatArray:
+    def adjoints(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
         """Return z⁺ (k, U⁺_local) with K⁺ᵀz⁺ = ∂ψ/∂u of outputs weighted by `weights` (k, m); collective.
 
         Raises
@@ -268,7 +268,7 @@ class Enriched(EnrichedEquations):
         loads[:, self.equations.fixed] = 0
         return self.solve(solution, loads, self._rule.other, transpose=True)
 
-    def indicators(self, solution: Solved, weights: FloatArray) -> FloatArray:
+    def indicators(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
         """Return contributions (k, n_cells) of this rank's cells to the error of outputs weighted by (k, m); ≥ 0.
 
         The size of the dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i is

@@ -6,9 +6,8 @@ method without a factor leave to the stiffness of the body what a coarser space 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from forward.solvers.anderson import block_galerkin
 from forward.solvers.multigrid import minimised, smoothed
 
 if TYPE_CHECKING:
+    from forward.fem.solution import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
 
 
@@ -30,61 +30,6 @@ STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 LITTLE = 0.01  # the same before the steps, after which these forces are met again
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
-
-
-class Solved(Protocol):
-    """A solution of the body."""
-
-    @property
-    def parameters(self) -> FloatArray:
-        """Parameters (d,)."""
-
-    @property
-    def state(self) -> FloatArray:
-        """This rank's part (U_local,) of the state."""
-
-    @property
-    def stiffer(self) -> float:
-        """Factor on the stiffness of tools."""
-
-    @property
-    def reference(self) -> ReferenceSolution | None:
-        """The nearby solution whose factor was used to find it."""
-
-    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
-        """Solve with the stiffness of the body at this state, or its transpose, for rows (k, U_local)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """A solution of the body, moved to a state (U⁺_local,) of the enriched space."""
-
-    origin: Solved
-    enriched: FloatArray
-
-    @property
-    def parameters(self) -> FloatArray:
-        """Parameters (d,)."""
-        return self.origin.parameters
-
-    @property
-    def state(self) -> FloatArray:
-        """State (U_local,) of the solution itself."""
-        return self.origin.state
-
-    @property
-    def stiffer(self) -> float:
-        """As of the solution."""
-        return self.origin.stiffer
-
-    @property
-    def reference(self) -> ReferenceSolution | None:
-        """As of the solution."""
-        return self.origin.reference
-
-    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
-        """Solve with the stiffness of the body at the solution itself, for rows (k, U_local)."""
-        return self.origin.solve(right, transpose=transpose, tolerance=tolerance)
 
 
 class EnrichedEquations:
@@ -115,7 +60,7 @@ class EnrichedEquations:
         self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
         cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
         self.way, self._alone = cost.way, cost.alone
-        self._blocks: tuple[ReferenceSolution | Solved, Preconditioner | None] | None = None
+        self._blocks: tuple[ReferenceSolution | FiniteElementSolution, Preconditioner | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
         """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
@@ -132,33 +77,38 @@ class EnrichedEquations:
         parts = np.split(forces, [3 * self.equations.nodes_owned])
         return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
 
-    def _state_of(self, solution: Solved) -> FloatArray:
-        return solution.enriched if isinstance(solution, Moved) else self.up(solution.state)
-
-    def visit(self, solution: Solved) -> Discretisation:
-        """Set parameters, loads and state to those of a solution of the body."""
-        equations = self.equations
-        if equations.latest.solution is not solution:
+    def visit(self, solution: FiniteElementSolution, at: FloatArray | None = None) -> Discretisation:
+        """Set parameters, loads and state to those of a solution of the body, or to a state (U⁺_local,) near it."""
+        equations, key = self.equations, solution if at is None else at
+        if equations.latest.solution is not key:
             equations.set_parameters(solution.parameters, solution.stiffer)
             equations.at_load(1.0)
-            equations.set_state(self._state_of(solution))
-            equations.latest.solution = solution
+            equations.set_state(self.up(solution.state) if at is None else at)
+            equations.latest.solution = key
         return equations
 
-    def imbalance(self, solution: Solved) -> FloatArray:
-        """F⁺(u_h) (U⁺_local,) of a solution, zero on prescribed unknowns."""
-        equations = self.visit(solution)
+    def imbalance(self, solution: FiniteElementSolution, at: FloatArray | None = None) -> FloatArray:
+        """F⁺ (U⁺_local,) at a solution, or at a state near it, zero on prescribed unknowns."""
+        equations = self.visit(solution, at)
         forces = equations.imbalance()
         equations.work.residuals += 1
         forces[equations.fixed] = 0
         return forces
 
-    def solve(self, solution: Solved, right: FloatArray, close: float, *, transpose: bool = False) -> FloatArray:
+    def solve(
+        self,
+        solution: FiniteElementSolution,
+        right: FloatArray,
+        close: float,
+        *,
+        transpose: bool = False,
+        at: FloatArray | None = None,
+    ) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns; collective.
 
         To rounding with its own factor, else to the tolerance `close`: relative to the solution with the factor of a
         reference; of steps without a factor, the part that may be missing of the energy or, with pressures, of the
-        forces.
+        forces. With `at`, K⁺ is that at a state (U⁺_local,) near the solution.
 
         Raises
         ------
@@ -166,17 +116,17 @@ class EnrichedEquations:
             If the stiffness is singular.
         """
         found = None
-        if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
+        if self.way == Way.SMOOTHING and at is None:  # where K(u_h) is near
             found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
-            found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
+            found = self._solve_near(solution, solution.reference, right, close, at, transpose=transpose)
         if found is None:
-            self._factorise(solution)
+            self._factorise(solution, at)
             found = self.equations.back_substitute(right, transpose=transpose)
         return found
 
     def _solve_by_smoothing(
-        self, solution: Solved, right: FloatArray, close: float, *, transpose: bool
+        self, solution: FiniteElementSolution, right: FloatArray, close: float, *, transpose: bool
     ) -> FloatArray | None:
         """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
 
@@ -208,7 +158,9 @@ class EnrichedEquations:
         left = right - np.array([multiply(x) for x in found])
         return found + self._on_the_body(solution, left, ORTHOGONAL, transpose=transpose)
 
-    def _on_the_body(self, solution: Solved, right: FloatArray, negligible: float, *, transpose: bool) -> FloatArray:
+    def _on_the_body(
+        self, solution: FiniteElementSolution, right: FloatArray, negligible: float, *, transpose: bool
+    ) -> FloatArray:
         """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
         forces = np.array([self.restrict(row) for row in right])
         forces[:, self._coarse.fixed] = 0
@@ -222,10 +174,9 @@ class EnrichedEquations:
         self.visit(solution)
         return found
 
-    def _preconditioner(self, solution: Solved) -> Preconditioner | None:
+    def _preconditioner(self, solution: FiniteElementSolution) -> Preconditioner | None:
         """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
-        origin = solution.origin if isinstance(solution, Moved) else solution
-        at: ReferenceSolution | Solved = origin.reference or origin
+        at = solution.reference or solution
         if self._blocks is None or not _same(self._blocks[0], at):
             equations = self.equations
             kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
@@ -241,7 +192,14 @@ class EnrichedEquations:
         return ReferenceFactor(self.equations)
 
     def _solve_near(
-        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, close: float, *, transpose: bool
+        self,
+        solution: FiniteElementSolution,
+        reference: ReferenceSolution,
+        right: FloatArray,
+        close: float,
+        at: FloatArray | None,
+        *,
+        transpose: bool,
     ) -> FloatArray | None:
         """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
         equations = self.equations
@@ -249,8 +207,8 @@ class EnrichedEquations:
             equations.release()
         known = ReferenceSolution(reference.parameters, self.up(reference.state))
         self._reference.prepare(known)
-        R = self._reference.rotation(self._state_of(solution))
-        self.visit(solution)
+        R = self._reference.rotation(self.up(solution.state) if at is None else at)
+        self.visit(solution, at)
         return block_galerkin(
             lambda x: equations.free_stiffness_times(x, transpose=transpose),
             self._reference.inverse(R, transpose=transpose),
@@ -261,16 +219,16 @@ class EnrichedEquations:
             ITERATIONS,
         )
 
-    def _factorise(self, solution: Solved) -> None:
-        equations = self.visit(solution)
-        if equations.latest.factorised is not solution:
+    def _factorise(self, solution: FiniteElementSolution, at: FloatArray | None) -> None:
+        equations, key = self.visit(solution, at), solution if at is None else at
+        if equations.latest.factorised is not key:
             if self._alone:
                 self._reference.release()
-            equations.factorise(self._state_of(solution))
-            equations.latest.factorised = equations.latest.solution = solution
+            equations.factorise(self.up(solution.state) if at is None else at)
+            equations.latest.factorised = equations.latest.solution = key
 
 
-def _same(one: ReferenceSolution | Solved, other: ReferenceSolution | Solved) -> bool:
+def _same(one: ReferenceSolution | FiniteElementSolution, other: ReferenceSolution | FiniteElementSolution) -> bool:
     if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
         return one.same(other)
     return one is other

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
-from forward.combine import Joined, Mapped, MappedSolution, Rows
+from forward.combine import DerivedSolution, Joined, Mapped, Rows
 from forward.extrapolated import HALVED, Begun, FromStart, Otherwise, limit
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
 
@@ -224,25 +224,22 @@ class FinerMeshes:
         self.otherwise = otherwise
         self._begun: list[Begun | SolveError] = []
 
-    def observing(self, observed: SpecimenModel) -> ForwardModel:
-        """Return the model of what is `observed` of a specimen; collective when it is first solved."""
-        coarse = observed if self.coarse is None else self.coarse.observing(observed)
-        otherwise = None if self.otherwise is None else self.otherwise.observing(observed)
-        return self._limit(self.fine.observing(observed), coarse, None, otherwise)
+    def of(self, observed: ForwardModel) -> ForwardModel:
+        """Return the model of what a model of the body has as outputs; collective when it is first solved.
 
-    def restricted(self, to: Rows | None = None) -> ForwardModel:
-        """Return the model of its outputs, or of those rows of them that a model has; as `observing`."""
-        otherwise = None if self.otherwise is None else self.otherwise.restricted(to)
-        return self._limit(self.fine, self.coarse or self.own, to, otherwise)
-
-    def _limit(
-        self, fine: ForwardModel, coarse: ForwardModel, to: Rows | None, otherwise: ForwardModel | None
-    ) -> ForwardModel:
-        both = Joined((fine, coarse), (*fine.outputs, *(f"{name} (coarse)" for name in fine.outputs)))
-        begun = FromStart(both, self.start, self._begun, otherwise is not None)
-        observed = csr_matrix(identity(len(fine.outputs))) if to is None else to.S
-        found = limit(begun, observed, (to or fine).outputs, self.share)
-        return found if otherwise is None else Otherwise(found, otherwise)
+        Parameters
+        ----------
+        observed
+            The body itself, what is observed of a specimen, or `Rows` of either.
+        """
+        rows = observed if isinstance(observed, Rows) else None
+        body = observed if rows is None else rows.model
+        fine, coarse = (body if mesh is None else mesh.of(body) for mesh in (self.fine, self.coarse))
+        both = Joined((fine, coarse), (*body.outputs, *(f"{name} (coarse)" for name in body.outputs)))
+        begun = FromStart(both, self.start, self._begun, self.otherwise is not None)
+        weights = csr_matrix(identity(len(body.outputs))) if rows is None else rows.S
+        found = limit(begun, weights, observed.outputs, self.share)
+        return found if self.otherwise is None else Otherwise(found, self.otherwise.of(observed))
 
 
 class OtherMesh(OneByOne):
@@ -260,12 +257,11 @@ class OtherMesh(OneByOne):
         self.spec = spec
         self.parameters, self.outputs = model.parameters, model.outputs
         self.differentiable, self.space = True, None
-        self._own = model
+        self._own = self._observed = model
         self._made: list[AnyModel] = []  # shared by all that observe
-        self._observed: SpecimenModel | None = None
 
-    def observing(self, observed: SpecimenModel) -> OtherMesh:
-        """Return the same with the outputs of another model; both share mesh, forms and factors."""
+    def of(self, observed: Any) -> OtherMesh:
+        """Return the same with the outputs of another model of the body; both share mesh, forms and factors."""
         other = copy.copy(self)
         other.outputs, other._observed = observed.outputs, observed
         other.__dict__.pop("_model", None)
@@ -279,13 +275,14 @@ class OtherMesh(OneByOne):
         return self._made[0]
 
     @cached_property
-    def _model(self) -> AnyModel:
+    def _model(self) -> ForwardModel:
         mesh: Any = self._mesh
         if not hasattr(mesh, "observing"):
             return self._mesh
-        observed: Any = self._own if self._observed is None else self._observed
+        observed: Any = self._observed
         axes, cases = observed.axes.tolist(), observed.cases.tolist()
-        return cast("SpecimenModel", mesh.observing(observed.places, axes, cases, observed.directions))
+        found: ForwardModel = mesh.observing(observed.places, axes, cases, observed.directions)
+        return found
 
     @cached_property
     def _scalars(self) -> list[int]:
@@ -326,7 +323,7 @@ class OtherMesh(OneByOne):
         """Return gradients (n, d) of those (n, D) by the parameters on the other mesh; collective."""
         return gradients @ self.along(np.eye(len(self.parameters))).T
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> MappedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
         """Solve at parameters (d,) of the body on its own mesh; collective.
 
         Raises

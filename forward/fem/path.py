@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 from scipy.sparse import eye
 
-from forward.combine import Joined, JoinedSolution, Mapped, MappedSolution, Sparse, along, mapped, together
+from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped, together
 from forward.fem.calibration import FinerMesh
 from forward.fem.equations import Discretisation
 from forward.fem.model import HyperelasticModel
@@ -124,7 +124,7 @@ def reached(known: Sequence[FloatArray], count: int) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class StepSolution(MappedSolution):
+class StepSolution(DerivedSolution):
     """The equilibrium of a step, with derivatives (d, U_local) of its state where they were found with it."""
 
     solution: FiniteElementSolution
@@ -136,7 +136,7 @@ class StepSolution(MappedSolution):
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        return self.solution.along(self.state_tangent(direction), along(self.by, direction))
+        return self.solution.along(self.state_tangent(direction), self._directions(direction))
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,8 @@ class ObservedModel(OfOne):
     ----------
     model
         The one of the body.
-    outputs
-        Names.
+    names
+        Of what is observed.
     seen
         What is observed (n, N) of its coordinate fields.
     rows
@@ -43,10 +43,14 @@ class ObservedModel(OfOne):
     """
 
     model: ReducedModel
-    outputs: tuple[str, ...]
+    names: tuple[str, ...]
     seen: FloatArray
     rows: Observation
-    space: None = None
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what is observed."""
+        return self.names
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> ObservedSolution:
         """Find the equilibrium at `parameters` (d,)."""

@@ -34,14 +34,10 @@ def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | None, str
 def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
     """Return the model on finer meshes of a specimen, or of the measured outputs of a body."""
     from forward.fem.finer import extrapolated
-    from forward.fem.specimen import SpecimenModel
 
-    own: Any = make()
-    if isinstance(own, SpecimenModel):
-        return extrapolated(own, start).observing(own)
-    assert isinstance(own, Rows)
-    body: Any = own.model
-    return extrapolated(body, start).restricted(own)
+    own = make()
+    body: Any = own.model if isinstance(own, Rows) else own
+    return extrapolated(body, start).of(own)
 
 
 def solved_on(model: ForwardModel) -> Finer:

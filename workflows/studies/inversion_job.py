@@ -104,7 +104,7 @@ def _outputs(study: Inversion, ensemble: Ensemble) -> _Made:
     model, there = study.spec.build(ensemble.group, study.inputs.names), None
     if has_mesh(study.spec):
         meshes, why = _meshes(study, model, study.inputs.mean)
-        there = (None if meshes is None else meshes.restricted(), why)
+        there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
     return _Made(model, lambda number: _Observed(model, there))
@@ -127,7 +127,7 @@ def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
             own = model.observing(data.places, data.axes, data.cases, data.along)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
-        there = None if meshes is None else meshes.observing(own)
+        there = None if meshes is None else meshes.of(own)
         motion = measured.motion(study.model.body)
         shared = None if motion is None else (motion, model.observing(*motion.observed))
         return _Observed(own, (there, why), shared)

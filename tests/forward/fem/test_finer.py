@@ -316,10 +316,10 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
     assert 0.4 < seen < 1
     equal = extrapolated(model).otherwise  # for where thin cells have no equilibrium
     assert (equal.fine.spec.body.cells, equal.fine.spec.body.grading) == ((5, 5, 5), {})
-    plain = np.split(equal.observing(model).solve(point).outputs, 2)[0]
+    plain = np.split(equal.of(model).solve(point).outputs, 2)[0]
     assert np.linalg.norm(truth - plain) < 0.1 * np.linalg.norm(truth - here)
     # What is extrapolated from it is nearer still; so are its derivatives, from a start elsewhere.
-    limit = extrapolated(model, np.array([1e4])).observing(model).solve(point)
+    limit = extrapolated(model, np.array([1e4])).of(model).solve(point)
     tends, between = np.split(limit.outputs, 2)
     assert np.linalg.norm(truth - tends) < 0.5 * np.linalg.norm(truth - there)
     # Linear meshes of 3 and 2 cells left a sixth of the error.

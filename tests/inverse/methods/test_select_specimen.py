@@ -181,7 +181,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
     """Beside the evidence of a model that has no such error, of one candidate that moves little and one that does."""
     it = load(study, ["method.noise.absolute=0.06", "method.samples=64", "method.mesh_error='report'"])
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
-    finer = {name: extrapolated(model, np.array([1e3])).observing(model) for name, model in coarse.items()}
+    finer = {name: extrapolated(model, np.array([1e3])).of(model) for name, model in coarse.items()}
 
     def solve(model):
         return FunctionModel(
@@ -220,7 +220,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     """A mesh that is too coarse no longer loses for that alone, but for what is uncertain of its correction."""
     it = load(study, ["method.noise.absolute=0.02", "method.samples=64"])
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
-    finer = {name: extrapolated(model, np.array([1e3])).observing(model) for name, model in coarse.items()}
+    finer = {name: extrapolated(model, np.array([1e3])).of(model) for name, model in coarse.items()}
     lines = []
     found = it.method.run(
         it.models,
