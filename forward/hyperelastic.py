@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from forward import adapt as adaptive
 from forward.adapt import Adapt
@@ -20,16 +19,15 @@ from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
 from forward.bodies.inclusions import too_narrow
 from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.affordable import finer, own_estimate
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Ranges
-from forward.fem.mesh_error_cost import Estimate
+from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
 from forward.findings import Finding
 from forward.materials.material import splits
 from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import nearest, shown
 from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
@@ -44,15 +42,6 @@ IN_WORDS = {  # what linear systems are solved with
     Linear.BOTH: "multigrid; a factor of the stiffness for the reference only",
     Linear.MULTIGRID: "multigrid, without a factor of the stiffness",
 }
-
-
-def _without_lists(block: Block, given: Any) -> Any:
-    """Return items of a block as they were written, unless one has a list in place of a number."""
-    for item in given if isinstance(given, tuple) else ():
-        for name, values in lists(block, item).items():
-            message = f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'"
-            raise ValueError(message)
-    return given
 
 
 class Hyperelastic(Solid):
@@ -103,15 +92,16 @@ class Hyperelastic(Solid):
     adapt: Adapt | None = None
     stresses: bool = False
 
-    @field_validator("loads", mode="before")
+    @field_validator("loads", "displacements", mode="before")
     @classmethod
-    def _no_lists_in_loads(cls, given: Any) -> Any:
-        return _without_lists("loads", given)
-
-    @field_validator("displacements", mode="before")
-    @classmethod
-    def _no_lists_in_displacements(cls, given: Any) -> Any:
-        return _without_lists("displacements", given)
+    def _no_lists(cls, given: Any, of: ValidationInfo) -> Any:
+        """Refuse lists in place of numbers."""
+        block: Block = "loads" if of.field_name == "loads" else "displacements"
+        for item in given if isinstance(given, tuple) else ():
+            for name, values in lists(block, item).items():
+                message = f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'"
+                raise ValueError(message)
+        return given
 
     @property
     def scalars(self) -> dict[str, Scalar]:
@@ -405,19 +395,7 @@ class Hyperelastic(Solid):
 
     @model_validator(mode="after")
     def _check(self) -> Hyperelastic:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                type(self).__name__,
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("model", "{message}", {"message": message}),
-                        loc=place,
-                        input=given,
-                    )
-                    for place, message, given in mistakes
-                ],
-            )
+        refuse(type(self).__name__, self._mistakes())
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 from pydantic import Field, GetJsonSchemaHandler, model_validator
@@ -19,6 +19,7 @@ from forward.fem.cost import Times, sum_of
 from forward.fem.mesh_error_cost import Estimate
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
+from forward.observables.observable import Output
 from forward.readable import scale
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
@@ -29,34 +30,6 @@ from forward.words import number, with_unit
 LEAST = 2  # steps of a path
 LISTED = 6  # steps that are named
 BLOCKS: tuple[Block, ...] = ("loads", "displacements")  # whose numbers may have steps
-
-
-@dataclass(frozen=True)
-class AtStep:
-    """An output at one step.
-
-    Attributes
-    ----------
-    name
-        That of the output and, after a dot, the number of the step from 1.
-    unit
-        SI unit of its value.
-    of
-        Name of the output.
-    step
-        Number of the step from 1.
-    estimable
-        Whether an error of the mesh can be estimated.
-    negative
-        Whether it can be below 0.
-    """
-
-    name: str
-    unit: str
-    of: str
-    step: int
-    estimable: bool
-    negative: bool
 
 
 class Path(Hyperelastic):
@@ -134,13 +107,13 @@ class Path(Hyperelastic):
         return dict(super().unavailable) | dict.fromkeys(self.steps, why)
 
     @property
-    def returned(self) -> tuple[AtStep, ...]:
-        """All outputs at the first step, then at the second, and so on."""
-        return tuple(
-            AtStep(f"{output.name}.{step}", output.unit, output.name, step, output.estimable, output.negative)
-            for step in range(1, self.count + 1)
-            for output in self.outputs
-        )
+    def returned(self) -> tuple[Output, ...]:
+        """All outputs at the first step, then at the second, and so on: each with the number of the step, from 1."""
+        return tuple(one.model_copy(update={"name": f"{one.name}.{step}"}) for one, step in self._at_steps)
+
+    @property
+    def _at_steps(self) -> list[tuple[Output, int]]:
+        return [(output, step) for step in range(1, self.count + 1) for output in self.outputs]
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -151,13 +124,12 @@ class Path(Hyperelastic):
     @property
     def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
         """Which output and which step each of these is, and the numbers that have steps there."""
-        returned = self.returned
         found: dict[str, tuple[str, list[Any]]] = {
-            "output_of": ("", [one.of for one in returned]),
-            "step": ("1", [one.step for one in returned]),
+            "output_of": ("", [output.name for output, _ in self._at_steps]),
+            "step": ("1", [step for _, step in self._at_steps]),
         }
         for path, values in self.steps.items():
-            found[path] = self.unit_of(path), [values[one.step - 1] for one in returned]
+            found[path] = self.unit_of(path), [values[step - 1] for _, step in self._at_steps]
         return found
 
     @property

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
 from annotated_types import Unit
 from pydantic import Field, TypeAdapter, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.settings import Settings
 
 Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
+
+
+def refuse(title: str, mistakes: Iterable[Mistake]) -> None:
+    """Raise pydantic's exception if there are mistakes in a model."""
+    found = [
+        InitErrorDetails(type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given)
+        for place, message, given in mistakes
+    ]
+    if found:
+        raise ValidationError.from_exception_data(title, found)
 
 
 class Scalar(NamedTuple):

@@ -5,24 +5,21 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.bodies.geometry import AXES, Vector, holds
-from forward.fem.affordable import own_estimate
 from forward.fem.cost import Times, sum_of
 from forward.fem.locking import Ranges
-from forward.fem.mesh_error_cost import Estimate
+from forward.fem.mesh_error_cost import Estimate, own_estimate
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
-from forward.model import ModelError, SolveError
+from forward.model import ModelError
 from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import Settings, nearest
 from forward.solid import Solid
 from forward.terms.displacement import Displacement
@@ -265,17 +262,15 @@ class Specimen(Solid):
 
     @model_validator(mode="after")
     def _check(self) -> Specimen:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(type(self).__name__, mistakes)
+        refuse(type(self).__name__, self._mistakes())
         return self
 
-    def _mistakes(self) -> Iterator[InitErrorDetails]:
+    def _mistakes(self) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)
         for block, labels in (("cases", names), ("observed", tuple(item.label for item in self.observed))):
             for label, count in Counter(labels).items():
                 if count > 1:
-                    yield _mistake((block,), f"{count} of them are called '{label}', expected different names", label)
+                    yield (block,), f"{count} of them are called '{label}', expected different names", label
         for i, case in enumerate(self.cases):
             try:
                 self.loaded(case)
@@ -284,46 +279,24 @@ class Specimen(Solid):
                     common = line["loc"] and line["loc"][0] in SHARED
                     if i == 0 or not common:  # what is wrong with the body is wrong in every case
                         place = line["loc"] if common else ("cases", i, *line["loc"])
-                        yield _mistake(place, line["msg"], line["input"])
+                        yield place, line["msg"], line["input"]
             for k, output in enumerate(case.outputs):
                 if output.name in AXES:
                     message = "the name of a component of displacements, expected another one"
-                    yield _mistake(("cases", i, "outputs", k, "name"), message, output.name)
+                    yield ("cases", i, "outputs", k, "name"), message, output.name
             if self.observed and not self.seen(case) and not case.outputs:
-                yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
+                yield ("cases", i), "nothing is measured in this load case", case.name
         for i, item in enumerate(self.observed):
             yield from self._mistakes_of(i, item)
 
-    def _mistakes_of(self, i: int, item: Observed) -> Iterator[InitErrorDetails]:
+    def _mistakes_of(self, i: int, item: Observed) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)
         if item.on is not None and item.on not in self.body.boundaries:
             message = f"unknown boundary; {nearest(item.on, self.body.boundaries)}"
-            yield _mistake(("observed", i, "on"), message, item.on)
+            yield ("observed", i, "on"), message, item.on
         for name in item.cases:
             if name not in names:
-                yield _mistake(("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name)
+                yield ("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name
         for point in item.at:
             if not holds(self.body, point):
-                yield _mistake(("observed", i, "at"), "outside the body", list(point))
-
-
-@contextmanager
-def of_case(name: str) -> Iterator[None]:
-    """Name the load case in which a solve fails.
-
-    Raises
-    ------
-    SolveError
-        That which was raised, with the name.
-    """
-    try:
-        yield
-    except SolveError as error:
-        message = f"load case '{name}': {error.reason}"
-        raise type(error)(message, error.history, error.work, error.stability) from error
-
-
-def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErrorDetails:
-    return InitErrorDetails(
-        type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given
-    )
+                yield ("observed", i, "at"), "outside the body", list(point)

@@ -33,7 +33,6 @@ WRAPPERS = (
     "forward/specimen.py",
     "forward/fem/specimen.py",
     "forward/fem/finer.py",
-    "forward/extrapolated.py",
     "forward/reduced/specimen.py",
     "uq/evaluation/kept.py",
 )

@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from forward.fem.affordable import Finer, finer
 from forward.fem.dolfinx import spaces
 from forward.fem.layout import sorted_by_place
+from forward.fem.mesh_error_cost import Finer, finer
 from forward.fem.model import HyperelasticModel
 from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
 
@@ -123,7 +123,7 @@ class FinerMesh:
     model
         The body.
     spare
-        How many solves it may cost (`forward.fem.affordable.allowance`).
+        How many solves it may cost (`forward.fem.mesh_error_cost.allowance`).
     """
 
     def __init__(self, model: HyperelasticModel, spare: float = math.inf) -> None:

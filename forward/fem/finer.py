@@ -1,9 +1,10 @@
 """A body on finer meshes: what error its own mesh makes of what is observed.
 
 Cells are smaller everywhere, and smaller still at the faces that are held, where stresses are singular along the rim: a
-mesh that is refined equally shares most of the error there. The same grading with as many cells as the body has
-tells how fast the error falls, from which follows what the finer mesh still misses (`forward.extrapolated`). Random
-fields are those of the mesh itself, interpolated.
+mesh that is refined equally shares most of the error there. The same grading with as many cells as the body has tells
+how fast the error falls: as h^p, and where the cells of the finer mesh are t times smaller, it still misses the
+difference ψ_f − ψ_c times 1/(t^p − 1) (L. F. Richardson, Phil. Trans. R. Soc. A 226 (1927) 299–361). The difference
+itself is an output too: it says how far that may be wrong. Random fields are those of the mesh itself, interpolated.
 
 Finer meshes are quadratic, with as many nodes where the body is linear, and never coarser than a few cells: the
 differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
@@ -16,27 +17,26 @@ boxes and blocks with fields are divided, and again at the rims of what is held 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, identity
+from scipy.sparse import csr_matrix, identity, kron
 
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
-from forward.combine import DerivedSolution, Joined, Mapped, Rows
-from forward.extrapolated import HALVED, Begun, FromStart, Otherwise, limit
-from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
+from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows
+from forward.model import FloatArray, ForwardModel, Guess, ModelError, OfOne, OneByOne, Solution, SolveError
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.fem.path import PathModel
     from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
-    from forward.model import ForwardModel
     from forward.specimen import Specimen
 
     AnyBody = Hyperelastic | Specimen
@@ -51,6 +51,10 @@ HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that
 # Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
 ITERATIONS, LOAD_STEP = 12, 1 / 16
 FEWEST = 6  # cells along an edge of finer meshes of fields
+Begun = tuple[tuple[FloatArray, FloatArray], ...]
+# Where all cells are halved, errors at held faces fall slowly, whatever the degree: 1/(2^1.6 − 1).
+HALVED = 0.5
+TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
@@ -153,7 +157,7 @@ def _on(spec: AnyBody, times: float, *, thin: bool = True) -> Any:
             body = body.finer(times / 2 if linear else times, held(spec), HELD, BESIDE)
         cells = {"cells": tuple(max(n, LEAST[times]) for n in body.cells)}
         body = body.model_validate(body.model_dump() | cells | (QUADRATIC if linear else {}))
-    of = dict.fromkeys(field.of for field in spec.fields)
+    of = dict.fromkeys(one.of for one in spec.fields)
     fields = tuple(RandomField(of=what, length=1.0, std=1.0, basis="nodes") for what in of)
     # Linear cells have displacements only, quadratic ones pressures too where they need them.
     found = spec.model_copy(update={"body": body, "fields": fields, **({"formulation": "auto"} if linear else {})})
@@ -196,6 +200,111 @@ def _hurried(spec: Any, smallest: float) -> Any:
         "minimum_load_step": max(known.minimum_load_step, smallest),
     }
     return spec.model_copy(update={"solver": known.model_copy(update=limits)})
+
+
+def limit(model: ForwardModel, observed: csr_matrix, outputs: tuple[str, ...], share: float) -> Rows:
+    """Return the model of what is observed in the limit of finer meshes.
+
+    Parameters
+    ----------
+    model
+        On a fine and a coarse mesh: its outputs (2m,) are those on the one and then those on the other.
+    observed, outputs
+        Weights (n, m) of the outputs in what is observed, and its names.
+    share
+        1/(t^p − 1).
+
+    Returns
+    -------
+    Rows
+        With 2n outputs: ψ_f + share (ψ_f − ψ_c), and then ψ_f − ψ_c.
+    """
+    names = (*outputs, *(f"{name} (between the meshes)" for name in outputs))
+    one = identity(len(outputs))
+    gaps = Rows(model, kron([[1, 0], [1, -1]], observed, format="csr"), names)
+    return Rows(gaps, kron([[1, share], [0, 1]], one, format="csr"), names)
+
+
+@dataclass(frozen=True)
+class Otherwise(OfOne):
+    """A model, and another one where it has no answer."""
+
+    model: ForwardModel
+    other: ForwardModel
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
+        """Solve at `parameters` (d,).
+
+        Raises
+        ------
+        SolveError
+            Where neither has an answer.
+        """
+        try:
+            return self.model.solve(parameters)
+        except SolveError:
+            return self.other.solve(parameters)
+
+
+@dataclass(frozen=True)
+class FromStart(OfOne):
+    """Models whose solves begin at what the linearisation at a start predicts.
+
+    Parameters
+    ----------
+    model
+        The models.
+    start
+        Parameters (d,) that are solved for first; None: every solve begins at rest.
+    begun
+        States there, and their derivatives, once they are known, or why there are none; models of the same meshes share
+        it.
+    needed
+        Whether there is no answer anywhere without one at the start: then searches end at once, which may take minutes.
+    """
+
+    model: Joined
+    start: FloatArray | None = None
+    begun: list[Begun | SolveError] = field(default_factory=list)
+    needed: bool = False
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
+        """Solve at `parameters` (d,).
+
+        Raises
+        ------
+        SolveError
+            Where there is no answer.
+        """
+        if self.start is None:
+            return self.model.solve(parameters)
+        if not self.begun:
+            at_start = np.array_equal(parameters, self.start)
+            try:
+                here = self._begin(self.start)
+            except SolveError as error:
+                self.begun.append(error)
+                if at_start:
+                    raise
+            else:
+                if at_start:
+                    return here
+        begun = self.begun[0]
+        if not isinstance(begun, SolveError):
+            step = parameters - self.start
+            guesses = [Guess(state + step @ slopes if slopes.size else state) for state, slopes in begun]
+            return self.model.solve_each(parameters, guesses)
+        if self.needed:
+            raise begun
+        return self.model.solve(parameters)
+
+    def _begin(self, start: FloatArray) -> JoinedSolution:
+        """Solve at the start, once, and keep the states with their derivatives."""
+        d, found = len(start), self.model.solve(start)
+        few = d <= TANGENTS and self.differentiable
+        kept = ((one.state, one.state_tangent(np.eye(d)) if few else np.zeros((d, 0))) for one in found.solutions)
+        self.begun.append(tuple(kept))
+        return found
 
 
 class FinerMeshes:
@@ -310,9 +419,9 @@ class OtherMesh(OneByOne):
 
         around, weights = self._interpolation
         found = [scalars]
-        for field in self.spec.fields:
-            log = log_factor(self._own, points, field.of)[:, around]
-            found.append((weights * log).sum(axis=2) - field.on(self.spec.body).offset)
+        for one in self.spec.fields:
+            log = log_factor(self._own, points, one.of)[:, around]
+            found.append((weights * log).sum(axis=2) - one.on(self.spec.body).offset)
         return np.concatenate(found, axis=1)
 
     def along(self, directions: FloatArray) -> FloatArray:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import copy
 from collections import deque
 from collections.abc import Iterable, Iterator
-from functools import cached_property
-from itertools import chain, islice, repeat
-from typing import Any
+from functools import cached_property, partial
+from itertools import chain, groupby, islice, repeat
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor, WayFromReference
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, Observation
-from forward.fem.together import by_reference, refused, task
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
 from forward.model import (
@@ -34,13 +33,39 @@ from forward.model import (
     Stability,
     Work,
 )
-from forward.solvers.equilibrium import solve
-from forward.solvers.steps import Task, finish_all
+from forward.solvers.equilibrium import solve, solving
+from forward.solvers.steps import Task, failed, finish_all
 from forward.solvers.system import Found
 
 AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
 UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
 STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
+
+
+P = TypeVar("P")
+
+
+def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool, Iterator[tuple[P, Guess]]]]:
+    """Group consecutive points, with their guesses, by the reference from which their states are predicted.
+
+    Yields
+    ------
+    tuple
+        Whether states of the group are predicted from one reference, and the group.
+    """
+    last: ReferenceSolution | None = None
+
+    def reference(pair: tuple[P, Guess | None]) -> ReferenceSolution | None:
+        nonlocal last
+        guess = pair[1]
+        if guess is None or guess.state is None or guess.reference is None:
+            return None
+        if last is None or not last.same(guess.reference):
+            last = guess.reference
+        return last
+
+    for one, group in groupby(pairs, reference):
+        yield one is not None, ((point, guess or Guess()) for point, guess in group)
 
 
 class HyperelasticModel(OneByOne):
@@ -198,11 +223,13 @@ class HyperelasticModel(OneByOne):
                 try:
                     self.require_admissible(point)
                 except InadmissibleError as error:
-                    one = refused(error)
+                    one = Task[Found](failed(error), lambda _: None)
                 else:
                     way = self.way(point, guess)
                     assert way is not None
-                    one = task(equations, self.spec.solver, zero, way, guess, work)
+                    settings, known = self.spec.solver, guess.iterations
+                    steps = solving(equations, settings, zero, guess.state, way, known, audit=guess.audit)
+                    one = Task(steps, partial(way.resume, work))
                 begun.append((point, way, work))
                 yield one
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.fem.affordable import allowance, richer
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
+from forward.fem.mesh_error_cost import allowance, richer
 from forward.fem.reference import WayFromReference
 from forward.fem.saturation import factors, typical
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Work
@@ -275,12 +275,12 @@ class FiniteElementSolution:
 
         Where that is too large, by elements of two degrees more (`forward.fem.saturation`); typical values where this
         takes too much memory too. In a short study, either is too large also where it would take too long
-        (`forward.fem.affordable.allowance`).
+        (`forward.fem.mesh_error_cost.allowance`).
 
         Parameters
         ----------
         spare
-            How many solves it may cost (`forward.fem.affordable.allowance`).
+            How many solves it may cost (`forward.fem.mesh_error_cost.allowance`).
         finer
             The body on a finer mesh (`forward.fem.calibration.FinerMesh`), where there is one already.
 

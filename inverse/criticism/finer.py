@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uq.inputs.distributions import Distribution
 
 SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: data by the million make it no finer
-Solved = tuple[FloatArray, FloatArray | None]  # outputs (2M,) of `forward.extrapolated`, and their derivatives (2M, d)
+Solved = tuple[FloatArray, FloatArray | None]  # outputs (2M,) of `forward.fem.finer`, and their derivatives (2M, d)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def shared_expansion(
     evaluate
         The model.
     finer
-        The same on finer meshes (`forward.extrapolated`); None where there is nothing to look at, or where `why` says
+        The same on finer meshes (`forward.fem.finer`); None where there is nothing to look at, or where `why` says
         why not.
     samples
         Number of solves.
@@ -128,7 +128,7 @@ def expanded_finer(
     inputs
         The prior.
     finer
-        The model on finer meshes (`forward.extrapolated`).
+        The model on finer meshes (`forward.fem.finer`).
     points
         Where it is solved.
     own

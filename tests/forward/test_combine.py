@@ -8,7 +8,7 @@ from scipy.sparse import csr_matrix
 
 from forward.combine import Joined, Mapped, Rows, Sparse, selected
 from forward.conformance import check_derivatives, check_mesh_errors
-from forward.extrapolated import FromStart, Otherwise, limit
+from forward.fem.finer import FromStart, Otherwise, limit
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, Work
 
 pytestmark = pytest.mark.unit

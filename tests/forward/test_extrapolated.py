@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from forward.combine import Joined
-from forward.extrapolated import FromStart, Otherwise, limit
+from forward.fem.finer import FromStart, Otherwise, limit
 from forward.model import FunctionModel, SolveError
 
 pytestmark = pytest.mark.unit

@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.affordable import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
 from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, saturation
+from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import OUTPUTS, loaded_body
 from tests.launch import run_script
@@ -282,7 +282,7 @@ def test_a_mesh_without_an_estimate_of_its_own_calibrates_nearly_as_well(monkeyp
     spec = block((2, 2, 2), 2, formulation="mixed", material=SOFT, outputs=(energy,))
     solution = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
     best = solution.saturation()
-    monkeypatch.setattr("forward.fem.affordable.TIMES", ())
+    monkeypatch.setattr("forward.fem.mesh_error_cost.TIMES", ())
     alone = solution.saturation()
     assert not finer(spec).estimated
     assert alone.measured

@@ -9,8 +9,7 @@ from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh import contents, divided
 from forward.bodies.mesh_file import MeshFile
-from forward.extrapolated import HALVED
-from forward.fem.finer import OF_LINEAR, OtherMesh, counted, extrapolated, finer, graded, held, share
+from forward.fem.finer import HALVED, OF_LINEAR, OtherMesh, counted, extrapolated, finer, graded, held, share
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.specimen import Specimen
