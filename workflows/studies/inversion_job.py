@@ -67,7 +67,7 @@ class _Observed:
     model
         The model of what was measured.
     there
-        The same on finer meshes (`forward.extrapolated`).
+        The same on finer meshes (`forward.fem.finer`).
     shared
         What errors the data share, and the model that tells what they are; None if they are independent.
     """
