@@ -86,6 +86,11 @@ class Data:
     kinds: NDArray[np.int64] | None = None
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the tests that were measured."""
+        return tuple(dict.fromkeys(self.tests[: self.values.size]))
+
+    @property
     def sorted(self) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.int64]]:
         """Numbers (m,) of the data in an order independent of the rows, and their places and kinds in it."""
         m = self.values.size

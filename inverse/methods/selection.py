@@ -224,7 +224,7 @@ class Select(Settings):
             variants[label] = {
                 pair: value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
                 for pair in pairs
-                if set(tests) & set(_tests(data_groups[pair[1]]))
+                if set(tests) & set(data_groups[pair[1]].measured)
             }
         checks = {}
         if self.check is not None:
@@ -291,7 +291,7 @@ def _without(
     """Return ln Z and its error without a test, in the groups that have it and others."""
     found = {}
     for pair, posterior in posteriors.items():
-        rest = _tests(data_groups[pair[1]])
+        rest = data_groups[pair[1]].measured
         if test in rest and len(rest) > 1:
             others = tuple(other for other in rest if other != test)
             found[pair] = value(_only(posterior, data_groups[pair[1]], others), pair)
@@ -312,13 +312,8 @@ def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
     return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
 
 
-def _tests(data: Data) -> tuple[str, ...]:
-    """Names of the tests that were measured."""
-    return tuple(dict.fromkeys(data.tests[: data.values.size]))
-
-
 def _testnames(data_groups: Mapping[str, Data]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(test for data in data_groups.values() for test in _tests(data)))
+    return tuple(dict.fromkeys(test for data in data_groups.values() for test in data.measured))
 
 
 def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:

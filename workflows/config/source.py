@@ -57,7 +57,8 @@ class Source(Settings):
 
     @model_validator(mode="after")
     def _read(self) -> Source:
-        found: str = named(f"{READER}:digest_of")(self.file) if self.model in (AVERAGED, STACKED) else self.drawn.digest
+        whole = self.model in (AVERAGED, STACKED)
+        found: str = named(f"{READER}:Left")(self.file).digest if whole else self.drawn.digest
         if self.digest and found != self.digest:
             message = f"{self.file} has changed since the study was begun: hash {self.digest} → {found}"
             raise ValueError(message)

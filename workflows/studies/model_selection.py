@@ -172,18 +172,9 @@ class ModelSelection(OfCandidates, Comparison):
         return {name: Candidate(inputs, self.candidates[name].weight) for name, inputs in self.priors.items()}
 
     @property
-    def group_names(self) -> tuple[str, ...]:
-        """Names of the groups: there is one."""
-        return (WHOLE,)
-
-    @property
     def data_groups(self) -> dict[str, Data]:
         """Data by group."""
         return {WHOLE: self.data.data}
-
-    def tests(self, group: str) -> tuple[str, ...]:
-        """Names of the tests that were measured in a group."""
-        return self.data.tests
 
     def measured_in(self, test: str) -> str:
         """Say what was measured in a test, in the unit of the first candidate."""

@@ -24,7 +24,7 @@ from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
 from workflows.studies.job import Job
-from workflows.studies.posteriors import candidate_of, digest_of, draws_in, prior_of, source_blocks, specimens
+from workflows.studies.posteriors import Left, draws_in
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -55,9 +55,14 @@ class PopulationStudy(StudyKind):
     method: Population
 
     @cached_property
+    def source(self) -> Left:
+        """What the study of the specimens has left."""
+        return Left(self.method.source)
+
+    @cached_property
     def posteriors(self) -> dict[str, Draws]:
         """Draws of each specimen, by its name."""
-        return specimens(self.method.source, self.method.model)
+        return self.source.specimens(self.method.model)
 
     @property
     def planned(self) -> int:
@@ -110,8 +115,7 @@ class PopulationStudy(StudyKind):
         source = _source(self)
         if source is None:
             return {}
-        by_candidate = hasattr(source, "candidates")
-        return source.units_of(candidate_of(self.method.source, self.method.model) if by_candidate else "/")
+        return source.units_of(self.source.candidate(self.method.model) if hasattr(source, "candidates") else "/")
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what is wrong with the source, which is taken as it was when the study was begun."""
@@ -121,7 +125,7 @@ class PopulationStudy(StudyKind):
         try:
             Scale.of(method.distribution, self.posteriors)
             Columns.of(method.covariates, list(self.posteriors)).row(method.new)
-            found = digest_of(method.source)
+            found = self.source.digest
         except (ValueError, StudyError) as error:
             yield place, str(error), method.source
             return
@@ -148,13 +152,13 @@ def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
     from workflows.config.study import parse
 
     method = study.method
-    blocks = {key: value for key, value in source_blocks(method.source).items() if key in KEPT}
+    blocks = {key: value for key, value in study.source.blocks.items() if key in KEPT}
     parameters = {name: one.model_dump(mode="json") for name, one in prior.marginals.items()}
     correlations = [{"between": [a, b], "value": value} for a, b, value in prior.correlations]
     known = {"parameters": parameters, "correlations": correlations}
     folder = Path(method.source) if method.study is None else Path(method.study).parent
     if "candidates" in blocks:
-        name = candidate_of(method.source, method.model)
+        name = study.source.candidate(method.model)
         tests = [one for one in blocks["data"]["tests"] if one["group"] == specimen]
         blocks["candidates"] = {name: blocks["candidates"][name] | known}
         blocks["data"] = {**blocks["data"], "tests": tests}
@@ -236,7 +240,7 @@ class PopulationJob(Job):
 
         def task(asked: Callable[[tuple[str, Inputs]], Draws | str]) -> xr.Dataset:
             posteriors = self.study.posteriors
-            prior = prior_of(method.source, method.model, next(iter(posteriors.values())).names)
+            prior = self.study.source.prior(method.model, next(iter(posteriors.values())).names)
             asking = 0.0
 
             def timed(*one: Any) -> Draws | str:
@@ -265,6 +269,6 @@ def _source(study: PopulationStudy) -> StudyKind | None:
 
     try:
         named("workflows.run.own_code:make_visible")(Path(study.method.source))
-        return parse(source_blocks(study.method.source), folder=Path(study.method.source))
+        return parse(study.source.blocks, folder=Path(study.method.source))
     except (StudyError, ValueError, OSError):
         return None

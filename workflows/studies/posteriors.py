@@ -6,6 +6,8 @@ import io
 import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from forward.findings import Finding
+from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.low_dimensional.posterior import NOISE
 from uq.evaluation.hdf5 import variables
@@ -50,7 +53,7 @@ def read(file: str, group: str | None, model: str | None) -> Draws:
         path = path.parent
     try:
         if path.is_dir():
-            return _of_results(path, group, model)
+            return Left(path).draws(group, model)
         if not path.exists():
             message = f"{path}: is not there, expected a results directory of 'select' or 'invert', or a table of draws"
             raise ValueError(message)
@@ -91,39 +94,100 @@ def _kept(path: Path) -> Draws:
 # --- results of tissuq ---------------------------------------------------------------------------------------------
 
 
-def _of_results(path: Path, group: str | None, model: str | None) -> Draws:
-    summary = _summary(path)
-    kind = summary.get("method")
-    if kind not in READERS:
-        message = f"{path}: is a study of kind '{kind}', which has no posterior, expected one of: {', '.join(READERS)}"
-        raise ValueError(message)
-    found = {name: one.values for name, one in _content(path)[0].items()}
-    try:
-        return READERS[kind](path, found, group, model, digest_of(str(path)))
-    except KeyError as error:
-        message = f"{path}: its results.nc has no {error}, expected one that this version has made: run it again"
-        raise ValueError(message) from None
+class Left:
+    """What a finished study has left in a directory; a ValueError says in one line what is not there.
 
+    Parameters
+    ----------
+    file
+        The directory, or results.nc in it.
+    """
 
-def _content(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return variables and attributes of results.nc; a ValueError says that it cannot be read."""
-    try:
-        return variables((path / "results.nc").read_bytes())
-    except (OSError, KeyError, RuntimeError, ValueError):
-        message = f"{path / 'results.nc'}: missing or damaged, expected that of a finished study: run it again"
-        raise ValueError(message) from None
+    def __init__(self, file: str | Path) -> None:
+        path = Path(file)
+        self.path = path.parent if path.name == "results.nc" else path
 
+    @cached_property
+    def kind(self) -> str:
+        """Kind of its method."""
+        try:
+            found = json.loads((self.path / "summary.json").read_text(encoding="utf-8"))
+            return str(found.get("method"))  # a list has nothing to get
+        except (OSError, ValueError, AttributeError):
+            begun, there = (self.path / "study.toml").exists(), self.path.exists()
+            what = "holds an unfinished study" if begun else "holds no results" if there else "is not there"
+            message = f"{self.path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
+            raise ValueError(message) from None
 
-def _summary(path: Path) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-        found.keys()  # a list has none
-    except (OSError, ValueError, AttributeError):
-        begun = (path / "study.toml").exists()
-        what = "holds an unfinished study" if begun else "holds no results" if path.exists() else "is not there"
-        message = f"{path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
-        raise ValueError(message) from None
-    return found
+    @cached_property
+    def _content(self) -> tuple[Arrays, Mapping[str, Any]]:
+        try:
+            found, attributes = variables((self.path / "results.nc").read_bytes())
+        except (OSError, KeyError, RuntimeError, ValueError):
+            message = f"{self.path / 'results.nc'}: missing or damaged, expected that of a finished study: run it again"
+            raise ValueError(message) from None
+        return {name: one.values for name, one in found.items()}, attributes
+
+    @property
+    def found(self) -> Arrays:
+        """The variables of results.nc."""
+        return self._content[0]
+
+    @cached_property
+    def blocks(self) -> dict[str, Any]:
+        """The blocks of the study."""
+        return tomllib.loads(str(self._content[1]["config"]))
+
+    @property
+    def digest(self) -> str:
+        """Hash of the results."""
+        _ = self.kind, self._content
+        return sha256((self.path / "results.nc").read_bytes()).hexdigest()[:LETTERS]
+
+    def candidate(self, model: str | None) -> str:
+        """Return the name of the candidate that is meant, or that is the most probable."""
+        best = str(self.found["model"][int(np.nanargmax(self.found["probability"]))])
+        return best if model in (None, BEST) else str(model)
+
+    def material(self, model: str | None) -> dict[str, Any]:
+        """Return the block of the material of a candidate, or of an inversion; empty where there is none."""
+        chosen = self.blocks.get("model", {})
+        if "candidates" in self.blocks:
+            candidate = self.blocks["candidates"].get(self.candidate(model), {})
+            chosen = {**chosen, **candidate.get("model", candidate)}
+        block = chosen.get("material", {})
+        return dict(block) if isinstance(block, dict) else {}
+
+    def draws(self, group: str | None, model: str | None) -> Draws:
+        """Return the draws of a posterior."""
+        if self.kind not in READERS:
+            known = f"expected one of: {', '.join(READERS)}"
+            message = f"{self.path}: is a study of kind '{self.kind}', which has no posterior, {known}"
+            raise ValueError(message)
+        try:
+            return replace(READERS[self.kind](self.path, self.found, group, model), digest=self.digest)
+        except KeyError as error:
+            message = (
+                f"{self.path}: its results.nc has no {error}, expected one that this version has made: run it again"
+            )
+            raise ValueError(message) from None
+
+    def specimens(self, model: str | None) -> dict[str, Draws]:
+        """Return the posteriors of the groups of a comparison, or of the data sets of a batch, by their names."""
+        if self.kind not in ("select", "invert"):
+            message = f"{self.path}: is a study of kind '{self.kind}', expected 'select' or 'invert'"
+            raise ValueError(message)
+        names = _texts(self.found, "group" if self.kind == "select" else "data_set")
+        done = np.atleast_1d(self.found["ok"]).astype(bool) if self.kind == "invert" else [True] * len(names)
+        return {name: self.draws(name, model) for name, one in zip(names, done, strict=True) if one}
+
+    def prior(self, model: str | None, names: Sequence[str]) -> Inputs:
+        """Return the prior of these parameters, which the posteriors were found with."""
+        from workflows.config.study import parse
+
+        study: Any = parse(self.blocks, folder=self.path)
+        inputs: Inputs = study.models[self.candidate(model)].inputs if "candidates" in self.blocks else study.inputs
+        return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
 
 
 def _texts(found: Arrays, name: str) -> list[str]:
@@ -141,24 +205,28 @@ def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> i
     return 0 if given is None else known.index(given)
 
 
-def _selected(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+def _drawn(names: Sequence[str], values: FloatArray, weights: FloatArray, worth: float = np.inf) -> Draws:
+    """Return draws (n, d) with positive weights (n,), without the size of the errors."""
+    here = [i for i, name in enumerate(names) if name != NOISE]
+    weights = weights / weights.sum()
+    most = float(1 / (weights**2).sum())
+    return Draws(tuple(names[i] for i in here), values[:, here], weights, min(most, worth))
+
+
+def _selected(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
     """Weighted points of one candidate in one group of data."""
-    models, parameters = _texts(found, "model"), _texts(found, "parameter")
+    models, parameters = _texts(found, "model"), np.array(_texts(found, "parameter"))
     k = int(np.nanargmax(found["probability"])) if model == BEST else _chosen("model", model, models, path)
     g = _chosen("group", group, _texts(found, "group"), path)
-    weights = np.nan_to_num(found["point_weight"][k, g])
-    values = found["point"][k, g]
-    here = np.isfinite(values).any(axis=0) & (np.array(parameters) != NOISE)
-    some = weights > 0
-    if not some.any() or not here.any():
+    weights, values = np.nan_to_num(found["point_weight"][k, g]), found["point"][k, g]
+    here, some = np.isfinite(values).any(axis=0), weights > 0
+    if not some.any() or not (here & (parameters != NOISE)).any():
         message = f"{path}: candidate '{models[k]}' has no draws, as its evidence was not found"
         raise ValueError(message)
-    names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
-    weights = weights[some] / weights[some].sum()
-    return Draws(names, values[some][:, here], weights, float(1 / (weights**2).sum()), digest)
+    return _drawn(parameters[here].tolist(), values[some][:, here], weights[some])
 
 
-def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+def _inverted(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
     """Weighted points of the posterior of one data set; its draws in results that have none."""
     if model is not None:
         message = f"model = '{model}', but {path} is an inversion, which has one model"
@@ -167,24 +235,18 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, d
         message = f"{path}: is an inversion of a field, which has no draws of numbers, expected one with few parameters"
         raise ValueError(message)
     k = _chosen("group", group, _texts(found, "data_set"), path)
-    parameters = _texts(found, "parameter")
     values = np.asarray(found["point" if "point" in found else "draw"])[k]
     weights = np.nan_to_num(found["point_weight"][k]) if "point" in found else np.ones(len(values))
     whole = np.isfinite(values).all(axis=1) & (weights > 0)
-    here = np.array([name != NOISE for name in parameters])
     if not whole.any() or not bool(np.atleast_1d(found["ok"])[k]):
         message = f"{path}: has no draws of that data set, which could not be inverted"
         raise ValueError(message)
-    values = values[whole][:, here]
     chains = int(np.nan_to_num(np.atleast_1d(found["chains"])[k])) if "chains" in found else 0
     worth = float(np.atleast_1d(found["chain_effective" if chains else "effective"])[k])
-    names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
-    weights = weights[whole] / weights[whole].sum()
-    most = float(1 / (weights**2).sum())
-    return Draws(names, values, weights, min(most, worth) if worth > 0 else most, digest)
+    return _drawn(_texts(found, "parameter"), values[whole], weights[whole], worth if worth > 0 else np.inf)
 
 
-def _of_population(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+def _of_population(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
     """Draws of a new specimen or, with its name, of one of the population."""
     if model is not None:
         message = f"model = '{model}', but {path} is a population, which has one model"
@@ -194,7 +256,15 @@ def _of_population(path: Path, found: Arrays, group: str | None, model: str | No
         values = np.asarray(found["specimen_draw"])[_chosen("group", group, _texts(found, "specimen"), path)]
     weights = np.full(len(values), 1 / len(values))
     worth = min(float(found["population_effective"]), len(values))
-    return Draws(tuple(_texts(found, "parameter")), values, weights, worth, digest)
+    return Draws(tuple(_texts(found, "parameter")), values, weights, worth)
+
+
+READERS = {"select": _selected, "invert": _inverted, "population": _of_population}
+
+
+def draws_in(found: xr.Dataset, kind: str) -> Draws:
+    """Return the draws in the results of a study of one group of data or data set; errors as of `read`."""
+    return READERS[kind](Path("results"), {str(name): one.values for name, one in found.variables.items()}, None, None)
 
 
 class NamedCandidate(NamedTuple):
@@ -214,84 +284,22 @@ def candidates(file: str, by: str) -> list[NamedCandidate]:
     ValueError
         If it is none of materials: one line.
     """
-    path = _directory(file)
-    kind = _summary(path).get("method")
-    if kind != "select":
-        message = f"{path}: is a study of kind '{kind}', expected 'select' for model = 'averaged' or 'stacked'"
+    left = Left(file)
+    if left.kind != "select":
+        message = (
+            f"{left.path}: is a study of kind '{left.kind}', expected 'select' for model = 'averaged' or 'stacked'"
+        )
         raise ValueError(message)
-    found = _content(path)[0]
-    if by not in found:
-        message = f"{path}: has no weights of stacking, as it was made by an earlier version: run it again"
+    if by not in left.found:
+        message = f"{left.path}: has no weights of stacking, as it was made by an earlier version: run it again"
         raise ValueError(message)
-    shares = zip(found["model"].values, found[by].values, found[f"{by}_error"].values, strict=True)
-    every = [NamedCandidate(str(m), float(p), float(e), material(file, str(m))) for m, p, e in shares]
+    shares = zip(left.found["model"], left.found[by], left.found[f"{by}_error"], strict=True)
+    every = [NamedCandidate(str(m), float(p), float(e), left.material(str(m))) for m, p, e in shares]
     without = [one.name for one in every if "kind" not in one.material]
     if without:
-        message = f"{path}: candidates {', '.join(without)} have no material, expected a comparison of materials"
+        message = f"{left.path}: candidates {', '.join(without)} have no material, expected a comparison of materials"
         raise ValueError(message)
     return sorted(every, key=lambda one: -one.probability)
-
-
-def digest_of(file: str) -> str:
-    """Return the hash of a source; a ValueError says that it is not there."""
-    path = _directory(file)
-    _summary(path)
-    _content(path)
-    return sha256((path / "results.nc").read_bytes()).hexdigest()[:LETTERS]
-
-
-READERS = {"select": _selected, "invert": _inverted, "population": _of_population}
-
-
-def specimens(file: str, model: str | None) -> dict[str, Draws]:
-    """Return the posteriors of the groups of a comparison, or of the data sets of a batch, by their names.
-
-    Raises
-    ------
-    ValueError
-        As `read`.
-    """
-    path = _directory(file)
-    summary = _summary(path)
-    if summary.get("method") not in ("select", "invert"):
-        message = f"{path}: is a study of kind '{summary.get('method')}', expected 'select' or 'invert'"
-        raise ValueError(message)
-    found = _content(path)[0]
-    if summary["method"] == "select":
-        return {name: read(file, name, model) for name in map(str, found["group"].values)}
-    done = np.atleast_1d(found["ok"].values).astype(bool)
-    names = np.atleast_1d(found["data_set"].values)
-    return {str(name): read(file, str(name), model) for name, one in zip(names, done, strict=True) if one}
-
-
-def source_blocks(file: str) -> dict[str, Any]:
-    """Return the blocks of the study that left results in a directory."""
-    attributes = _content(_directory(file))[1]
-    return tomllib.loads(str(attributes["config"]))
-
-
-def candidate_of(file: str, model: str | None) -> str:
-    """Return the name of the candidate that is meant, or that is the most probable; errors as of `read`."""
-    found = _content(_directory(file))[0]
-    best = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
-    return best if model in (None, BEST) else str(model)
-
-
-def prior_of(file: str, model: str | None, names: Sequence[str]) -> Inputs:
-    """Return the prior of these parameters, which posteriors in a results directory were found with."""
-    from workflows.config.study import parse
-
-    blocks = source_blocks(file)
-    study: Any = parse(blocks, folder=_directory(file))
-    inputs: Inputs = study.models[candidate_of(file, model)].inputs if "candidates" in blocks else study.inputs
-    return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
-
-
-def draws_in(found: xr.Dataset, kind: str) -> Draws:
-    """Return the draws in the results of a study of one group of data or data set; errors as of `read`."""
-    return READERS[kind](
-        Path("results"), {str(name): one.values for name, one in found.variables.items()}, None, None, ""
-    )
 
 
 # --- numbers of the model --------------------------------------------------------------------------------------------
@@ -334,11 +342,8 @@ def mistakes(source: Source, model: ModelSpec, own: Sequence[str]) -> Iterator[M
     for path in found:
         if path in own:
             clean = False
-            yield (
-                ("parameters", path),
-                f"has a distribution, and is in {source.file} too, expected only one of them",
-                path,
-            )
+            message = f"has a distribution, and is in {source.file} too, expected only one of them"
+            yield ("parameters", path), message, path
     block, mine = material_of(source), getattr(model, "material", None)
     if block and mine is not None and block.get("kind") != mine.kind and not source.names:
         clean = False
@@ -373,28 +378,10 @@ def findings(study: Study, source: Source) -> Iterator[Finding]:
             yield Finding("constants-changed", "warning", {"source": source.file, "changed": "; ".join(other)})
 
 
-def _directory(file: str) -> Path:
-    path = Path(file)
-    return path.parent if path.name == "results.nc" else path
-
-
 def material_of(source: Source) -> dict[str, Any]:
     """Return the block of the material that was calibrated, as far as it is known."""
-    return material(source.file, source.model) if _directory(source.file).is_dir() else {}
-
-
-def material(file: str, model: str | None) -> dict[str, Any]:
-    """Return the block of the material of a candidate, or of an inversion; empty where there is none."""
-    path = _directory(file)
-    config = source_blocks(str(path))
-    if "candidates" not in config:
-        chosen = config.get("model", {})
-    else:
-        name = candidate_of(str(path), model)
-        candidate = config["candidates"].get(name, {})
-        chosen = {**config.get("model", {}), **candidate.get("model", candidate)}
-    block = chosen.get("material", {})
-    return dict(block) if isinstance(block, dict) else {}
+    left = Left(source.file)
+    return left.material(source.model) if left.path.is_dir() else {}
 
 
 def draws_of(source: Source, scalars: Mapping[str, Scalar]) -> Draws | None:

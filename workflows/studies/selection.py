@@ -113,7 +113,7 @@ class Comparison(StudyKind):
     @property
     def group_names(self) -> tuple[str, ...]:
         """Names of the groups."""
-        raise NotImplementedError
+        return tuple(self.data_groups)
 
     @property
     def data_groups(self) -> dict[str, Data]:
@@ -122,7 +122,7 @@ class Comparison(StudyKind):
 
     def tests(self, group: str) -> tuple[str, ...]:
         """Names of the tests that were measured in a group."""
-        raise NotImplementedError
+        return self.data_groups[group].measured
 
     def measured_in(self, test: str) -> str:
         """Say what was measured in a test, with its unit."""
@@ -311,15 +311,6 @@ class Selection(Comparison):
 
     data_in_file: ClassVar[tuple[type[Settings], ...]] = (DataFile,)
     costly: ClassVar[bool] = False
-
-    @property
-    def group_names(self) -> tuple[str, ...]:
-        """Names of the groups."""
-        return self.data.data_groups
-
-    def tests(self, group: str) -> tuple[str, ...]:
-        """Names of the tests that were measured in a group."""
-        return tuple(test.label for test in self._measured(group))
 
     @property
     def seconds_of_solves(self) -> float:
