@@ -22,6 +22,7 @@ from benchmarks.beams import CONFIG
 from benchmarks.meshes import FOLDER, Case, Known, expect, invert, known
 from forward.fem.finer import extrapolated
 from forward.model import FloatArray, Guess, SolveError
+from inverse.criticism.finer import Finer
 from inverse.methods.invert import Invert
 from inverse.methods.shared_expansion import expanded_finer
 from uq.evaluation.block import merge
@@ -30,7 +31,6 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from workflows.config.study import load
-from workflows.studies.finer import solved_on
 from workflows.studies.inversion import Inversion
 
 OWN, OTHER = (CONFIG.parent / f"{name}.toml" for name in ("palpation", "synthesize-palpation"))
@@ -74,7 +74,7 @@ def main(specimens: int = 100, inverted: int = 3) -> None:
         "noise (root mean square).\n"
     )
     if inverted:
-        case = Case(inputs, model, solved_on(finer))
+        case = Case(inputs, model, Finer.by(SerialEvaluate(finer)))
         invert(case, made.truths[:inverted], made.data[:inverted], "palpation-inverted", (NOISE,), INVERT)
 
 

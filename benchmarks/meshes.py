@@ -39,7 +39,6 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.studies.findings_inversion import NEITHER
-from workflows.studies.finer import solved_on
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,7 +174,7 @@ def main(words: Sequence[str] = ()) -> None:
     given = parser.parse_args(words)
     inputs, mesh = Inputs(PRIORS), f"{given.cells}-{given.degree}-{given.seed}"
     model: SpecimenModel = specimen(given.cells, given.degree).build(MPI.COMM_SELF, PARAMETERS)
-    case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).of(model)))
+    case = Case(inputs, model, Finer.by(SerialEvaluate(extrapolated(model, inputs.mean).of(model))))
     truths, clean = balls(model, inputs, max(given.truths, given.inverted), given.seed)
     if given.truths:
         expect(case, [known(case, truth) for truth in truths[: given.truths]], clean[: given.truths])

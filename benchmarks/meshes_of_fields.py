@@ -46,7 +46,7 @@ from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.mesh_correction import error_of
-from workflows.studies.finer import solved_on
+from uq.evaluation.evaluate import SerialEvaluate
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -113,7 +113,7 @@ def _problem(spec: Specimen) -> Problem:
     model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
     prior = spec.fields[0].prior(spec.body)
     root = prior.root(np.eye(len(prior.variance))).T
-    finer = solved_on(extrapolated(model, np.zeros(len(root))).of(model))
+    finer = Finer.by(SerialEvaluate(extrapolated(model, np.zeros(len(root))).of(model)))
     return Problem(model, prior, root, model.log_fields(np.zeros((1, len(root))))[0], finer)
 
 

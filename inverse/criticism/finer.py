@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ModelError, SolveError
+from uq.evaluation.request import Evaluate, Request
 
 if TYPE_CHECKING:
     from inverse.low_dimensional.laplace import Laplace
@@ -62,6 +63,18 @@ class Finer:
 
     solve: Callable[[FloatArray, bool], Solved] | None
     why: str = ""
+
+    @classmethod
+    def by(cls, evaluate: Evaluate) -> Finer:
+        """Solve by an evaluation of the model on finer meshes."""
+
+        def solve(point: FloatArray, tangents: bool) -> Solved:
+            found = evaluate(Request(point[None], tangents=tangents))
+            for failure in found.failures:
+                raise SolveError(failure.reason)
+            return np.asarray(found.outputs[0]), None if found.tangents is None else found.tangents[0]
+
+        return cls(solve)
 
     def look(self, point: FloatArray, *, tangents: bool = False) -> tuple[Look | None, str]:
         """Solve at parameters (d,): what finer meshes say, or why that is not known."""

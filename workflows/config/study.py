@@ -14,8 +14,8 @@ from pydantic import TypeAdapter, ValidationError
 from forward.registry import dotted
 from forward.settings import cut
 from uq.methods.method import METHODS
+from workflows.config.blocks import located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.report import located
 from workflows.config.source import KEPT, Sourced
 from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
 

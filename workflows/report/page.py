@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from forward.external.own_modules import OwnCodeError, installed_only, refused
 from forward.settings import one_line
+from workflows.config.blocks import Report, located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.report import Report, located
 from workflows.config.study import parse
 from workflows.report import comparison
 from workflows.report.blocks import Block, Folded, Heading, Html, Text, Viewer

@@ -29,7 +29,7 @@ from workflows.report.words import solves
 if TYPE_CHECKING:
     import xarray as xr
 
-    from workflows.config.report import Report
+    from workflows.config.blocks import Report
     from workflows.report.blocks import Block
 
 ROWS = 40  # parameters from which on a table is in the order of their effects

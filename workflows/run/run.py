@@ -40,8 +40,8 @@ from workflows.run.progress import Progress
 from workflows.run.summary import summarised
 from workflows.run.version import version
 from workflows.studies.adapted_mesh import FILES as REFINED
-from workflows.studies.findings_solves import findings_of_solves
 from workflows.studies.job import Job
+from workflows.studies.solves import findings_of_solves
 
 if TYPE_CHECKING:
     import xarray as xr

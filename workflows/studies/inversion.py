@@ -14,16 +14,15 @@ from forward.bodies.inclusions import log_factor
 from forward.findings import Finding
 from forward.registry import named
 from forward.scalars import Mistake
-from forward.settings import nearest
+from forward.settings import Settings, nearest
 from forward.spec import MEASURED, SPECIMEN, usual_kind
-from forward.specimen import Specimen
+from forward.specimen import LoadCase, Observed, Specimen
 from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced, Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.mistakes import not_installed
-from workflows.config.predict import Predict
 from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_factor, mistakes_of_priors, ranges
 from workflows.studies.measured import DataFiles, as_block, data_as
 from workflows.studies.measured_outputs import MeasuredOutputs
@@ -42,7 +41,38 @@ if TYPE_CHECKING:
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted
+LEAST = 8  # solves of an expansion of what is predicted
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
+
+
+class Predict(Settings):
+    """Outputs that the posterior predicts: under other loads, at other places, of another kind.
+
+    Parameters
+    ----------
+    cases
+        Of a specimen: load cases in which something is predicted, with what acts in them and `outputs`. One that has
+        the name of a measured load case and nothing that acts is that load case. By default the measured ones.
+    observed
+        Of a specimen: places at which displacements are predicted, as `model.observed` has them.
+    model
+        Of other models: settings that replace those of the model, such as { loads = [...], outputs = [...] }; all of
+        the outputs are predicted. By default the model as it is.
+    samples
+        Solves for the posterior, and as many for the prior: those of an expansion over draws of few parameters (by
+        default 32); of a field, pairs of draws (8 pairs), without which it is not seen what derivatives leave out.
+    """
+
+    cases: tuple[LoadCase, ...] = ()
+    observed: tuple[Observed, ...] = ()
+    model: dict[str, Any] = Field(default={})
+    samples: Annotated[int, Field(ge=0)] | None = None
+
+    def solves(self, *, field: bool) -> int:
+        """Number of solves beside the first, for the posterior as for the prior."""
+        if self.samples is None:
+            return 16 if field else 32
+        return self.samples
 
 
 class Inversion(StudyKind):

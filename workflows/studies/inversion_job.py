@@ -24,12 +24,11 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
-from workflows.studies.findings_solves import of_answers
-from workflows.studies.finer import FINER, finer_meshes, solved_by
 from workflows.studies.inversion import PREDICTED, Inversion
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
-from workflows.studies.predictions import has_mesh
+from workflows.studies.predictions import FINER, finer_meshes, has_mesh
+from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,7 +174,7 @@ def _inverted(
         As of `invert_few`.
     """
     data, method, errors = study.measured(number), study.method, study.data.errors
-    finer = _finer(seen.there, lambda model: solved_by(on(FINER, model)))
+    finer = _finer(seen.there, lambda model: Finer.by(on(FINER, model)))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
     if cheap is None:
         return invert_few(
@@ -324,7 +323,7 @@ def _inverting_field(
     def invert(
         number: int, states: ForwardModel, seen: _Observed, on: Callable[[str, ForwardModel], Evaluate]
     ) -> xr.Dataset:
-        finer = _finer(seen.there, lambda model: solved_by(on(FINER, model))) or NOT_LOOKED
+        finer = _finer(seen.there, lambda model: Finer.by(on(FINER, model))) or NOT_LOOKED
         shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
         data, errors = study.measured(number), study.data.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)

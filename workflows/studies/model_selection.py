@@ -22,13 +22,13 @@ from inverse.methods.selection import SelectSpecimens
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.priors import ranges
 from workflows.studies.candidates import OfCandidates, changed, spec_of
-from workflows.studies.findings_solves import of_answers
 from workflows.studies.listed_displacements import ListedDisplacements
 from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE, expanded
 from workflows.studies.measured import as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison, Selection
+from workflows.studies.solves import of_answers
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:

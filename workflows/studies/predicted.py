@@ -18,9 +18,8 @@ from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
-from workflows.config.predict import LEAST
 from workflows.config.priors import ranges
-from workflows.studies.inversion import PREDICTED
+from workflows.studies.inversion import LEAST, PREDICTED
 from workflows.studies.predictions import has_mesh, never_estimable
 
 if TYPE_CHECKING:
@@ -32,8 +31,7 @@ if TYPE_CHECKING:
     from inverse.methods.predict import Band, Record
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
-    from workflows.config.predict import Predict
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import Inversion, Predict
 
 FieldPredictions = Callable[["LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
 ACTING = ("clamp", "displacements", "loads")

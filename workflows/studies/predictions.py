@@ -1,23 +1,27 @@
-"""Parts of what studies say about themselves before they run."""
+"""Parts of what studies say about themselves before they run, and the finer meshes that they look at models on."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import REPORT, START
+from forward.settings import one_line
 from uq.accuracy.goal import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
+    from forward.fem.finer import FinerMeshes
     from forward.fem.locking import Decision
+    from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
 NONE_TO_SPARE = -1e9  # solves: for estimates without what calibrates them
 PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+FINER = "finer mesh"  # in names of models
 NOT_ASKED = "not requested: no result will be called trusted"
 
 
@@ -75,6 +79,26 @@ def meshes_of(spec: Any) -> tuple[Any, ...]:
         return ()
     beside = graded(spec)
     return (finer(spec),) if beside is None else (finer(spec), beside)
+
+
+def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+    """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+    from forward.fem.finer import extrapolated
+
+    try:
+        return extrapolated(model, start), ""
+    except ValueError as error:  # a mesh that is not divided, or would be too large
+        return None, one_line(str(error))
+
+
+def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
+    """Return the model on finer meshes of a specimen, or of the measured outputs of a body."""
+    from forward.combine import Rows
+    from forward.fem.finer import extrapolated
+
+    own = make()
+    body: Any = own.model if isinstance(own, Rows) else own
+    return extrapolated(body, start).of(own)
 
 
 def mesh_check(spec: Any) -> tuple[float, str]:

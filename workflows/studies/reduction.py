@@ -11,7 +11,7 @@ from forward.registry import named
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.predictions import duration, times_of
-from workflows.studies.reduce import Reduce
+from workflows.studies.reduction_job import Reduce, job
 from workflows.studies.sampling import Study
 
 if TYPE_CHECKING:
@@ -75,9 +75,7 @@ class ReductionStudy(Study):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the body; collective."""
-        make = named("workflows.studies.reduction_job:job")
-        made: Job = make(self.method, self.spec, self.inputs, ensemble, directory)
-        return made
+        return job(self.method, self.spec, self.inputs, ensemble, directory)
 
     def finished(self, dataset: xr.Dataset, evaluations: Any) -> xr.Dataset:
         """Results are complete."""

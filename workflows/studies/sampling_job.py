@@ -20,12 +20,12 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
+from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
-from workflows.studies.at_mean import stressed, with_stresses
-from workflows.studies.findings_solves import measured, of_answers
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
+from workflows.studies.solves import measured, of_answers, stressed, with_stresses
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,7 +52,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         found = sampled(evaluate)
         if not (study.spec.meshed and study.spec.touched):
             return found
-        from workflows.studies.at_mean import with_contact
+        from workflows.studies.solves import with_contact
 
         tools = tuple(load.label for load in model.spec.loads if load.contact)
         return with_contact(found, tools, model.space.coordinates, inputs, evaluate, recorders["/"].first)
@@ -89,7 +89,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     regions = model.space.regions()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
     of_body = ensemble.index == 0 and study.spec.meshed
-    locking = measured(study, model) if of_body else []
+    locking = measured(model, inputs.mean, ranges(study.given)) if of_body else []
     tensors = stressed(model, inputs.mean) if of_body and getattr(study.spec, "stresses", False) else None
 
     def labelled(found: xr.Dataset) -> xr.Dataset:

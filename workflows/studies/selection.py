@@ -27,10 +27,9 @@ from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
 from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
-from workflows.studies.finer import FINER, once_on_finer_meshes, solved_by
 from workflows.studies.job import MOVED, MethodJob
 from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements
-from workflows.studies.predictions import NOT_ASKED, duration
+from workflows.studies.predictions import FINER, NOT_ASKED, duration, once_on_finer_meshes
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -213,7 +212,7 @@ class Comparison(StudyKind):
             def finer(name: str, group: str) -> Finer:
                 if (name, group) not in checked:
                     return Finer(None, why[name])
-                return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
+                return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
             look = finer if why else None
 

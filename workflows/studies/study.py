@@ -11,9 +11,8 @@ from pydantic import Field, model_validator
 
 from forward.registry import Kinds, named
 from forward.settings import Settings
-from workflows.config.blocks import Parallel
+from workflows.config.blocks import Parallel, Report
 from workflows.config.mistakes import refused
-from workflows.config.report import Report
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -19,6 +19,7 @@ from scipy.stats import multivariate_normal
 import forward.fem.finer
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.model import FunctionModel
+from inverse.criticism.finer import Finer
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import SerialEvaluate
@@ -29,7 +30,6 @@ from workflows.config.study import dump, load, parse
 from workflows.report.sections.errors import finer_mesh_table as meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
-from workflows.studies.finer import solved_on
 from workflows.studies.model_selection import ModelSelection
 from workflows.studies.predictions import meshes_of
 from workflows.studies.selection_results import doubts_of_selection, trusted_on_meshes
@@ -198,7 +198,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
             it.models,
             it.data_groups,
             lambda name, _, models=models: SerialEvaluate(models[name]),
-            finer=lambda name, _: solved_on(finer[name]),
+            finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
         )
         for models in runs
     )
@@ -226,7 +226,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
         it.models,
         it.data_groups,
         lambda name, _: SerialEvaluate(coarse[name]),
-        finer=lambda name, _: solved_on(finer[name]),
+        finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
         say=lines.append,
     )
     assert found["mesh_corrected"].all()
@@ -236,7 +236,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
         it.models,
         it.data_groups,
         lambda name, _: SerialEvaluate(coarse[name]),
-        finer=lambda name, _: solved_on(finer[name]),
+        finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
     )
     apart = abs(np.diff(plain["log_evidence"].values.ravel())).item()
     assert abs(np.diff(found["log_evidence"].values.ravel())).item() < 0.5 * apart

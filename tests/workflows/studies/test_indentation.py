@@ -15,7 +15,7 @@ from uq.surrogates.linearisation import linearise
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
-from workflows.studies.at_mean import with_contact
+from workflows.studies.solves import with_contact
 
 STUDY = """
 [model]
