@@ -18,7 +18,7 @@ from mpi4py import MPI
 from benchmarks.beams import CONFIG
 from forward.fem.finer import extrapolated
 from forward.model import FloatArray
-from inverse.data.outputs import OutputData
+from inverse.data.measurements import Measurements
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
@@ -107,7 +107,8 @@ def _inverted(
     """Measure a curve with errors, and invert it; also their standard deviation (N)."""
     outputs, size = mine.model.outputs, noise * float(np.sqrt((clean**2).mean()))
     values = clean + size * rng.standard_normal(len(clean))
-    data = OutputData(outputs, values, np.hypot(size, mine.error), outputs).of(outputs, outputs)
+    sigma, numbers = np.hypot(size, mine.error), range(len(outputs))
+    data = Measurements.of(values, sigma, numbers, numbers, outputs, parts=outputs, some=True)
     method = Invert(samples=SAMPLES, starts=1, seed=1)
     return invert_few(inputs, SerialEvaluate(mine.model), data, method, finer=mine.finer).dataset, size
 

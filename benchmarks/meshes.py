@@ -31,7 +31,7 @@ from inverse.criticism.doubts_of_meshes import mesh_corrected, mesh_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Places, Whitening
 from inverse.data.errors import NORMAL
-from inverse.data.observations import Components
+from inverse.data.measurements import Measurements
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.mesh_correction import Treatment, error_of
@@ -353,11 +353,11 @@ def inverted(
     }
 
 
-def measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -> Components:
+def measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -> Measurements:
     """Add errors to data (m,)."""
     sigma = sigma_of(model, clean, noise)
     values = clean + sigma * np.random.default_rng([seed, 7]).standard_normal(len(clean))
-    return Components(model.places, model.axes, model.cases, values, sigma)
+    return Measurements.of(values, sigma, model.cases, model.axes, places=model.places)
 
 
 def trusted(found: xr.Dataset) -> bool:

@@ -41,7 +41,7 @@ from forward.specimen import Specimen
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Places, Whitening, along
 from inverse.data.errors import NORMAL
-from inverse.data.observations import Components
+from inverse.data.measurements import Measurements
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_field import Vertices, invert_field
@@ -191,7 +191,7 @@ def _invert(problem: Problem, truths: FloatArray, clean: FloatArray, name: str) 
         )
 
 
-def _inverted(problem: Problem, data: Components, vertices: Vertices, truth: FloatArray) -> dict[str, Any]:
+def _inverted(problem: Problem, data: Measurements, vertices: Vertices, truth: FloatArray) -> dict[str, Any]:
     """Invert one data set for a field."""
     begin = time.process_time()
     posterior = FieldPosterior(problem.model, data.values, data.sigma, problem.prior)

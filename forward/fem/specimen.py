@@ -27,6 +27,7 @@ from forward.model import FloatArray, Guess, MeshError, Saturation
 from forward.specimen import Observed, Specimen
 
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
+Numbers = Sequence[int] | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +63,8 @@ class SpecimenModel(Joined):
     def observing(
         self,
         places: FloatArray,
-        axes: Sequence[int],
-        cases: Sequence[int],
+        axes: Numbers,
+        cases: Numbers,
         directions: FloatArray | None = None,
         names: Sequence[str] = (),
     ) -> SpecimenModel:

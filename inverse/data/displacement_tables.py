@@ -21,15 +21,16 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.observations import ERRORS, MOTION, POSITION, SAME, Observations
+from inverse.data.measurements import AXES, SAME, Measurements
 from inverse.data.readings import Units, split
 from inverse.data.table import DataError, Table, needed, numeric, others, read_table
 from inverse.data.units import factor, split_head
 
-COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
+MOTION, ERRORS = ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
+COLUMNS = (*AXES, *MOTION, "sigma", *ERRORS, "case")
 
 
-def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) -> Observations:
+def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) -> Measurements:
     """Read a table of displacements, and of other outputs.
 
     Parameters
@@ -48,17 +49,15 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
     """
     name, cases = path.name, tuple(known)
     table, readings = split(read_table(path), name, known)
-    source = table.source
-    truth = {path_of: value.strip('"') for path_of, value in table.truth}
+    readings = replace(readings, source=table.source, truth={one: value.strip('"') for one, value in table.truth})
     if not table.rows:
-        none = np.zeros((0, 3))
-        return Observations(none, none, none, cases, np.zeros(0, dtype=np.int64), (), source, truth, readings=readings)
+        return readings
     found, unit = _without_units(table, name, unit)
     columns = found.columns
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
     ]
-    wrong += [f"{name}: no column '{column}', expected x, y, z" for column in POSITION if column not in columns]
+    wrong += [f"{name}: no column '{column}', expected x, y, z" for column in AXES if column not in columns]
     if not any(column in columns for column in MOTION):
         wrong.append(f"{name}: no column of displacements, expected at least one of ux, uy, uz")
     if "case" not in columns and len(cases) > 1:
@@ -69,7 +68,7 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
     labels = tuple(f"{name}: line {n}" for n in found.lines)
     numbers: dict[str, FloatArray] = {}
     mistakes = []
-    for column in (*POSITION, *MOTION, "sigma", *ERRORS):
+    for column in (*AXES, *MOTION, "sigma", *ERRORS):
         if column not in columns:
             continue
         values, bad = np.full(len(rows), math.nan), []
@@ -90,18 +89,17 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         raise DataError(*mistakes)
     nothing = np.full(len(rows), np.nan)
     common = numbers.get("sigma", nothing)
-    return Observations(
-        np.column_stack([numbers[column] for column in POSITION]),
+    return Measurements.of_points(
+        np.column_stack([numbers[column] for column in AXES]),
         np.column_stack([numbers.get(column, nothing) for column in MOTION]),
         np.column_stack([numbers.get(column, common) for column in ERRORS]),
-        cases,
         np.array([cases.index(case) for case in given_cases]),
         labels,
-        source,
-        truth,
+        cases,
         unit=unit,
-        readings=readings,
-    )
+        source=readings.source,
+        truth=readings.truth,
+    ).with_rows(readings)
 
 
 def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, float]:
@@ -133,6 +131,6 @@ def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, 
 
 def _number(text: str, column: str) -> float:
     """Return a number; where none has to be, an empty cell or NaN is one that was not measured."""
-    if column in POSITION:
+    if column in AXES:
         return needed(text, column)
     return numeric("" if text.lower() == "nan" else text, column, positive=column not in MOTION)

@@ -10,123 +10,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.approximation_error import Places
 from inverse.data.curves import Steps, as_rows
-from inverse.data.neighbours import Neighbours, neighbours
+from inverse.data.measurements import Measurements
 from inverse.data.table import DataError, needed, numeric, read_table
 
 COLUMNS = ("output", "value", "sigma")
 
 
-@dataclass(frozen=True, eq=False)
-class OutputData:
-    """Measured outputs of a model, each a separate part of the data.
-
-    Attributes
-    ----------
-    names
-        Measured outputs (m,); an output may occur several times.
-    values, sigma
-        What was measured (m,), and the standard deviations (m,) of the errors, NaN if unknown.
-    labels
-        Location (m,) of each in its file.
-    source
-        Their source, line by line.
-    truth
-        Numbers of the model, by path.
-    outputs
-        All outputs of the model, in its order.
-    parts
-        Outputs with data in any data set of a study, in the order of the model.
-    """
-
-    names: tuple[str, ...]
-    values: FloatArray
-    sigma: FloatArray
-    labels: tuple[str, ...]
-    source: tuple[str, ...] = ()
-    truth: Mapping[str, float] = field(default_factory=dict)
-    outputs: tuple[str, ...] = ()
-    parts: tuple[str, ...] = ()
-
-    @property
-    def data(self) -> OutputData:
-        """Itself: what is compared with a model."""
-        return self
-
-    def of(self, outputs: Sequence[str], parts: Sequence[str]) -> OutputData:
-        """Return the same as data of a model with these outputs."""
-        return replace(self, outputs=tuple(outputs), parts=tuple(parts))
-
-    @property
-    def which(self) -> tuple[int, ...]:
-        """Numbers (m,) of the outputs of the model."""
-        return tuple(self.outputs.index(name) for name in self.names)
-
-    @property
-    def cases(self) -> NDArray[np.int64]:
-        """Numbers (m,) of the parts."""
-        return np.array([self.parts.index(name) for name in self.names], dtype=np.int64)
-
-    @property
-    def described(self) -> dict[str, FloatArray]:
-        """Nothing else: the parts are the outputs."""
-        return {}
-
-    @property
-    def spread(self) -> Places:
-        """At no places, by output."""
-        return Places(self.cases)
-
-    def neighbours(self) -> Neighbours:
-        """Return pairs of repeated measurements."""
-        return neighbours(np.zeros((len(self.names), 1)), self.cases)
-
-    def with_sigma(self, given: Mapping[str, float], relative: float, absolute: float) -> OutputData:
-        """Return the same with standard deviations of the errors where they are unknown.
-
-        Parameters
-        ----------
-        given
-            By output.
-        relative, absolute
-            For other outputs, σ = max(relative |y|, absolute).
-
-        Raises
-        ------
-        DataError
-            If one is still unknown.
-        """
-        general = np.maximum(relative * np.abs(self.values), absolute)
-        general = np.array([given.get(name, one) for name, one in zip(self.names, general, strict=True)])
-        sigma = np.where(np.isnan(self.sigma), general, self.sigma)
-        lost = [label for label, one in zip(self.labels, sigma, strict=True) if not one > 0]
-        if lost:
-            more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
-            raise DataError(
-                f"{lost[0]}: the standard deviation of the error is not known{more}, expected a column sigma, "
-                "data.sigma of this output, or data.noise that does not vanish there"
-            )
-        return replace(self, sigma=sigma)
-
-    def with_truth(self, truth: Mapping[str, float]) -> OutputData:
-        """Return the same with true numbers of the model that are known separately."""
-        return replace(self, truth={**self.truth, **truth})
-
-    def data_labels(self) -> list[str]:
-        """Say for each datum its location, and its output."""
-        return [f"{label}, {name}" for label, name in zip(self.labels, self.names, strict=True)]
-
-
-def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None) -> OutputData:
+def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None) -> Measurements:
     """Read a table of measured outputs.
 
     Parameters
@@ -182,16 +80,34 @@ def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None)
     if wrong:
         raise DataError(*wrong)
     sigma = np.array(numbers.get("sigma", [math.nan] * len(names)))
-    return OutputData(names, np.array(numbers["value"]), sigma, labels, table.source, truth)
+    values, axes = np.array(numbers["value"]), [outputs.index(one) for one in names]
+    return _outputs(values, sigma, axes, labels, outputs, source=table.source, truth=truth)
 
 
-def stated(values: Mapping[str, float | Sequence[float]]) -> OutputData:
-    """Return measured outputs that a study states by name, one or several of each."""
+def stated(given: Mapping[str, float | Sequence[float]], outputs: Sequence[str]) -> Measurements:
+    """Return measurements that a study states by name, one or several of each output; errors as of `read_outputs`."""
+    wrong = [name for name in given if name not in outputs]
+    if wrong:
+        raise DataError(
+            *(f"outputs.{one}: not an output of the model; {nearest(one, tuple(outputs))}" for one in wrong)
+        )
     pairs = [
         (name, float(value))
-        for name, given in values.items()
-        for value in (given if isinstance(given, Sequence) else (given,))
+        for name, several in given.items()
+        for value in (several if isinstance(several, Sequence) else (several,))
     ]
-    names = tuple(name for name, _ in pairs)
-    labels = tuple(f"data.outputs.{name}" for name in names)
-    return OutputData(names, np.array([value for _, value in pairs]), np.full(len(pairs), math.nan), labels)
+    labels = [f"data.outputs.{name}" for name, _ in pairs]
+    values = np.array([value for _, value in pairs])
+    return _outputs(values, np.full(len(pairs), math.nan), [outputs.index(name) for name, _ in pairs], labels, outputs)
+
+
+def _outputs(
+    values: FloatArray,
+    sigma: FloatArray,
+    axes: Sequence[int],
+    labels: Sequence[str],
+    outputs: Sequence[str],
+    **more: Any,
+) -> Measurements:
+    names = [outputs[axis] for axis in axes]
+    return Measurements.of(values, sigma, axes, axes, names, labels, outputs, some=True, **more)

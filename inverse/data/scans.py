@@ -32,9 +32,9 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray
 from forward.settings import Settings, nearest
-from inverse.data.displacement_tables import of_table
+from inverse.data.displacement_tables import ERRORS, MOTION, of_table
 from inverse.data.files import MESHES, TABLES
-from inverse.data.observations import ERRORS, MOTION, SAME, Observations, mistakes_of
+from inverse.data.measurements import SAME, Measurements
 from inverse.data.readings import Units
 from inverse.data.registration import Registration
 from inverse.data.scan_files import Points, points_of
@@ -163,7 +163,7 @@ class Scan(Reading):
         return self
 
 
-def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -> Observations:
+def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -> Measurements:
     """Read the files of a scan.
 
     Parameters
@@ -191,13 +191,13 @@ def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -
             found = of_table(path, known if isinstance(known, Mapping) else {case: {} for case in cases}, unit)
         else:
             found = _mesh(path, scan.field, cases, 1.0 if unit is None else unit)
-    mistakes = mistakes_of(found, Path(scan.file or scan.reference or "").name)
+    mistakes = found.mistakes(Path(scan.file or scan.reference or "").name)
     if mistakes:
         raise DataError(*mistakes)
     return found
 
 
-def _mesh(path: Path, named: str | None, cases: tuple[str, ...], unit: float) -> Observations:
+def _mesh(path: Path, named: str | None, cases: tuple[str, ...], unit: float) -> Measurements:
     found = points_of(path)
     if path.suffix == ".stl" or not (found.values or named):
         raise DataError(
@@ -252,7 +252,7 @@ def _errors(found: Points, name: str, case: str) -> FloatArray:
     return whole
 
 
-def _pairs(folder: Path, scan: Scan, cases: tuple[str, ...], unit: float) -> Observations:
+def _pairs(folder: Path, scan: Scan, cases: tuple[str, ...], unit: float) -> Measurements:
     """Read pairs of surfaces, and take their differences."""
     assert scan.reference is not None
     strange = [case for case in scan.deformed if case not in cases]
@@ -283,7 +283,7 @@ def _pairs(folder: Path, scan: Scan, cases: tuple[str, ...], unit: float) -> Obs
 
 def _joined(
     parts: Sequence[tuple[FloatArray, FloatArray, FloatArray]], name: str, cases: tuple[str, ...], unit: float
-) -> Observations:
+) -> Measurements:
     """Join places, displacements and errors of the load cases, without points that coincide and say the same."""
     rows = []
     for number, (places, motion, sigma) in enumerate(parts):
@@ -303,5 +303,5 @@ def _joined(
         words = [f"{name}: point {i}" for i in kept]
         rows.append((places[kept], motion[kept], sigma[kept], np.full(len(kept), number), words))
     places, motions, errors, numbers = (np.concatenate([row[k] for row in rows]) for k in range(4))
-    labels = tuple(label for row in rows for label in row[4])
-    return Observations(unit * places, unit * motions, unit * errors, cases, numbers, labels, unit=unit)
+    labels = [label for row in rows for label in row[4]]
+    return Measurements.of_points(unit * places, unit * motions, unit * errors, numbers, labels, cases, unit=unit)

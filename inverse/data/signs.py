@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.data.table import DataError
 
 
-def check(names: Sequence[str], values: FloatArray, labels: Sequence[str], negative: Sequence[bool]) -> None:
+def check(names: Iterable[str], values: FloatArray, labels: NDArray[np.str_], negative: Sequence[bool]) -> None:
     """Refuse data of which most are below 0, where their output cannot be; a few may be by their errors.
 
     Parameters

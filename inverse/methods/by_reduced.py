@@ -20,11 +20,11 @@ from inverse.criticism.doubts import SAME
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.weights import effective_sample_size, normalised, resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Inverted, invert_few
-from inverse.methods.record import Data
 from uq.evaluation.evaluate import OfEvaluate, Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
@@ -110,7 +110,7 @@ def invert_by_reduced(
     inputs: Inputs,
     evaluate: Evaluate,
     reduced: ForwardModel,
-    data: Data,
+    data: Measurements,
     method: Invert,
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
@@ -159,7 +159,7 @@ def _corrected(
     inputs: Inputs,
     full: Evaluate,
     cheap: Evaluate,
-    data: Data,
+    data: Measurements,
     method: Invert,
     errors: NormalErrors | StudentErrors,
 ) -> tuple[Linearisation, Corrected]:

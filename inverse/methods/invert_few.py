@@ -20,6 +20,7 @@ from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import Evidence
@@ -31,7 +32,6 @@ from inverse.methods.record import (
     ENDS,
     SOURCES,
     TRUST,
-    Data,
     Record,
     as_dataset,
     diagnosed,
@@ -99,7 +99,7 @@ class Inverted:
 def invert_few(
     inputs: Inputs,
     evaluate: Evaluate,
-    data: Data,
+    data: Measurements,
     method: Invert,
     look: Look | None = None,
     *,
@@ -247,7 +247,7 @@ def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Dra
     }
 
 
-def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Data) -> Record:
+def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Measurements) -> Record:
     """Standard deviations (c,) by the model linearised at the mode, from all load cases and from each alone."""
     d, c = len(posterior.inputs.names), len(posterior.names)
     slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]

@@ -20,6 +20,7 @@ from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine
 from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
+from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
@@ -32,7 +33,6 @@ from inverse.methods.record import (
     ENDS,
     SHOWN,
     TRUST,
-    Data,
     Record,
     as_dataset,
     diagnosed,
@@ -88,7 +88,7 @@ def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) 
 
 def invert_field(
     posterior: FieldPosterior,
-    data: Data,
+    data: Measurements,
     method: Invert,
     vertices: Vertices,
     finer: Finer = NOT_LOOKED,

@@ -8,7 +8,7 @@ directions that all cases together constrain, exact to the first λ that was neg
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ from forward.model import FloatArray
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.predictive import ResidualTest
-from inverse.data.approximation_error import Places, Whitening
-from inverse.data.neighbours import Neighbours
+from inverse.data.approximation_error import Whitening
+from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
@@ -136,37 +136,6 @@ DIMS: dict[str, tuple[str, ...]] = {
 }
 
 
-class Data(Protocol):
-    """Measured data (m,) of one data set."""
-
-    @property
-    def values(self) -> FloatArray:
-        """Measured values (m,)."""
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations (m,) of the errors."""
-
-    @property
-    def cases(self) -> NDArray[np.int64]:
-        """Numbers (m,) of the parts (load cases, outputs) whose information is also shown separately."""
-
-    @property
-    def which(self) -> tuple[int, ...] | None:
-        """Numbers (m,) of the outputs of the model that were measured; None if these are all, in order."""
-
-    @property
-    def described(self) -> dict[str, FloatArray]:
-        """Further information on the data, by its name in results."""
-
-    @property
-    def spread(self) -> Places:
-        """Where the data are, for what is uncertain of their mesh error."""
-
-    def neighbours(self) -> Neighbours:
-        """Return pairs of data that are expected to agree if the model is wrong."""
-
-
 def as_dataset(record: Record) -> xr.Dataset:
     """Return the results of an inversion, numbers and sentences, as a dataset."""
     import xarray as xr
@@ -218,7 +187,9 @@ def usual_sizes(method: Invert, *, field: bool) -> dict[str, int]:
     return {"iteration": STEPS} | (of_field if field else {"sample": method.draws})
 
 
-def of_data(data: Data, predicted: FloatArray, residual: FloatArray, scale: FloatArray, spectrum: Spectrum) -> Record:
+def of_data(
+    data: Measurements, predicted: FloatArray, residual: FloatArray, scale: FloatArray, spectrum: Spectrum
+) -> Record:
     """Data, residuals over the errors `scale`, and resolution, also by load case."""
     values, cases = spectrum.values, int(data.cases.max()) + 1
     resolution = (spectrum.images**2 / (1 + values[:, None])).sum(axis=0)

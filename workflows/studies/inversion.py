@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
     from forward.reduced.spec import Reduced
     from forward.spec import ModelSpec
-    from inverse.methods.record import Data
+    from inverse.data.measurements import Measurements
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
@@ -202,14 +202,18 @@ class Inversion(StudyKind):
             return tuple(case.name for case in self.model.cases)
         return next((found.parts for found in self.measurements if found is not None), ())
 
-    def measured(self, number: int) -> Data:
+    def measured(self, number: int) -> Measurements:
         """Return a data set that can be used."""
-        found: Data = self.measurements[number].data
+        found: Measurements = self.measurements[number]
         return found
 
     def not_estimable(self, number: int) -> tuple[str, ...]:
         """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
-        return () if self.specimen is not None else never_estimable(self.model, self.measurements[number].names)
+        return (
+            ()
+            if self.specimen is not None
+            else never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
+        )
 
     @property
     def recorded(self) -> bool:
@@ -295,8 +299,8 @@ class Inversion(StudyKind):
         """Find that no force acts or is measured: then displacements do not change if all stiffnesses are doubled."""
         pressed = any(not load.contact for case in self.model.cases for load in case.loads)
         units = self.model.measurable
-        seen = [found.observations.readings for found in self.measurements if found is not None]
-        names = {(self.parts[case], name) for one in seen for case, name in zip(one.case, one.names, strict=True)}
+        seen = [found.subset(found.points < 0) for found in self.measurements if found is not None]
+        names = {(self.parts[case], name) for one in seen for case, name in zip(one.cases, one.names, strict=True)}
         if pressed or any(units[case][name] not in OF_GEOMETRY for case, name in names):
             return
         moduli = [

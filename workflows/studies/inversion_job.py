@@ -27,6 +27,7 @@ from workflows.studies.findings_inversion import judged
 from workflows.studies.inversion import PREDICTED, Inversion
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
+from workflows.studies.measured import motion_of
 from workflows.studies.predictions import FINER, finer_meshes, has_mesh
 from workflows.studies.solves import of_answers
 
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
     from forward.specimen import Specimen
-    from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import SharedMotion
     from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
@@ -120,14 +120,13 @@ def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
         return study.stiffness(vertices[0], points) + model.log_fields(points)
 
     def observed(number: int) -> _Observed:
-        measured = study.measurements[number]
-        data = measured.data
+        data = study.measured(number)
         try:
             own = model.observing(data.places, data.axes, data.cases, data.along)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
         there = None if meshes is None else meshes.of(own)
-        motion = measured.motion(study.model.body)
+        motion = motion_of(data, study.model.body)
         shared = None if motion is None else (motion, model.observing(*motion.observed))
         return _Observed(own, (there, why), shared)
 
@@ -285,8 +284,8 @@ def _expanded(
 
 def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Callable[[str], None]) -> xr.Dataset:
     """Invert a data set with the expansion, whose errors are among those of the data."""
-    data = cast("OutputData", study.measured(number))
-    missed = found.error[list(data.which)]
+    data = study.measured(number)
+    missed = found.error[data.axes]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
     errors = study.data.errors
     evaluate, near = SerialEvaluate(found.model), partial(Nearby.at, found.model, spread=study.inputs.std)

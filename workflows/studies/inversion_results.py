@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.bodies.random_fields import NodalPrior
+    from inverse.data.measurements import Measurements
     from uq.evaluation.tasks import Outcome
     from workflows.studies.inversion import Inversion
-    from workflows.studies.measured import Measurement
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
@@ -99,9 +99,9 @@ def _of_specimen(
     places, cells, kind = vertices
     found = list(study.measurements)
     return {
-        "points_moved": ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found]),
-        "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max(initial=0.0)) for m in found]),
-        "rms_move": ("data_set", [0.0 if m is None else _rms(m.moved) for m in found]),
+        "points_moved": ("data_set", [0 if m is None else int((m.moves > 0).sum()) for m in found]),
+        "largest_move": ("data_set", [0.0 if m is None else float(m.moves.max(initial=0.0)) for m in found]),
+        "rms_move": ("data_set", [0.0 if m is None else _rms(m.moves) for m in found]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
         "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
         "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
@@ -116,13 +116,12 @@ def _rms(moved: FloatArray) -> float:
     return float(np.linalg.norm(moved) / np.sqrt(max(len(moved), 1)))
 
 
-def _moves(found: Sequence[Measurement | None], count: int) -> FloatArray:
+def _moves(found: Sequence[Measurements | None], count: int) -> FloatArray:
     """Return how far (n, count) the point of each datum was moved (m)."""
     whole = np.full((len(found), count), np.nan)
     for row, one in zip(whole, found, strict=True):
         if one is not None:
-            moves = one.observations.by_datum(one.moved)
-            row[: len(moves)] = moves
+            row[: len(one)] = one.moved
     return whole
 
 
@@ -143,7 +142,7 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
         warnings.simplefilter("ignore", RuntimeWarning)  # of data sets that could not be inverted there are none
         lower, upper = np.nanquantile(draws, ENDS, axis=1)
         mean, std = np.nanmean(draws, axis=1), np.nanstd(draws, axis=1)
-    true = np.array([of(np.zeros((1, 0)), m.inclusions if m is not None else ())[0] for m in found])
+    true = np.array([of(np.zeros((1, 0)), (m.truth.get("inclusions", ()) if m is not None else ()))[0] for m in found])
     here = {"mode": of(record["mode"][:, : len(names)]), "mean": mean, "std": std, "lower": lower, "upper": upper}
     prior = np.column_stack([before[label] for label in labels])
     return {
@@ -188,17 +187,17 @@ def prior_draws(study: Inversion) -> FloatArray:
     return kept[:PRIOR_DRAWS]
 
 
-def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArray) -> FloatArray:
+def _true_at(study: Inversion, measurement: Measurements | None, places: FloatArray) -> FloatArray:
     """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is unknown."""
     if measurement is None:
         return np.full(len(places), np.nan)
-    if measurement.inclusions:
-        return np.asarray(log_factor(measurement.inclusions, (), np.zeros((1, 0)), places)[0])
-    if len(measurement.places):
+    truth = measurement.truth
+    if truth.get("inclusions"):
+        return np.asarray(log_factor(truth["inclusions"], (), np.zeros((1, 0)), places)[0])
+    if len(truth.get("stiffness", ((), ()))[0]):
         from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-        linear = LinearNDInterpolator(measurement.places, measurement.stiffness)(places)
-        nearest = NearestNDInterpolator(measurement.places, measurement.stiffness)(places)
+        linear, nearest = (of(*truth["stiffness"])(places) for of in (LinearNDInterpolator, NearestNDInterpolator))
         return np.asarray(np.where(np.isfinite(linear), linear, nearest))  # beyond the hull, by rounding
     return np.full(len(places), np.nan)
 
@@ -343,7 +342,7 @@ class Rows:
         """Add a finished data set."""
         sets, measurement = self._study.data.sets[number], self._study.measurements[number]
         if outcome.dataset is None:
-            moved = int((getattr(measurement, "moved", np.zeros(0)) > 0).sum())
+            moved = 0 if measurement is None else int((measurement.moves > 0).sum())
             after = len(self._head) - self._head.index("why") - 1
             empty = [""] * (len(self._head) - 5 - after)
             self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason, *[""] * after]

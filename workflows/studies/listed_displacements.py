@@ -20,7 +20,7 @@ from inverse.data.registration import UncertainMotion
 from inverse.data.scans import Reading
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import Positive, check_readings, onto, read_on
+from workflows.studies.measured import Positive, onto, read_on
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -54,29 +54,23 @@ class DisplacementFile(Reading):
         StudyError
             If the file cannot be used.
         """
-        measurable = specimen.measurable
-        cases = tuple(measurable)
         try:
-            placed, registered, scan = read_on(folder / self.file, measurable, specimen.body, self)
-            check_readings(placed.observations.readings, specimen)
+            found = read_on(folder / self.file, specimen, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        motion = UncertainMotion.of(registered, scan.moved_between(placed.observations.unit))
-        found, moved = placed.observations, placed.distances
-        data = found.components()
-        known = bool(np.isfinite(data.sigma).all())
-        truth = [f"truth: {name} = {value}" for name, value in found.truth.items()]
+        motion, moved = UncertainMotion.of(found.registered, found.between), found.moves
+        known = bool(np.isfinite(found.sigma).all())
+        axes = {} if found.registered is None else {"axes": found.registered.motion.rotation.T.tolist()}
+        uncertain = {} if motion is None else {"motion": motion.model_dump(exclude_none=True)}
         return {
-            "source": [*found.source, *truth],
-            "places": np.nan_to_num(data.places).tolist(),
-            "components": [
-                (*AXES, *measurable[cases[case]])[axis] for axis, case in zip(data.axes, data.cases, strict=True)
-            ],
-            **({} if registered is None else {"axes": found.axes.tolist()}),
-            **({} if motion is None else {"motion": motion.model_dump(exclude_none=True), "on_surface": scan.surface}),
-            "cases": [cases[case] for case in data.cases],
-            "measured": data.values.tolist(),
-            **({"sigma": data.sigma.tolist()} if known else {}),
+            "source": [*found.source, *(f"truth: {name} = {value}" for name, value in found.truth.items())],
+            "places": np.nan_to_num(found.places).tolist(),
+            "components": found.names.tolist(),
+            **axes,
+            **({} if motion is None else {**uncertain, "on_surface": found.on_surface}),
+            "cases": [found.parts[case] for case in found.cases],
+            "measured": found.values.tolist(),
+            **({"sigma": found.sigma.tolist()} if known else {}),
             **({"points_moved": int((moved > 0).sum()), "largest_move": float(moved.max())} if moved.any() else {}),
         }
 

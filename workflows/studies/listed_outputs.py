@@ -20,7 +20,8 @@ from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from inverse.methods.invert import derivable
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import Positive, check_signs
+from workflows.studies.measured import Positive
+from workflows.studies.measured_outputs import check_signs
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
@@ -62,16 +63,17 @@ class OutputFile(Settings):
         outputs = tuple(output.name for output in spec.returned)
         try:
             found = (
-                stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs, steps_of(spec))
+                stated(self.outputs, outputs)
+                if self.file is None
+                else read_outputs(folder / self.file, outputs, steps_of(spec))
             )
             check_signs(found, spec)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        given = np.array([self.sigma.get(name, np.nan) for name in found.names])
-        sigma = np.where(np.isnan(found.sigma), given, found.sigma)
+        sigma = found.with_sigma(np.array([self.sigma.get(name, np.nan) for name in found.names])).sigma
         truth = [f"truth: {name} = {value!r}" for name, value in found.truth.items()]
         return {
-            "names": list(found.names),
+            "names": found.names.tolist(),
             "measured": found.values.tolist(),
             "source": [*found.source, *truth],
             **({"sigma": sigma.tolist()} if np.isfinite(sigma).all() else {}),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -13,18 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
-from forward.bodies.geometry import tolerance
+from forward.bodies.geometry import AXES, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.files import meshes
-from forward.findings import Finding
 from forward.settings import Settings, one_line
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
-from inverse.data.observations import Components, Observations, Placed
-from inverse.data.readings import Readings, Units
-from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
+from inverse.data.measurements import Measurements
+from inverse.data.registration import ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
@@ -32,14 +31,11 @@ from workflows.config.mistakes import StudyError, lines
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
     from forward.model import FloatArray
-    from forward.spec import ModelSpec
     from forward.specimen import Specimen
-    from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import SharedMotion
 
 
 Positive = Annotated[float, Field(gt=0)]
-LISTED = 5  # points that do not belong to a body
 
 
 class DataSet(Settings):
@@ -204,73 +200,15 @@ def _hashes(path: Path) -> bytes:
     return b"".join(sha256(one.read_bytes()).digest() for one in (path, *meshes.beside(path)))
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """A data set that can be used.
+def motion_of(found: Measurements, body: Body) -> SharedMotion | None:
+    """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
+    from inverse.data.shared_motion import SharedMotion
 
-    Attributes
-    ----------
-    observations
-        On the body.
-    moved
-        How far (n,) its points were moved (m).
-    truth
-        Numbers from which it was made, by path.
-    inclusions
-        The true ones.
-    places, stiffness
-        Where (k, 3) ln of the true stiffness factor (k,) is known beside that.
-    left_out
-        Points that do not belong to the body, and how far they are from it.
-    registered
-        The motion from the frame of the file to that of the body; None if they are the same.
-    on_surface
-        Whether its points lie on the surface.
-    between
-        Standard deviations (rad, m) of rigid motions between the undeformed scan and that of each load case.
-    """
-
-    observations: Observations
-    moved: FloatArray
-    truth: dict[str, float]
-    inclusions: tuple[Any, ...]
-    places: FloatArray
-    stiffness: FloatArray
-    left_out: tuple[str, ...] = ()
-    registered: Registered | None = None
-    on_surface: bool = False
-    between: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def data(self) -> Components:
-        """The components that were measured."""
-        return self.observations.components()
-
-    def data_labels(self) -> list[str]:
-        """Say of each datum where it stands."""
-        return self.observations.data_labels()
-
-    def motion(self, body: Body) -> SharedMotion | None:
-        """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
-        from inverse.data.shared_motion import SharedMotion
-
-        motion = UncertainMotion.of(self.registered, self.between)
-        if motion is None:
-            return None
-        data = self.data
-        project = onto(body) if self.on_surface else None
-        return SharedMotion.of(data.places, data.along, data.cases, motion, project)
-
-    @property
-    def findings(self) -> Iterator[Finding]:
-        """What is to be known of the points before they are used."""
-        if self.left_out:
-            points = "1 point does" if len(self.left_out) == 1 else f"{len(self.left_out)} points do"
-            more = "" if len(self.left_out) <= LISTED else f" and {len(self.left_out) - LISTED} others"
-            listed = ", ".join(self.left_out[:LISTED])
-            yield Finding("points-left-out", "note", {"points": points, "listed": listed, "more": more})
-        if self.registered is not None and self.registered.unseen:
-            yield Finding("registration-undetermined", "note", {"what": ", ".join(self.registered.unseen)})
+    motion = UncertainMotion.of(found.registered, found.between)
+    if motion is None:
+        return None
+    project = onto(body) if found.on_surface else None
+    return SharedMotion.of(found.places, found.along, found.cases, motion, project)
 
 
 def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
@@ -279,38 +217,15 @@ def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
     return lambda points: surface.nearest(points)[0]
 
 
-def check_signs(found: OutputData, spec: ModelSpec) -> None:
-    """Refuse measured outputs of a model whose sign cannot be right, over all steps of each.
-
-    Raises
-    ------
-    DataError
-        With a line for each.
-    """
-    of = {one.name: (getattr(one, "of", one.name), getattr(one, "negative", True)) for one in spec.returned}
-    there = [of.get(name, (name, True)) for name in found.names]
-    signs.check([name for name, _ in there], found.values, found.labels, [negative for _, negative in there])
-
-
-def check_readings(found: Readings, model: Specimen) -> None:
-    """Refuse measured outputs of load cases whose sign cannot be right; raises as `check_signs`."""
-    outputs = [model.cases[case].outputs[which] for case, which in zip(found.case, found.which, strict=True)]
-    signs.check(found.names, found.values, found.labels, [output.negative for output in outputs])
-
-
-def read_on(
-    path: Path, cases: Mapping[str, Units], body: Body, usual: Reading
-) -> tuple[Placed, Registered | None, Scan]:
-    """Read a scan, and put it on a body.
+def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
+    """Read a scan, and put it on the body of a specimen; standard deviations may still be unknown.
 
     Parameters
     ----------
     path
         Its file, or its description.
-    cases
-        Names of the load cases, and what is measured in them beside displacements.
-    body
-        The body.
+    specimen
+        What is measured.
     usual
         What is so where the description says nothing else.
 
@@ -319,59 +234,48 @@ def read_on(
     DataError
         With every kind of mistake in the files.
     """
-    scan = scan_of(path, usual)
-    found = read(path.parent, scan, cases)
-    if scan.sigma is not None:
-        found = found.with_sigma(scan.sigma)
-    found = replace(found, readings=found.readings.stated(scan.sigma_of))
+    scan, body = scan_of(path, usual), specimen.body
+    found = read(path.parent, scan, specimen.measurable)
+    sigma = dict.fromkeys(AXES, math.nan if scan.sigma is None else scan.sigma) | scan.sigma_of
+    found = found.with_sigma(np.array([sigma.get(name, math.nan) for name in found.names]))
     extent = max(high - low for low, high in body.bounds)
     surface = Surface.of(body) if scan.surface or isinstance(scan.registration, ToSurface) else None
-    registered = None
     if scan.registration is not None:
-        registered = register(scan.registration, found.places, found.unit, surface, extent, path.name)
-        found = replace(found, places=registered.motion(found.places), axes=registered.motion.rotation.T)
+        points = found.places_of_points
+        found = found.moved_by(register(scan.registration, points, found.unit, surface, extent, path.name))
     allowed = tolerance(body) if scan.tolerance is None else scan.tolerance
     nearest_place = (lambda points: surface.nearest(points)[0]) if scan.surface and surface else body.nearest
     leave_out = scan.beyond == "leave-out"
-    return found.on(nearest_place, extent, allowed, surface=scan.surface, leave_out=leave_out), registered, scan
+    found = found.on(nearest_place, extent, allowed, surface=scan.surface, leave_out=leave_out).measured()
+    forces = found.subset(found.points < 0)
+    pairs = zip(forces.cases, forces.axes - len(AXES), strict=True)
+    negative = [specimen.cases[case].outputs[which].negative for case, which in pairs]
+    signs.check(forces.names, forces.values, forces.labels, negative)
+    return replace(found, between=scan.moved_between(found.unit), truth=found.truth | scan.truth)
 
 
-def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurement:
-    """Read a file of displacements of a specimen.
+def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurements:
+    """Read a file of displacements of a specimen, whose errors are known, with what is true.
 
     Raises
     ------
     DataError
         With every kind of mistake in the file.
     """
-    placed, registered, scan = read_on(path, model.measurable, model.body, data)
-    check_readings(placed.observations.readings, model)
-    found = placed.observations.with_sigma(None)
-    found = replace(found, readings=found.readings.with_sigma({}))
-    truth, places, stiffness = scan.truth | data.truth, np.zeros((0, 3)), np.zeros(0)
-    for name, text in found.truth.items():
-        if name not in {"stiffness", "inclusions"}:
-            truth.setdefault(name, _known(name, text, path))
-    inclusions = _true_inclusions(found.truth["inclusions"], path) if "inclusions" in found.truth else ()
-    if "stiffness" in found.truth:
-        places, stiffness = _true_stiffness(path.parent / found.truth["stiffness"])
-    return Measurement(
-        found,
-        placed.distances,
-        truth,
-        inclusions,
-        places,
-        stiffness,
-        placed.left_out,
-        registered,
-        scan.surface,
-        scan.moved_between(found.unit),
-    )
+    found = read_on(path, model, data).checked()
+    return replace(found, truth={name: _known(name, value, path) for name, value in found.truth.items()} | data.truth)
 
 
-def _known(name: str, text: str, path: Path) -> float:
+def _known(name: str, said: str | float, path: Path) -> Any:
+    """Return what is true: a number, inclusions, or places (k, 3) and ln of the true stiffness factor (k,) there."""
+    if not isinstance(said, str):
+        return said
+    if name == "inclusions":
+        return _true_inclusions(said, path)
+    if name == "stiffness":
+        return _true_stiffness(path.parent / said)
     try:
-        return needed(text, f"truth.{name}")
+        return needed(said, f"truth.{name}")
     except ValueError as error:
         raise DataError(f"{path.name}: {error}") from None
 

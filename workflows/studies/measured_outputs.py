@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import ModelSpec
+from inverse.data import signs
 from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.outputs import OutputData, read_outputs, stated
-from inverse.data.table import DataError
+from inverse.data.measurements import Measurements
+from inverse.data.outputs import read_outputs, stated
+from inverse.data.table import DataError, others
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import DataSet, FileNames, Found, Positive, check_signs, read_files
+from workflows.studies.measured import DataSet, FileNames, Found, Positive, read_files
 
 STATED = "outputs"  # name of the data set given in the study itself
 
@@ -78,24 +82,34 @@ class MeasuredOutputs(Settings):
 
     def read(self, folder: Path, model: ModelSpec) -> Found:
         """Read the files, or what the study itself states, of a model; errors as of `DataFiles.read`."""
-        names = tuple(output.name for output in model.returned)
+
+        def known(found: Measurements) -> Measurements:
+            check_signs(found, model)
+            return self.with_errors(found)
+
+        names, steps = tuple(output.name for output in model.returned), steps_of(model)
         if self.files:
-            sets, found = read_files(
-                self.files, folder, lambda path: self._with_errors(read_outputs(path, names, steps_of(model)), model)
-            )
+            sets, found = read_files(self.files, folder, lambda path: known(read_outputs(path, names, steps)))
         else:
             try:
-                sets, found = (DataSet(name=STATED, file=""),), (self._with_errors(stated(self.outputs), model),)
+                sets, found = (DataSet(name=STATED, file=""),), (known(stated(self.outputs, names)),)
             except DataError as error:
                 raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        seen = {name for one in found if one is not None for name in one.names}
-        parts = tuple(name for name in names if name in seen)
-        return sets, tuple(None if one is None else one.of(names, parts) for one in found)
+        seen = np.unique(np.concatenate([one.axes for one in found if one is not None]))
+        return sets, tuple(None if one is None else one.by_part(seen) for one in found)
 
-    def _with_errors(self, found: OutputData, model: ModelSpec) -> OutputData:
-        check_signs(found, model)
-        noise = self.noise
-        return found.with_sigma(self.sigma, noise.relative, noise.absolute).with_truth(self.truth)
+    def with_errors(self, found: Measurements) -> Measurements:
+        """Return data with standard deviations and what is true; a DataError if one is unknown."""
+        general = np.maximum(self.noise.relative * np.abs(found.values), self.noise.absolute)
+        usual = [self.sigma.get(name, one) for name, one in zip(found.names, general, strict=True)]
+        found = found.with_sigma(np.array(usual))
+        lost = found.labels[~(found.sigma > 0)]
+        if lost.size:
+            raise DataError(
+                f"{lost[0]}: the standard deviation of the error is not known{others(lost.size - 1)}, expected a "
+                "column sigma, data.sigma of this output, or data.noise that does not vanish there"
+            )
+        return replace(found, truth={**found.truth, **self.truth})
 
     def mistakes(self, model: ModelSpec) -> Iterator[Mistake]:
         """Find names that are no outputs of a model."""
@@ -104,3 +118,10 @@ class MeasuredOutputs(Settings):
             for name in given:
                 if name not in names:
                     yield ("data", block, name), f"not an output of the model; {nearest(name, names)}", name
+
+
+def check_signs(found: Measurements, model: ModelSpec) -> None:
+    """Refuse measured outputs of a model whose sign cannot be right, over all steps of each, as `signs.check`."""
+    outputs = [model.returned[axis] for axis in found.axes]
+    names = [getattr(output, "of", output.name) for output in outputs]
+    signs.check(names, found.values, found.labels, [getattr(output, "negative", True) for output in outputs])

@@ -214,7 +214,7 @@ class ModelSelection(OfCandidates, Comparison):
 
     def moved(self, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
         """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
-        return cast("SpecimenModel", make()).observing(*motion.observed)  # type: ignore[arg-type]
+        return cast("SpecimenModel", make()).observing(*motion.observed)
 
     def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
         """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""

@@ -26,8 +26,8 @@ from workflows.studies.predictions import (
 
 if TYPE_CHECKING:
     from forward.specimen import Specimen
+    from inverse.data.measurements import Measurements
     from workflows.studies.inversion import Inversion
-    from workflows.studies.measured import Measurement
     from workflows.studies.sampling import Study
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
@@ -166,8 +166,8 @@ def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
 
     sets = study.data.sets
     usable = [m for m in study.measurements if m is not None]
-    counts = [int(m.observations.measured.sum()) + len(m.observations.readings) for m in usable]
-    moved = [int((m.moved > 0).sum()) for m in usable]
+    counts = [len(m) for m in usable]
+    moved = [int((m.moves > 0).sum()) for m in usable]
     cases = [times_of(spec.loaded(case)) for case in spec.cases]
     each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
     if study.field:
@@ -227,11 +227,11 @@ def _own_seconds(study: Inversion, data: int) -> float:
     return own_seconds(size, data, method.solves(size, field=False), method.chains)
 
 
-def _moved(count: int, usable: list[Measurement]) -> str:
+def _moved(count: int, usable: list[Measurements]) -> str:
     where = "" if all(m.on_surface for m in usable) else " outside the body"
     are = f"point{where} is" if count == 1 else f"points{where} are"
-    farthest = max(m.moved.max(initial=0.0) for m in usable)
-    square = float(np.mean(np.concatenate([m.moved for m in usable]) ** 2))
+    farthest = max(m.moves.max(initial=0.0) for m in usable)
+    square = float(np.mean(np.concatenate([m.moves for m in usable]) ** 2))
     rms = told(np.sqrt(square), "m")
     return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
 
@@ -240,7 +240,7 @@ def _of_outputs(study: Inversion) -> list[str]:
     from inverse.methods.invert import derivable
 
     spec, sets, method = study.spec, study.data.sets, study.method
-    counts = [len(found.values) for found in study.measurements if found is not None]
+    counts = [len(found) for found in study.measurements if found is not None]
     lines = [
         f"method      {method.kind}",
         *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),

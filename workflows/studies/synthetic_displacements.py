@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import log_factor
-from inverse.data.observations import kinds
+from inverse.data.measurements import kinds
 from workflows.studies.synthetic import OF_TRUTH, Synthetic, head
 from workflows.studies.synthetic_surfaces import facets_among, surfaces
 

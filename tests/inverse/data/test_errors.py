@@ -7,7 +7,7 @@ from scipy import stats
 from forward.model import FunctionModel
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.errors import NormalErrors, StudentErrors
-from inverse.data.observations import Components
+from inverse.data.measurements import Measurements
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -100,7 +100,7 @@ def test_evidence_and_posterior_by_quadrature(noise):
 
 
 def test_what_does_not_belong_does_not_decide():
-    data = Components(RNG.uniform(size=(15, 3)), np.zeros(15, np.int64), np.zeros(15, np.int64), VALUES, SIGMA)
+    data = Measurements.of(VALUES, SIGMA, [0] * 15, [0] * 15, places=RNG.uniform(size=(15, 3)))
     method = Invert(samples=128, starts=2)
     plain, heavy = (
         invert_few(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), data, method, lambda p: p[:, :1], errors=errors).dataset

@@ -79,7 +79,7 @@ def test_a_table_is_read_component_by_component(table):
     assert found.source == ("speckles of the camera",)
     assert found.truth == {"inclusions.lump.x": "0.5"}
     np.testing.assert_allclose(found.places[0], [0, 5e-4, 5e-4])
-    rows = found.components()
+    rows = found.measured()
     np.testing.assert_array_equal(rows.cases, [0, 0, 1, 1])
     np.testing.assert_array_equal(rows.axes, [0, 2, 0, 2])
     np.testing.assert_allclose(rows.values, [1e-4, 2e-4, 3e-4, 4e-4])
@@ -120,7 +120,7 @@ def test_one_line_for_a_mistake(table, old, new, told):
 @pytest.mark.unit
 def test_marks_of_other_programs_do_not_matter(table):
     found = read(table("\ufeff" + TABLE.replace("\n", "\r\n") + ",,,,,,\n"), CASES)
-    assert len(found.places) == 3
+    assert len(found.places_of_points) == 3
     assert found.source == ("speckles of the camera",)
 
 
@@ -130,11 +130,11 @@ def test_points_are_put_on_the_body(table):
     with pytest.raises(DataError, match=r"data.csv: line 4: \(-0.01, 0.5, 0.5\) lies 0.01 m outside the body"):
         found.on(BODY.nearest, 1.0, 1e-3)
     placed = found.on(BODY.nearest, 1.0, 0.02)
-    np.testing.assert_allclose(placed.observations.places[0], [0, 0.5, 0.5])
-    np.testing.assert_allclose(placed.distances, [0.01, 0, 0])
+    np.testing.assert_allclose(placed.places[0], [0, 0.5, 0.5])
+    np.testing.assert_allclose(placed.moves, [0.01, 0, 0])
     left = found.on(BODY.nearest, 1.0, 1e-3, leave_out=True)
     assert left.left_out == ("data.csv: line 4 (1 cm)",)
-    assert left.observations.labels == found.labels[1:]
+    assert left.labels.tolist() == found.labels[3:].tolist()
     with pytest.raises(DataError, match=r"a displacement of 400 m in a body of 1 m.*data\.unit"):
         read(table(TABLE.replace("0.4", "400")), CASES).on(BODY.nearest, 1.0, 0.0)
 
@@ -155,8 +155,8 @@ def test_nearest_places_of_a_block():
 def test_sigma_is_needed_where_something_was_measured(table):
     found = read(table(TABLE.replace("0.02", "")), CASES)
     with pytest.raises(DataError, match=r"line 5: no sigma, expected a column sigma or data\.sigma"):
-        found.with_sigma(None)
-    assert found.with_sigma(0.5).components().sigma[1] == 0.5
+        found.checked()
+    assert found.with_sigma(np.array(0.5)).checked().measured().sigma[1] == 0.5
 
 
 @pytest.mark.unit
@@ -179,7 +179,7 @@ def test_meshes(tmp_path):
     data = {"displacement_shear": 0.1 * points, "displacement_extension": np.where(points == 0, np.nan, points)}
     path = tmp_path / "data.vtu"
     meshio.Mesh(points, [("tetra", [[0, 1, 2, 3]])], point_data=data).write(path)
-    rows = read(path, CASES, unit=0.5).components()
+    rows = read(path, CASES, unit=0.5).measured()
     assert len(rows.values) == 12 + 3
     np.testing.assert_allclose(rows.values[-3:], 0.5)
     with pytest.raises(DataError, match="no point data 'displacement_pull'"):

@@ -204,7 +204,7 @@ def test_the_same_bytes_on_two_groups_of_ranks(folder):
 INPUTS = Inputs({"a": Normal(mean=0.0, std=1.0), "b": Normal(mean=1.0, std=0.5)})
 A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
 SIGMA = np.array([0.1, 0.1, 0.2])
-DATA = stated({"u": 1.2, "v": -0.4, "w": 1.5}).with_sigma(dict(zip("uvw", SIGMA, strict=True)), 0, 0).of("uvw", "uvw")
+DATA = stated({"u": 1.2, "v": -0.4, "w": 1.5}, "uvw").with_sigma(np.array(SIGMA))
 
 
 def model(bend=0.0, twist=0.0, ripple=0.0):

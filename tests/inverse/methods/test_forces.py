@@ -15,6 +15,7 @@ from tests.launch import run_script
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.run.run import run as run_study
+from workflows.studies.measured import motion_of
 
 CUBE = """
 [model]
@@ -261,10 +262,10 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
 
 def test_forces_alone_are_data_enough(folder):
     study = load(folder / "few.toml")
-    data, forces = study.measured(0), study.measurements[0].observations.readings
+    data, forces = study.measured(0), study.measured(0).subset(study.measured(0).axes >= 3)
     rows = [
         f"{study.parts[c]},{n},{v},{s}"
-        for c, n, v, s in zip(forces.case, forces.names, forces.values, forces.sigma, strict=True)
+        for c, n, v, s in zip(forces.cases, forces.names, forces.values, forces.sigma, strict=True)
     ]
     (folder / "alone").mkdir()
     (folder / "alone" / "made.csv").write_text("\n".join(["case,output,value,sigma", *rows]))
@@ -299,7 +300,7 @@ def test_forces_stand_beside_points_of_uncertain_registration(folder):
     uncertain = '["data"]\nregistration = { kind = "given", rotation_std = 2.0, translation_std = 1e-3 }'
     (folder / "moved.toml").write_text(FEW.replace('["data"]', uncertain))
     study = load(folder / "moved.toml")
-    motion, forces = study.measurements[0].motion(study.model.body), study.measured(0).axes >= 3
+    motion, forces = motion_of(study.measured(0), study.model.body), study.measured(0).axes >= 3
     model = study.specimen.build(MPI.COMM_SELF, study.inputs.names).observing(*motion.observed)
     rows = motion.errors(model.solve(study.inputs.mean).outputs)
     assert rows.shape == (6, len(forces))
@@ -331,19 +332,19 @@ def table(tmp_path, text, unit=None):
 
 def test_rows_of_outputs_stand_among_displacements_or_alone(tmp_path):
     both = table(tmp_path, TABLE, 1e-3)
-    assert both.readings.names == ("grip", "force")
-    np.testing.assert_allclose(both.readings.sigma, [0.01, 0.02])
-    assert both.displacements[0, 0] == pytest.approx(1e-6)  # data.unit is that of lengths only
-    data = both.components()
+    data = both.measured()
+    assert data.names.tolist() == ["x", "grip", "force"]
+    np.testing.assert_allclose(data.sigma[1:], [0.01, 0.02])
+    assert data.values[0] == pytest.approx(1e-6)  # data.unit is that of lengths only
     np.testing.assert_array_equal(data.axes, [0, 3, 3])
     np.testing.assert_array_equal(data.cases, [0, 0, 1])
     alone = table(
         tmp_path, "case,output,value [mN],sigma_value [mN]\npull,grip,2000,10\npress,force,3000,\npress,force,3100,20\n"
     )
-    assert len(alone.places) == 0
-    np.testing.assert_allclose(alone.readings.values, [2, 3, 3.1])
-    np.testing.assert_allclose(alone.readings.with_sigma({"force": 0.5}).sigma, [0.01, 0.5, 0.02])
-    first, second = alone.components().neighbours()
+    assert len(alone.places_of_points) == 0
+    np.testing.assert_allclose(alone.values, [2, 3, 3.1])
+    np.testing.assert_allclose(alone.sigma, [0.01, np.nan, 0.02])
+    first, second = alone.measured().neighbours()
     assert (first.tolist(), second.tolist()) == ([1], [2])  # repeated measurements
 
 

@@ -16,7 +16,7 @@ import inverse.methods.invert_field
 from benchmarks import buckling
 from forward.model import FunctionModel, SolveError, Stability
 from inverse.criticism.field_samples import weigh_field
-from inverse.data.observations import Components
+from inverse.data.measurements import Measurements
 from inverse.data.rigid import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -60,13 +60,9 @@ def test_what_is_left_of_several_data_sets_is_filled_up():
 RNG = np.random.default_rng(5)
 MATRIX = RNG.standard_normal((12, 3))
 PRIORS = {name: Normal(mean=mean, std=std) for name, mean, std in (("a", 1.0, 0.5), ("b", -1.0, 2.0), ("c", 0.0, 1.0))}
-DATA = Components(
-    RNG.uniform(size=(12, 3)),
-    np.arange(12) % 3,
-    np.repeat([0, 1], 6),
-    MATRIX @ [1.2, -0.5, 0.4] + 0.1 * RNG.standard_normal(12),
-    np.full(12, 0.1),
-)
+AT = RNG.uniform(size=(12, 3))
+VALUES = MATRIX @ [1.2, -0.5, 0.4] + 0.1 * RNG.standard_normal(12)
+DATA = Measurements.of(VALUES, np.full(12, 0.1), np.repeat([0, 1], 6), np.arange(12) % 3, places=AT)
 
 
 def linear():
@@ -158,7 +154,7 @@ def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
     """Laplace's moments and draws where it can be trusted; else those of the weighted samples, with their evidence."""
     posterior = curved()
     n = len(posterior.data)
-    data = Components(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.int64), posterior.data, posterior.sigma)
+    data = Measurements.of(posterior.data, posterior.sigma, [0] * n, [0] * n, places=np.zeros((n, 3)))
     vertices = Vertices(np.full(posterior.size, 0.1), np.ones(posterior.size))
     method = Invert(samples=512, draws=100)
     plain = invert_field(posterior, data, method, vertices)
@@ -297,7 +293,7 @@ def test_synthetic_data_say_what_they_are_of(folder, looked_at):
     assert "# truth.inclusions.lump.contrast = 4.0\n" in text
     assert text.startswith("# Synthetic: 3 × 3 × 3 cells (hexahedron, degree 1), errors relative 0.02, seed 1.")
     study = load(folder / "few.toml", ["data.files=['data/made-*.csv']"])
-    counts = [len(set(map(tuple, m.observations.places))) for m in study.measurements]
+    counts = [len(set(map(tuple, m.places))) for m in study.measurements]
     assert counts == [28, round(0.3 * 28)]
     assert study.measurements[0].truth["material.mu"] == 1e4
     looked_at(folder / "made")
@@ -325,8 +321,7 @@ def test_synthetic_scans_are_read_again(tmp_path, form):
     # Tables, and descriptions of clouds, say their unit, which is that of the registration too.
     study = load(tmp_path / "few.toml", [registration])
     (measurement,) = study.measurements
-    rows = measurement.observations.components()
-    values = made["values"].to_numpy()
+    rows, values = measurement, made["values"].to_numpy()
     # Points of an edge are on two boundaries, and are written once.
     gaps = np.abs(rows.values[:, None] - values[np.isfinite(values)]).min(axis=1)
     assert len(gaps) > 20
@@ -347,7 +342,7 @@ def test_synthetic_surfaces_are_read_again(tmp_path):
     (tmp_path / "few.toml").write_text(FEW.replace('files = ["data"]', 'files = ["out/data"]'))
     registration = 'data.registration={kind="given", rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}'
     (measurement,) = load(tmp_path / "few.toml", [registration]).measurements
-    rows, values = measurement.observations.components(), made["values"].to_numpy()
+    rows, values = measurement, made["values"].to_numpy()
     assert len(np.unique(rows.places.round(6), axis=0)) == len(rows.values) / 3 / len(np.unique(rows.cases))
     gaps = np.abs(rows.values[:, None] - values).min(axis=1)
     assert gaps.max() < 1e-9  # m, of displacements of centimetres

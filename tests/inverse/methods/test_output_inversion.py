@@ -16,6 +16,7 @@ from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
+from workflows.studies.measured_outputs import MeasuredOutputs
 
 A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
 MEAN, STD = np.array([1.0, -1.0]), np.array([0.5, 2.0])
@@ -326,10 +327,11 @@ def test_tables_with_mistakes(tmp_path, text, told):
 
 def test_errors_of_data():
     """By table, by output, and in general; relative errors of zero need another."""
-    found = stated({"u": 2.0, "v": (0.0, 1.0)})
-    np.testing.assert_allclose(found.with_sigma({"u": 0.5}, 0.1, 0.2).sigma, [0.5, 0.2, 0.2])
+    given = {"outputs": {"u": 2.0, "v": (0.0, 1.0)}, "sigma": {"u": 0.5}}
+    found, both = stated(given["outputs"], ("u", "v")), {"relative": 0.1, "absolute": 0.2}
+    np.testing.assert_allclose(MeasuredOutputs(**given, noise=both).with_errors(found).sigma, [0.5, 0.2, 0.2])
     with pytest.raises(DataError, match=r"data.outputs.v: the standard deviation .* not known, expected"):
-        found.with_sigma({"u": 0.5}, 0.1, 0.0)
+        MeasuredOutputs(**given, noise={"relative": 0.1}).with_errors(found)
 
 
 @pytest.mark.mpi

@@ -14,7 +14,7 @@ from forward.materials.material_point import HomogeneousModel, MaterialTest
 from inverse.criticism.assessment import weighted
 from inverse.criticism.comparison import Candidate, Data, criticise, probabilities
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
-from inverse.data.outputs import OutputData
+from inverse.data.measurements import Measurements
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -671,7 +671,7 @@ def of_bananas(pairs, bend=0.7, **settings):
     evaluate = SerialEvaluate(model)
     found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, model=lambda *_: model)
     named = tuple(f"z{k}" for k in range(d))
-    of_outputs = OutputData(named, np.zeros(d), np.ones(d), named, outputs=named, parts=named)
+    of_outputs = Measurements.of(np.zeros(d), np.ones(d), range(d), range(d), named, named, named, some=True)
     beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
     asked = partial(invert_few, curved.inputs, evaluate, of_outputs, beside, finer=None, model=model)
     return found.sel(model="it", group="all"), lambda: asked().dataset, truth

@@ -191,7 +191,7 @@ def test_chosen_points_are_what_other_studies_take(folder):
     )
     (folder / "invert.toml").write_text(inversion)
     study = load(folder / "invert.toml")
-    assert len(study.measurements[0].observations.places) == 5
+    assert len(study.measurements[0].places_of_points) == 5
     # The form to be filled in has the same rows, and is a table of data once it is.
     form = (folder / "out" / "observed.csv").read_text().splitlines()
     places = {tuple(np.round([float(x) for x in row.split(",")[:3]], 6)) for row in form[2:] if row[0] != ","}
@@ -205,7 +205,7 @@ def test_chosen_points_are_what_other_studies_take(folder):
     ]
     (folder / "filled.csv").write_text("\n".join([*form[:2], *filled]) + "\n")
     (folder / "invert.toml").write_text(inversion.replace("made/data/make.csv", "filled.csv"))
-    assert len(load(folder / "invert.toml").measurements[0].observations.places) == 5
+    assert len(load(folder / "invert.toml").measurements[0].places_of_points) == 5
 
 
 @pytest.mark.fem
