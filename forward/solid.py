@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Unit
 from pydantic import Field, create_model, field_validator
 
-from forward.bodies.geometry import AXES, Body, Vector, extent
+from forward.bodies.geometry import AXES, Body, Vector, extent, outside
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
@@ -195,7 +195,7 @@ class Solid(ModelSpec):
         """Find what no single block can see: inclusions outside, unknown regions, no material, a form that is not."""
         for i, inclusion in enumerate(self.inclusions):
             centre = (inclusion.x, inclusion.y, inclusion.z)
-            if not self.body.contains(centre):
+            if outside(self.body, centre):
                 message = f"its centre lies outside the body, which lies in {extent(self.body)}"
                 yield ("inclusions", i), message, list(centre)
         of_regions = list(self._mistakes_of_regions())

@@ -46,7 +46,7 @@ def unit_vector(direction: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
-ROUNDING = 1e-6  # of that distance: a move that counts as rounding
+ROUNDING = 1e-6  # of the distance that counts as inaccuracy: a distance that counts as rounding
 NEARBY = 1e-3  # of the diagonal of a body: distance from it that counts as inaccuracy of positions
 
 
@@ -144,10 +144,6 @@ class _SixSided(Settings):
         return self.model_validate(self.with_cells(1 / times).model_dump() | elements)
 
     @abstractmethod
-    def contains(self, point: Vector) -> bool:
-        """Whether a point (m) lies in the undeformed body."""
-
-    @abstractmethod
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
 
@@ -229,8 +225,7 @@ class _SixSided(Settings):
         ValidationError
             If the mesh is too large.
         """
-        cells = tuple(n * 2**level for n in self.cells)
-        return self.model_validate(self.model_dump() | {"cells": cells})
+        return self.with_cells(2**level)
 
     def corners_of(self, boundary: str) -> list[Vector]:
         """The four corners (m) of a boundary."""
@@ -287,10 +282,6 @@ class Box(_SixSided):
     def shaped(self, points: FloatArray) -> FloatArray:
         """Leave points (n, 3) where they are."""
         return points
-
-    def contains(self, point: Vector) -> bool:
-        """Whether a point (m) lies in the undeformed body."""
-        return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
@@ -353,20 +344,6 @@ class Block(_SixSided):
         """Map points (n, 3) of the cube into the body (m)."""
         return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
 
-    def contains(self, point: Vector) -> bool:
-        """Whether a point (m) lies in the undeformed body."""
-        steps = np.linspace(0, 1, 5)
-        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-        gaps = np.asarray(point) - self.shaped(guesses)
-        # Newton's method from the nearest guess, kept near the cube: the map is not invertible everywhere outside.
-        x = guesses[[np.linalg.norm(gaps, axis=1).argmin()]]
-        for _ in range(30):
-            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.shaped(x)[0], rcond=None)[0]
-            x = np.clip(x + step, -0.1, 1.1)
-        gap = np.abs(np.asarray(point) - self.shaped(x)[0]).max()
-        extent = max(high - low for low, high in self.bounds)
-        return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
-
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         from scipy.optimize import lsq_linear
@@ -428,17 +405,16 @@ def tolerance(body: Body) -> float:
 
 def outside(body: Body, point: Vector) -> float:
     """How far (m) a point lies outside the undeformed body; for a mesh from a file, outside the box around it."""
-    if body.contains(point):
-        return 0.0
     at = np.array([point])
     place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, MeshFile) else body.nearest(at)
-    return float(np.linalg.norm(place - at))
+    gap = float(np.linalg.norm(place - at))
+    return gap if gap > ROUNDING * tolerance(body) else 0.0
 
 
 def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...]:
     """Say how far points (m) outside a body, given by name, are moved onto it."""
     distances = {name: outside(body, point) for name, point in points.items()}
-    far = {name: distance for name, distance in distances.items() if distance > ROUNDING * tolerance(body)}
+    far = {name: distance for name, distance in distances.items() if distance}
     if not far:
         return ()
     name = max(far, key=far.__getitem__)

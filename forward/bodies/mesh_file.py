@@ -226,10 +226,6 @@ class MeshFile(Settings):
                 named = f" on '{name}'" if name else ""
                 yield Finding("slit", "warning", {"area": f"{area:.3g} m²", "named": named})
 
-    def contains(self, point: Point) -> bool:
-        """Whether a point (m) lies in a box around the body; where the mesh is made, it must lie in a cell."""
-        return all(low <= x <= high for x, (low, high) in zip(point, self.bounds, strict=True))
-
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         mesh = self.load()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.equations import Discretisation
 from forward.fem.linearisation import Preconditioner
 from forward.fem.mesh_error_cost import Way, estimate

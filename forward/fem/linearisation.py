@@ -14,12 +14,12 @@ from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
 from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unknowns
-from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Work
-from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
+from forward.solvers.system import ROUGH, TIGHT, LinearSolver
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -14,11 +14,10 @@ from forward.fem.equations import Discretisation
 from forward.model import FloatArray, ReferenceSolution, SolveError, Work
 from forward.solvers.anderson import Inverse
 from forward.solvers.lanczos import negative_eigenvalues
-from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, NOT_SCREENED, SMOOTH, Rows, Screened, draw, screen, screening_vectors
 from forward.solvers.steps import Corrector, Steps, finished, through
-from forward.solvers.system import Residual
+from forward.solvers.system import ROUGH, TIGHT, LinearSolver, Residual
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
 MANY = 16  # parameters, beyond which no derivatives by all of them are found

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from forward.model import FloatArray
-from forward.reduced.at_points import Integrand
 from forward.reduced.data import LevelData, Output, Points, ReducedData
-from forward.reduced.kernels import spread
+from forward.reduced.kernels import Integrand, spread
 
 LENGTH = 3  # in place of an axis
 LEAST = 0.1  # of the forces of the largest snapshot: below, forces that are left are measured against this

@@ -143,7 +143,7 @@ class Reduced(ModelSpec):
 
     @property
     def seconds_together(self) -> float:
-        """Weigh a solve in lockstep against solves of bodies, see `uq.methods.stopping.seconds_per_solve`.
+        """Weigh a solve in lockstep against solves of bodies, see `uq.methods.method.seconds_per_solve`.
 
         Fitted to 0.40 and 0.95 ms with 40 and 60 modes at 313 and 372 points of 4,641 and 32,175 unknowns, 1.0 and 4.6
         ms with 128 and 300 modes at 694 and 1,413 points (a 2.8 GHz core, 64 in lockstep, a ten-thousandth of the

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.reduced.at_points import Integrand
+from forward.reduced.kernels import Integrand
 from forward.reduced.level import Level
 from forward.solvers.anderson import scaled_eigenpairs
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from contextlib import suppress
 
 from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.linear import NoConvergence
 from forward.solvers.settings import SolverSettings
 from forward.solvers.stability import NOT_SCREENED
 from forward.solvers.steps import Steps
-from forward.solvers.system import Residual, System, Way
+from forward.solvers.system import NoConvergence, Residual, System, Way
 
 STALLED = 0.5  # a residual that falls by less may have reached rounding
 

@@ -7,10 +7,9 @@ import numpy as np
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.acceptance import Diverged, accepted, converged, instability
 from forward.solvers.corrections import mix
-from forward.solvers.linear import NoConvergence
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import finish, plain
-from forward.solvers.system import Found, Residual, System
+from forward.solvers.system import Found, NoConvergence, Residual, System
 
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
 NEAR = 0.2  # below this fraction of the last Newton step, a factor is used for more than one correction

@@ -276,12 +276,7 @@ def estimate(
     found = combine(offset, [one], beta1, beta2)
 
     return Moments(
-        mean=found.mean,
-        mean_error=found.mean_error,
-        std=found.std,
-        std_error=found.std_error,
-        coefficient=found.coefficient,
-        second_coefficient=found.second_coefficient,
+        **vars(found),
         variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
         std_variance_ratio=ratio(_scatter_of_variance(plain), n * variance_error**2, empty=1.0),
     )

@@ -29,9 +29,8 @@ from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
 from uq.methods.chaos import LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
-from uq.methods.method import Method
+from uq.methods.method import UNASKED, Method
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
-from uq.methods.stopping import UNASKED
 from uq.surrogates.field_regression import Deviations, deviations
 
 if TYPE_CHECKING:

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
-from uq.estimators.indices import coefficient_moments, shares
 from uq.estimators.moments import Z, student
 from uq.estimators.quantiles import Quantiles, quantiles
 from uq.evaluation.block import merge
@@ -26,7 +24,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods.stopping import Amount
+from uq.methods.method import Amount
 from uq.surrogates.basis import (
     DICTIONARY,
     FULL,
@@ -41,11 +39,11 @@ from uq.surrogates.basis import (
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
+    among,
     beyond_of_field,
-    errors_of_indices,
+    estimates_of_field,
     regression_of_field,
     relative_of_field,
-    solved,
 )
 from uq.surrogates.gate import repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
@@ -149,7 +147,11 @@ class Chaos(Amount):
         ValueError
             If the parameters are correlated.
         """
-        return expansion_dataset(self, evaluate, self.expand(inputs, evaluate))
+        return self.dataset_of(evaluate, self.expand(inputs, evaluate))
+
+    def dataset_of(self, evaluate: Evaluate, found: Expanded) -> xr.Dataset:
+        """Return the results of an expansion."""
+        return expansion_dataset(evaluate, found, self.seed, self.quantiles, fields=self.fields)
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
         """Solve at the points of the design and fit; errors as in `run`."""
@@ -169,7 +171,7 @@ class Chaos(Amount):
 
     def reported(self, evaluate: Evaluate, found: Expanded, stopped: str) -> xr.Dataset:
         """Return the results of an expansion that ended for a reason."""
-        return expansion_dataset(self, evaluate, replace(found, stopped=stopped))
+        return self.dataset_of(evaluate, replace(found, stopped=stopped))
 
     def most(self, goal: Goal) -> int:
         """Return how many samples an expansion may take for a goal."""
@@ -303,26 +305,19 @@ class Expanded:
 # --- what follows from an expansion --------------------------------------------------------------------------------
 
 
-class Report(Protocol):
-    """Settings of a method that reports an expansion."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the points at which the expansion is drawn for quantiles and densities."""
-
-    @property
-    def quantiles(self) -> tuple[float, ...]:
-        """Probabilities of the quantiles."""
-
-    @property
-    def fields(self) -> bool:
-        """Whether the displacement field is reported."""
-
-
 def expansion_dataset(
-    method: Report, evaluate: Evaluate, expanded: Expanded, further: Mapping[str, FloatArray] | None = None
+    evaluate: Evaluate,
+    expanded: Expanded,
+    seed: int,
+    probabilities: tuple[float, ...],
+    further: Mapping[str, FloatArray] | None = None,
+    *,
+    fields: bool,
 ) -> xr.Dataset:
-    """Return the results of an expansion; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
+    """Return the results of an expansion, with quantiles from points of a seed, and the displacement field or without.
+
+    `further` errors (m,) of "mean" and "std" are known from elsewhere.
+    """
     centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
     inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
     supports = [m.support for m in inputs.marginals.values()]
@@ -334,14 +329,14 @@ def expansion_dataset(
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
     )
     by_output, by_pair = ("output",), ("output", "parameter")
-    dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
+    dataset = local_dataset(inputs, evaluate, centre, fields=fields)
     field, terms = None, fit.chosen.which
-    if evaluations.sketches is not None and method.fields:
+    if evaluations.sketches is not None and fields:
         field = regression_of_field(regression, evaluations.sketches)
         terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
     indices = regression.largest.indices[terms]
-    coefficients = _among(terms, fit.chosen.which, fit.coefficients)
-    dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
+    coefficients = among(terms, fit.chosen.which, fit.coefficients)
+    dataset = dataset.assign_coords(quantile=list(probabilities)).assign(
         {
             **{name: (by_pair if v.ndim > 1 else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
@@ -362,14 +357,14 @@ def expansion_dataset(
         }
     )
     dataset = dataset.assign(_of_joint(basis))
-    if method.quantiles:
-        dataset = dataset.assign(_distribution(method, regression))
+    if probabilities:
+        dataset = dataset.assign(_distribution(seed, probabilities, regression))
     add(dataset, *regression.doubts(evaluate.outputs))
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
     add(dataset, *of_centre(evaluate.outputs, centre.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
     if field is not None:
         dataset = dataset.assign(
-            _field_estimates(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
+            estimates_of_field(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
         )
         left = relative_of_field(field)
         add(dataset, *of_field(left, TRUSTED, NOTHING))
@@ -397,29 +392,29 @@ def _of_joint(basis: Basis) -> dict[str, tuple[tuple[str, ...], Any]]:
     }
 
 
-def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+def _distribution(
+    seed: int, probabilities: tuple[float, ...], regression: Regression
+) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
     """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
 
     If the moments are those of the samples, so are the quantiles; densities are those of the expansion plus its errors
     at unseen samples, drawn independently.
     """
     inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
-    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
+    uniforms = np.split(sobol_points(seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
     drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
-    central = np.quantile(drawn, method.quantiles, axis=0)
+    central = np.quantile(drawn, probabilities, axis=0)
     # No quantile moves by more than the function does. Each quarter of the points is a set of Sobol' points too.
-    quarters = [np.quantile(part, method.quantiles, axis=0) for part in np.split(drawn, QUARTERS)]
+    quarters = [np.quantile(part, probabilities, axis=0) for part in np.split(drawn, QUARTERS)]
     factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
     error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
     found = Quantiles(central, central - Z * error, central + Z * error, error)
     if regression.controlled.any():
         rough = regression.controlled
         if np.ptp(data.weights) == 0:
-            of_samples = quantiles(data.values, method.quantiles)
+            of_samples = quantiles(data.values, probabilities)
             found = Quantiles(*(np.where(rough, *pair) for pair in zip(of_samples, found, strict=True)))
-        which = np.random.default_rng(method.seed).choice(
-            len(data.values), len(drawn), p=data.weights / data.weights.sum()
-        )
+        which = np.random.default_rng(seed).choice(len(data.values), len(drawn), p=data.weights / data.weights.sum())
         drawn = np.where(rough, drawn + fit.unseen[which], drawn)
     counts = [_density(column) for column in drawn.T]
     return {
@@ -434,60 +429,3 @@ def _density(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
     if np.ptp(drawn) <= ROUNDING * np.abs(drawn).max():
         return np.full(BINS, np.nan), np.linspace(drawn.min(), drawn.max(), BINS + 1)
     return np.histogram(drawn, BINS, density=True)
-
-
-def _among(terms: NDArray[np.int64], which: NDArray[np.int64], coefficients: FloatArray) -> FloatArray:
-    """Return coefficients (P, m) of the functions `which` (P,) as those of `terms` (T,), with zeros for the others."""
-    found = np.zeros((len(terms), coefficients.shape[1]))
-    found[[int(np.flatnonzero(terms == term)[0]) for term in which]] = coefficients
-    return found
-
-
-def _field_estimates(
-    evaluations: Evaluations,
-    centre: Linearisation,
-    count: int,
-    regression: Regression,
-    terms: NDArray[np.int64],
-    outputs: Regression,
-    estimates: dict[str, FloatArray],
-) -> dict[str, tuple[tuple[str, ...], FloatArray | float]]:
-    """Coefficients of the functions `terms` (T,), mean and standard deviation of the displacements, and their errors.
-
-    Errors are those of the sketches and of the outputs, scaled by the residuals, which come from the same rows. The
-    part of a variance s² that the fit misses (its residuals, increased by the ratio of unseen to seen residuals of the
-    sketches) is an error of the standard deviation too, √(s² + missed) − s.
-    """
-    basis, fit = regression.basis, regression.fit
-    projections = evaluations.fields[fit.chosen.which][:, :count]
-    coefficients = solved(fit, projections)
-    squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
-    coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
-    moments = coefficient_moments(coefficients.T, basis.indices)
-    of_sketches = regression.estimates()
-    fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
-    rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
-    seen = float(shares((fit.loo**2).sum(), fit.squares.sum() / rows))
-    left = max(1.0, seen) * squares / rows
-    for name in ("mean", "std"):
-        known = [(estimates, outputs.fit), (of_sketches, fit)]
-        share = max(float(shares(of[f"{name}_error"] ** 2, by.squares).max()) for of, by in known)
-        error = np.sqrt(share * squares)
-        if name == "std":
-            error = np.hypot(error, shares(left, moments["std"] + np.sqrt(moments["std"] ** 2 + left)))
-        fields[f"{name}_error"] = error.reshape(-1, 3)
-    by_node = [part.reshape(-1, 3).sum(axis=1) for part in (left, left + moments["std"] ** 2)]
-    return {
-        **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
-        "field_coefficients": (
-            ("term", "node", "component"),
-            _among(terms, fit.chosen.which, coefficients).reshape(len(terms), -1, 3),
-        ),
-        "field_loo_error": ((), relative_of_field(regression)),
-        "node_loo_error": (("node",), np.sqrt(shares(*by_node))),
-        **(
-            {f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()}
-            if regression.inputs.independent
-            else {}
-        ),
-    }

@@ -11,7 +11,7 @@ from forward.model import ModelError
 from forward.registry import Kinds, OfKind, named
 from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
-from uq.methods.stopping import seconds_per_solve
+from uq.methods.method import seconds_per_solve
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -29,8 +29,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.chaos import Chaos
-from uq.methods.method import SAMPLING, Method
-from uq.methods.stopping import Amount
+from uq.methods.method import SAMPLING, Amount, Method
 from uq.methods.trials import Memory, Trial, trial_of
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 

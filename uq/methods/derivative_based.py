@@ -56,8 +56,8 @@ from uq.inputs.distributions import (
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.inputs.univariate import Chaospy
+from uq.methods.method import Amount
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
-from uq.methods.stopping import Amount
 from uq.surrogates.basis import FULL, gauss, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import Regression

@@ -19,9 +19,8 @@ from forward.model import FloatArray
 from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, correlations
-from uq.estimators.fidelity_quantiles import quantiles_of_chosen
 from uq.estimators.moments import Estimates, ratio
-from uq.estimators.quantiles import Quantiles
+from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
 from uq.estimators.tails import of_influences, unseen
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Taken, Team

@@ -16,7 +16,7 @@ from uq.evaluation.request import COMPANY, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.cheap import CheapModel
-from uq.methods.stopping import TEXTBOOK
+from uq.methods.method import TEXTBOOK
 from uq.surrogates.linearisation import Linearisation, linearise
 
 OWN_LABEL = "model"  # name in results of the model of the study

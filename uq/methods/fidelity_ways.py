@@ -12,7 +12,6 @@ from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated, gains
-from uq.estimators.fidelity_quantiles import quantiles_of_groups
 from uq.estimators.moments import (
     Estimates,
     Z,
@@ -25,7 +24,7 @@ from uq.estimators.moments import (
     student,
     term,
 )
-from uq.estimators.quantiles import Quantiles, quantiles
+from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
 from uq.estimators.tails import influences, of_influences, unseen
 from uq.evaluation.request import Evaluations
 from uq.methods.chaos import objection

@@ -31,7 +31,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
-from uq.methods.stopping import Amount
+from uq.methods.method import Amount
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
@@ -100,6 +100,8 @@ class MonteCarlo(Amount):
         ------
         SolveError
             If the model has no answer at the mean parameters or at fewer than two samples.
+        ModelError
+            If the tangent is the control, and the model has no derivatives.
         """
         return self._sampled(inputs, evaluate)
 
@@ -112,12 +114,50 @@ class MonteCarlo(Amount):
         """Sample until errors are those of a goal; results and errors as in `run`."""
         return self._sampled(inputs, evaluate, goal)
 
+    @property
+    def _control(self) -> tuple[Coefficient, SecondMoment] | None:
+        """How the tangent at the mean parameters controls both moments, if it does."""
+        return None
+
     def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
-        return _sample(self, inputs, evaluate, None, goal)
+        control = self._control
+        if control is not None and not evaluate.differentiable:
+            message = f"the model has no derivatives, expected one that has for method.kind = '{self.kind}'"
+            raise ModelError(message)
+        evaluate = Recorder(evaluate)
+        centre = linearise(inputs, evaluate)
+        slopes = centre.state_slopes if control and len(centre.slopes) else None
+        state = centre.state if slopes is None else centre.state_middle
+        fields = _JointMoments(centre.coordinates, state, slopes) if self.fields and centre.state.size else None
+        rounds: list[Evaluations] = []
+        growing = grown(inputs, evaluate, centre, self.limit) if fields is not None else evaluate
+        limit = self.limit if goal is None else min(self.limit, goal.most - 1)
+        tolerance = self.tolerance if goal is None else 1.0
+        target = min(limit, FIRST_ROUND) if self.open_ended or goal is not None else limit
+        count = 0
+        while True:
+            points = inputs.random(self.seed, count, target)
+            rounds.append(growing(Request(points, fields=fields, start=centre.prediction)))
+            count = target
+            evaluations = merge(rounds)
+            scalars = _scalar_moments(evaluations, inputs, centre, control)
+            reached = float(scalars.relative_error.max()) if goal is None else goal.reached(scalars)
+            growth = MOST_GROWTH
+            if tolerance is not None:
+                growth = min(MOST_GROWTH, max(1.5 if goal is None else 1.1, 1.1 * (reached / tolerance) ** 2))
+            paid = count + self.affordable(evaluate.solves, evaluate.seconds)
+            target = int(min(limit, int(count * growth) + 1, paid))
+            if (tolerance is not None and reached <= tolerance) or target <= count:
+                break
+        amount, error = f"{count} samples", f"relative error {float(scalars.relative_error.max()):.3g}"
+        stopped = f"{amount}: {error}" if goal else self.why_stopped(reached, error, count, limit, amount)
+        return _dataset(self, inputs, evaluate, centre, evaluations, scalars, control, stopped)
 
 
 class SensitivityMonteCarlo(MonteCarlo):
     """Monte Carlo with sensitivity derivatives: the tangent at the mean parameters is the control variate.
+
+    Results are those of `MonteCarlo`, and `variance_ratio`.
 
     Parameters
     ----------
@@ -133,23 +173,9 @@ class SensitivityMonteCarlo(MonteCarlo):
     coefficient: Coefficient = "one"
     second_moment: SecondMoment = "quadratic"
 
-    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Linearise at the mean parameters, sample and estimate; results as in `MonteCarlo`, and `variance_ratio`.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters or at fewer than two samples.
-        ValueError
-            If the model has no derivatives.
-        """
-        return self._sampled(inputs, evaluate)
-
-    def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
-        if not evaluate.differentiable:
-            message = "the model has no derivatives, expected one that has for method.kind = 'sensitivity-monte-carlo'"
-            raise ModelError(message)
-        return _sample(self, inputs, evaluate, (self.coefficient, self.second_moment), goal)
+    @property
+    def _control(self) -> tuple[Coefficient, SecondMoment]:
+        return self.coefficient, self.second_moment
 
 
 @dataclass(frozen=True)
@@ -169,43 +195,6 @@ class _JointMoments:
             return monomials(solution.state - state, prediction)
 
         return rows
-
-
-def _sample(
-    method: MonteCarlo,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    control: tuple[Coefficient, SecondMoment] | None,
-    goal: Goal | None,
-) -> xr.Dataset:
-    evaluate = Recorder(evaluate)
-    centre = linearise(inputs, evaluate)
-    slopes = centre.state_slopes if control and len(centre.slopes) else None
-    state = centre.state if slopes is None else centre.state_middle
-    fields = _JointMoments(centre.coordinates, state, slopes) if method.fields and centre.state.size else None
-    rounds: list[Evaluations] = []
-    growing = grown(inputs, evaluate, centre, method.limit) if fields is not None else evaluate
-    limit = method.limit if goal is None else min(method.limit, goal.most - 1)
-    tolerance = method.tolerance if goal is None else 1.0
-    target = min(limit, FIRST_ROUND) if method.open_ended or goal is not None else limit
-    count = 0
-    while True:
-        points = inputs.random(method.seed, count, target)
-        rounds.append(growing(Request(points, fields=fields, start=centre.prediction)))
-        count = target
-        evaluations = merge(rounds)
-        scalars = _scalar_moments(evaluations, inputs, centre, control)
-        reached = float(scalars.relative_error.max()) if goal is None else goal.reached(scalars)
-        growth = MOST_GROWTH
-        if tolerance is not None:
-            growth = min(MOST_GROWTH, max(1.5 if goal is None else 1.1, 1.1 * (reached / tolerance) ** 2))
-        paid = count + method.affordable(evaluate.solves, evaluate.seconds)
-        target = int(min(limit, int(count * growth) + 1, paid))
-        if (tolerance is not None and reached <= tolerance) or target <= count:
-            break
-    amount, error = f"{count} samples", f"relative error {float(scalars.relative_error.max()):.3g}"
-    stopped = f"{amount}: {error}" if goal else method.why_stopped(reached, error, count, limit, amount)
-    return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
 
 
 def grown(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, planned: int) -> Evaluate:

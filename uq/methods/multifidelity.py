@@ -32,9 +32,8 @@ from uq.methods.cheap import CHEAP, CheapModel
 from uq.methods.fidelity_choice import ByChoice
 from uq.methods.fidelity_team import OWN_LABEL, PILOT, Team
 from uq.methods.fidelity_ways import ByExpansion, ByModels
-from uq.methods.method import MESH
+from uq.methods.method import MESH, Amount
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED, Probability
-from uq.methods.stopping import Amount
 from uq.surrogates.linearisation import local_dataset
 
 if TYPE_CHECKING:

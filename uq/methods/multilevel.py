@@ -24,9 +24,9 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
+from uq.methods.method import Amount
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
 from uq.methods.multilevel_meshes import RATES, Found, Mesh, Pilot, influences, name_of, rate
-from uq.methods.stopping import Amount
 from uq.surrogates.linearisation import local_dataset
 
 if TYPE_CHECKING:

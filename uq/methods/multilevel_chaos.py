@@ -29,7 +29,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request, St
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.chaos import Expanded, Probability, expansion_dataset, objection
-from uq.methods.stopping import Amount
+from uq.methods.method import Amount
 from uq.surrogates.basis import hyperbolic_count, orthonormal, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
@@ -192,7 +192,7 @@ class MultilevelChaos(Amount):
         count = f"{len(levels)} level{'s' if len(levels) > 1 else ''} of {n} samples"
         stopped = self.why_stopped(change, error, len(levels), self.max_levels, count)
         expanded = Expanded(centre, found, Regression(inputs, bases, basis, data, fit), stopped)
-        dataset = expansion_dataset(self, evaluate, expanded, further)
+        dataset = expansion_dataset(evaluate, expanded, self.seed, self.quantiles, further, fields=self.fields)
         return dataset.assign(_by_level(levels)).assign(
             {
                 f"control_{name}": (("output",), getattr(controlled, name))

@@ -25,8 +25,7 @@ from uq.estimators.tails import of_influences, unseen
 from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
-from uq.methods.method import MESH
-from uq.methods.stopping import TEXTBOOK, seconds_per_solve
+from uq.methods.method import MESH, TEXTBOOK, seconds_per_solve
 from uq.surrogates.linearisation import Linearisation, linearise
 
 SIZE = 10_000  # unknowns assumed on the coarsest mesh for a model without a state

@@ -24,10 +24,10 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two
-from uq.methods.chaos import LARGEST, Chaos, expansion_dataset
+from uq.methods.chaos import LARGEST, Chaos
+from uq.methods.method import Amount
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
 from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Design, Rows, by_output, by_round, with_maps
-from uq.methods.stopping import Amount
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
 from uq.surrogates.regression import Regression
@@ -219,7 +219,7 @@ class Sobol(Amount):
             fields=self.fields,
         )
         expanded = method.expand(inputs, evaluate)
-        dataset = expansion_dataset(method, evaluate, expanded)
+        dataset = method.dataset_of(evaluate, expanded)
         return self._with_indices(dataset, inputs, expanded.regression, evaluate.node_volumes)
 
     def _with_indices(

@@ -18,7 +18,7 @@ from uq.findings import findings
 
 if TYPE_CHECKING:
     from uq.inputs.random_parameters import Inputs
-    from uq.methods.stopping import Amount
+    from uq.methods.method import Amount
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
-from uq.estimators.indices import partial_variances, shares
+from uq.estimators.indices import coefficient_moments, partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
@@ -287,3 +287,60 @@ def beyond_of_field(regression: Regression) -> float:
 def _variances(fit: Fit) -> FloatArray:
     """Variances (k,) of the sketches."""
     return shares(fit.loo**2, fit.relative**2)
+
+
+def among(terms: NDArray[np.int64], which: NDArray[np.int64], coefficients: FloatArray) -> FloatArray:
+    """Return coefficients (P, m) of the functions `which` (P,) as those of `terms` (T,), with zeros for the others."""
+    found = np.zeros((len(terms), coefficients.shape[1]))
+    found[[int(np.flatnonzero(terms == term)[0]) for term in which]] = coefficients
+    return found
+
+
+def estimates_of_field(
+    evaluations: Evaluations,
+    centre: Linearisation,
+    count: int,
+    regression: Regression,
+    terms: NDArray[np.int64],
+    outputs: Regression,
+    estimates: dict[str, FloatArray],
+) -> dict[str, tuple[tuple[str, ...], FloatArray | float]]:
+    """Coefficients of the functions `terms` (T,), mean and standard deviation of the displacements, and their errors.
+
+    Errors are those of the sketches and of the outputs, scaled by the residuals, which come from the same rows. The
+    part of a variance s² that the fit misses (its residuals, increased by the ratio of unseen to seen residuals of the
+    sketches) is an error of the standard deviation too, √(s² + missed) − s.
+    """
+    basis, fit = regression.basis, regression.fit
+    projections = evaluations.fields[fit.chosen.which][:, :count]
+    coefficients = solved(fit, projections)
+    squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
+    coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
+    moments = coefficient_moments(coefficients.T, basis.indices)
+    of_sketches = regression.estimates()
+    fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
+    rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
+    seen = float(shares((fit.loo**2).sum(), fit.squares.sum() / rows))
+    left = max(1.0, seen) * squares / rows
+    for name in ("mean", "std"):
+        known = [(estimates, outputs.fit), (of_sketches, fit)]
+        share = max(float(shares(of[f"{name}_error"] ** 2, by.squares).max()) for of, by in known)
+        error = np.sqrt(share * squares)
+        if name == "std":
+            error = np.hypot(error, shares(left, moments["std"] + np.sqrt(moments["std"] ** 2 + left)))
+        fields[f"{name}_error"] = error.reshape(-1, 3)
+    by_node = [part.reshape(-1, 3).sum(axis=1) for part in (left, left + moments["std"] ** 2)]
+    return {
+        **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
+        "field_coefficients": (
+            ("term", "node", "component"),
+            among(terms, fit.chosen.which, coefficients).reshape(len(terms), -1, 3),
+        ),
+        "field_loo_error": ((), relative_of_field(regression)),
+        "node_loo_error": (("node",), np.sqrt(shares(*by_node))),
+        **(
+            {f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()}
+            if regression.inputs.independent
+            else {}
+        ),
+    }

@@ -108,7 +108,7 @@ class Regression:
 
     def _dependent(self) -> dict[str, FloatArray]:
         """Moments and, of few parameters, Shapley effects."""
-        from uq.estimators.shapley import MOST, Shapley
+        from uq.estimators.indices import MOST, Shapley
 
         draws = self.inputs.draws
         assert draws is not None

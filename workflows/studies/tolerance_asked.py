@@ -21,7 +21,7 @@ from forward.scalars import Mistake
 from forward.words import number
 from uq.accuracy.goal import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
-from uq.methods.stopping import UNASKED
+from uq.methods.method import UNASKED
 from workflows.studies.predictions import times_of
 
 if TYPE_CHECKING:

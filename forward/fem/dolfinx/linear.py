@@ -1,4 +1,4 @@
-"""Stiffness matrices and their linear solvers (`forward.solvers.linear`)."""
+"""Stiffness matrices and their linear solvers (`forward.solvers.system`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from forward.fem.dolfinx.spaces import owned_nodes
 from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
-from forward.solvers.linear import TIGHT
+from forward.solvers.system import TIGHT
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

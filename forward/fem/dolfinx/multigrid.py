@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.fem.dolfinx.linear import StiffnessMatrix
-from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.dolfinx.spaces import Transfer
 from forward.model import FloatArray, SolveError
 from forward.solvers import multigrid
 from forward.solvers.lanczos import negative_eigenvalues
-from forward.solvers.linear import TIGHT, LinearSolver, NoConvergence
 from forward.solvers.multigrid import MARGIN, Levels, minimised
 from forward.solvers.steps import finish
+from forward.solvers.system import TIGHT, LinearSolver, NoConvergence
 
 ITERATIONS = 400  # of conjugate gradients
 RESIDUALS = 100  # of generalised conjugate residuals, which remember all directions

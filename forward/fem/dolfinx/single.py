@@ -23,7 +23,7 @@ from forward.fem.cost import SPARE
 from forward.fem.dolfinx.linear import MOST_ROOM, ROOM, TOO_LITTLE_ROOM, DirectSolver, StiffnessMatrix
 from forward.machine import require
 from forward.model import FloatArray
-from forward.solvers.linear import ROUGH, TIGHT
+from forward.solvers.system import ROUGH, TIGHT
 
 SINGLE = np.float32
 CONTRACTION = 0.1  # largest share of an error that a refinement may leave: then the factor has the stiffness' inertia

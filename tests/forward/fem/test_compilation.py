@@ -104,7 +104,7 @@ def test_a_cache_that_cannot_be_made_is_said_in_one_line(tmp_path):
 def test_what_is_imported_with_dolfinx():
     """Not what UFL and FFCx only ask for their versions, nor SciPy before it is used."""
     code = (
-        "import sys, forward.fem.dolfinx as _, forward.fem.dolfinx.transfer, ufl, ffcx\n"
+        "import sys, forward.fem.dolfinx as _, forward.fem.dolfinx.spaces, ufl, ffcx\n"
         "print(ufl.__version__ == ffcx.__version__ == '', {'pkg_resources', 'scipy.sparse'} & set(sys.modules))"
     )
     done = subprocess.run(

@@ -39,8 +39,8 @@ from uq.estimators.scores import rate as rate_of_errors
 from uq.estimators.scores import score
 from uq.estimators.tails import _share_beyond, by_chance, concentration, influences, shown, skewed
 from uq.inputs.draws import effective
+from uq.methods.method import seconds_per_solve
 from uq.methods.multilevel_meshes import bias, rate
-from uq.methods.stopping import seconds_per_solve
 
 pytestmark = pytest.mark.unit
 RNG = np.random.default_rng(11)

@@ -6,8 +6,7 @@ from scipy import stats
 
 from uq.estimators.blue import subsets
 from uq.estimators.fidelities import Samples
-from uq.estimators.fidelity_quantiles import below, quantiles_of_groups
-from uq.estimators.quantiles import quantiles
+from uq.estimators.quantiles import below, quantiles, quantiles_of_groups
 
 P = (0.05, 0.5, 0.95)
 GROUPS = subsets(2)  # both, the model alone, the cheap one alone

@@ -25,7 +25,7 @@ from forward.scalars import Scalar
 from forward.settings import Settings
 from forward.spec import ModelSpec
 from uq.evaluation.request import Request
-from uq.methods.stopping import Amount
+from uq.methods.method import Amount
 from uq.methods.monte_carlo import MonteCarlo
 
 
