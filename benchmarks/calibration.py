@@ -19,9 +19,9 @@ from mpi4py import MPI
 
 from benchmarks import calibration_forces, calibration_palpation
 from benchmarks.beams import CONFIG
+from benchmarks.simulated import Kind, calibrate
 from forward.fem.specimen import SpecimenModel
 from forward.specimen import Specimen
-from inverse.criticism.calibration import Kind, calibrate
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Prediction

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.simulated import calibrate, rank_by_laplace, rank_by_weights
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.calibration import calibrate, rank_by_laplace, rank_by_weights
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
