@@ -31,3 +31,15 @@ def flat(p):
 
 
 NUMBER = 3.0
+
+
+def higher_moments(marginal):
+    """Third and fourth central moments of a distribution, from the recurrence or the rule of its polynomials."""
+    if marginal.closed:
+        # Of the standardised variable they are α_1 and 1 + α_1² + β_2: entries of powers of the Jacobi matrix.
+        alpha, beta = marginal.recurrence(2)
+        std = marginal.moments[1]
+        return float(alpha[1] * std**3), float((1 + alpha[1] ** 2 + beta[2]) * std**4)
+    _, offsets, weights = marginal.rule
+    deviations = offsets - weights @ offsets
+    return float(weights @ deviations**3), float(weights @ deviations**4)

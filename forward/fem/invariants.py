@@ -73,7 +73,7 @@ class Invariants:
         self, energy: str, mesh: Any, u: Any, displacement_of: Callable[[Any], Any], fibres: Sequence[Any] = ()
     ) -> None:
         gradient, identity = ufl.grad(u), ufl.Identity(3)
-        self.F = kinematics.deformation_gradient(gradient, identity)
+        self.F = identity + gradient
         self.deformation = at = kinematics.deformation(OPS, gradient, identity)
         self._energy, self._undeformed = energy, spaces.constant(mesh, 0.0)
         self._displacement_of = displacement_of

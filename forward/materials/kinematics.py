@@ -13,11 +13,6 @@ SMALL = 0.1  # |z| below which artanh z − z is its series
 TERMS = 7  # of the series: the relative truncation error is SMALL¹⁴/5
 
 
-def deformation_gradient(gradient: Any, identity: Any) -> Any:
-    """F = I + ∇u."""
-    return identity + gradient
-
-
 class Deformation(NamedTuple):
     """The parts of measures and stresses: polynomials of ∇u that vanish with it.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from forward.findings import Finding, entries
 from forward.model import FloatArray
-from uq.estimators.quantiles import quantiles_worth
+from uq.estimators.quantiles import quantiles
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 
@@ -117,7 +117,7 @@ def _kurtosis(values: FloatArray) -> FloatArray:
 def _quantiles(dataset: xr.Dataset, values: FloatArray, share: FloatArray, worth: float) -> dict[str, object]:
     """Intervals of quantiles, wider by those of as many independent samples as the draws are worth."""
     probabilities = dataset["quantile"].to_numpy()
-    of_draws = quantiles_worth(values, tuple(probabilities), worth)
+    of_draws = quantiles(values, tuple(probabilities), worth)
     central = dataset["quantiles"].to_numpy()
     lower = np.hypot(
         central - dataset["quantiles_lower"].to_numpy(), np.sqrt(share) * (of_draws.central - of_draws.lower)

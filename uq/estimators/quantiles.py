@@ -56,19 +56,15 @@ class Quantiles(NamedTuple):
         }
 
 
-def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> Quantiles:
-    """Quantiles of independent samples (n, m), with 95 % intervals between order statistics.
+def quantiles(values: FloatArray, probabilities: tuple[float, ...], worth: float | None = None) -> Quantiles:
+    """Quantiles of independent samples (n, m), or as many as they are worth, with 95 % intervals of order statistics.
 
     X_(a) lies below the p-quantile with probability I_p(a, n + 1 − a), which is also defined for a between whole
     numbers (A. D. Hutson, J. Appl. Stat. 26 (1999) 343–353). If a < 1 the interval extends beyond the samples: there
     the tail is assumed exponential, with the mean distance of the outermost quarter.
     """
-    return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), len(values)), Z)
-
-
-def quantiles_worth(values: FloatArray, probabilities: tuple[float, ...], worth: float) -> Quantiles:
-    """Quantiles of values (n, m), with the intervals of as many independent samples as they are worth."""
-    return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), worth), Z)
+    counts = np.full((len(probabilities), values.shape[1]), len(values) if worth is None else worth)
+    return _between(values, np.array(probabilities), counts, Z)
 
 
 def quantiles_from_replicates(

@@ -287,15 +287,6 @@ class LogNormal(Univariate):
         return self.mean, self.std
 
     @cached_property
-    def higher_moments(self) -> tuple[float, float]:
-        """Third and fourth central moments, from c = exp s² − 1."""
-        c = (self.std / self.mean) ** 2
-        return (
-            float(self.std**3 * (3 + c) * np.sqrt(c)),
-            float(self.std**4 * (3 + 16 * c + 15 * c**2 + 6 * c**3 + c**4)),
-        )
-
-    @cached_property
     def logarithmic(self) -> bool:
         """As for every distribution."""
         return True

@@ -153,12 +153,6 @@ class Empirical:
         """Expected value and standard deviation."""
         return self._moments(self.values)
 
-    @cached_property
-    def higher_moments(self) -> tuple[float, float]:
-        """Third and fourth central moments."""
-        deviations = self.values - self.moments[0]
-        return float(self.weights @ deviations**3), float(self.weights @ deviations**4)
-
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
         """A point of the distribution, and offsets from it with weights."""

@@ -61,18 +61,6 @@ class Univariate(Settings):
         mean = float(weights @ offsets)
         return origin + mean, float(np.sqrt(weights @ (offsets - mean) ** 2))
 
-    @cached_property
-    def higher_moments(self) -> tuple[float, float]:
-        """Third and fourth central moments."""
-        if self.closed:
-            # Of the standardised variable they are α_1 and 1 + α_1² + β_2: entries of powers of the Jacobi matrix.
-            alpha, beta = self.recurrence(2)
-            std = self.moments[1]
-            return float(alpha[1] * std**3), float((1 + alpha[1] ** 2 + beta[2]) * std**4)
-        _, offsets, weights = self.rule
-        deviations = offsets - weights @ offsets
-        return float(weights @ deviations**3), float(weights @ deviations**4)
-
     def recurrence(self, degree: int) -> FloatArray:
         """Return α and β (2, degree + 1) of the orthogonal polynomials of (ω − mean)/std, if `closed`; β_0 = 1.
 

@@ -26,7 +26,6 @@ from uq.estimators.moments import (
 )
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
 from uq.estimators.tails import influences, of_influences, unseen
-from uq.evaluation.request import Evaluations
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
@@ -186,7 +185,7 @@ class ByExpansion:
         zero = np.zeros_like(scale)
         return cls(
             team,
-            deviations(regression, _without_fields(pilot), centre),
+            deviations(regression, replace(pilot, fields=np.zeros((0, 0))), centre),
             Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
         )
 
@@ -293,10 +292,6 @@ class ByExpansion:
         values = self._values()[1]
         relative = self.estimates.relative_std_error
         yield from of_tails(team.evaluate.outputs, values, relative, self._moved, expanded=True)
-
-
-def _without_fields(pilot: Evaluations) -> Evaluations:
-    return replace(pilot, fields=np.zeros((0, 0)))
 
 
 def sizes(estimates: Estimates) -> FloatArray:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -27,13 +26,6 @@ from uq.surrogates.reach import normal_rule
 STEP = 0.5  # of the difference quotients, in standard deviations: wide, to capture the curvature where the samples lie
 MARGIN = 0.25  # of the range of its samples, by which an expansion is used beyond them on either side
 EDGE = 1e-9  # probability of the quantile that replaces the end of an unbounded range
-
-
-class Features(Protocol):
-    """Functions φ of the parameters."""
-
-    def values(self, points: FloatArray) -> FloatArray:
-        """Return φ (n, k) at points (n, d)."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +60,7 @@ class Control:
         of the prediction by these is the control of the second moment.
     """
 
-    polynomials: Features
+    polynomials: Basis | Monomials | Held
     outputs: FloatArray
     state: FloatArray
     features_mean: FloatArray

@@ -34,7 +34,7 @@ from uq.estimators.moments import (
     student,
     term,
 )
-from uq.estimators.quantiles import quantiles, quantiles_from_replicates, quantiles_of_shares, quantiles_worth
+from uq.estimators.quantiles import quantiles, quantiles_from_replicates, quantiles_of_shares
 from uq.estimators.scores import rate as rate_of_errors
 from uq.estimators.scores import score
 from uq.estimators.tails import _share_beyond, by_chance, concentration, influences, shown, skewed
@@ -172,7 +172,7 @@ def test_intervals_of_quantiles_are_those_of_order_statistics():
         assert stats.beta.cdf(p, upper * (n + 1), (n + 1) * (1 - upper)) == pytest.approx(0.025, abs=1e-6)
         assert found.error[k, 0] == pytest.approx(max(upper - found.central[k, 0], found.central[k, 0] - lower) / 1.96)
     np.testing.assert_allclose(found.lower + found.upper[::-1], 1)
-    worth = quantiles_worth(values, (0.5,), 49.0)
+    worth = quantiles(values, (0.5,), 49.0)
     assert stats.beta.cdf(0.5, worth.lower[0, 0] * 50, 50 * (1 - worth.lower[0, 0])) == pytest.approx(0.975, abs=1e-6)
     shares = quantiles_of_shares(values, (0.5,), np.array([[0.5 / 7]]))  # those of 49 samples
     np.testing.assert_allclose(shares.lower, worth.lower)
@@ -187,7 +187,7 @@ def test_quantiles_of_replicates_are_worth_what_their_shares_say(replicates):
     below = (values[:, 0] <= found.central[0, 0]).reshape(replicates, each).mean(axis=1)
     t = stats.t.ppf(0.975, replicates - 1)
     error = max(below.std(ddof=1) / math.sqrt(replicates), math.sqrt(replicates / 12) / len(values))
-    worth = quantiles_worth(values, (0.3,), 0.21 / error**2 * (1.96 / t) ** 2)
+    worth = quantiles(values, (0.3,), 0.21 / error**2 * (1.96 / t) ** 2)
     np.testing.assert_allclose([found.lower, found.upper], [worth.lower, worth.upper])
     np.testing.assert_allclose(found.error, worth.error * 1.96 / t)
 

@@ -13,6 +13,7 @@ from scipy import stats
 from benchmarks import coverage, skewed, tails
 from benchmarks.coverage import Vectorised, measure
 from forward.model import FunctionModel, SolveError
+from tests.functions import higher_moments
 from tests.launch import run_script
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.findings import findings
@@ -332,7 +333,6 @@ def test_quadratic_control_with_a_copula():
         (Beta(a=2.0, b=2.0, lower=2e5, upper=4e5), 0, 15 / 7),
         (Normal(mean=3e5, std=2e2), 0, 3),
         (Gamma(shape=4.0, scale=0.25), 1, 4.5),
-        (LogNormal(mean=1e3, std=2e3), 14, 947),
         (LogUniform(lower=1.0, upper=1e3), *(stats.loguniform.stats(1, 1e3, moments="sk") + np.array([0, 3]))),
         (Triangular(lower=0.0, upper=1.0, mode=0.2), float(stats.triang.stats(0.2, moments="s")), 2.4),
         (
@@ -343,7 +343,7 @@ def test_quadratic_control_with_a_copula():
     ids=lambda x: getattr(x, "kind", None),
 )
 def test_higher_moments(marginal, skewness, kurtosis):
-    third, fourth = marginal.higher_moments
+    third, fourth = higher_moments(marginal)
     std = marginal.moments[1]
     assert third / std**3 == pytest.approx(skewness, abs=1e-6)
     assert fourth / std**4 == pytest.approx(kurtosis, rel=1e-6)
