@@ -70,8 +70,7 @@ class Bisected:
             If the cells are not tetrahedra.
         """
         if mesh.cell != "tetrahedron":
-            message = "hexahedra cannot be refined locally, expected tetrahedra"
-            raise ModelError(message)
+            raise ModelError("hexahedra cannot be refined locally, expected tetrahedra")
         rank = _rank_of_edges(mesh.points, mesh.cells)
         longest = rank.argmax(axis=1)
         ends = EDGES[longest]

@@ -31,8 +31,7 @@ Vector = tuple[float, float, float]
 
 def _has_length(direction: Vector) -> Vector:
     if not any(direction):
-        message = "has length zero, expected a vector such as [0, -1, 0]"
-        raise ValueError(message)
+        raise ValueError("has length zero, expected a vector such as [0, -1, 0]")
     return direction
 
 
@@ -241,11 +240,10 @@ class _SixSided(Settings):
         lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
         needed = lowest[self.cell, self.degree]
         if self.quadrature < needed:
-            message = (
+            raise ValueError(
                 f"quadrature_degree = {self.quadrature} leaves deformations of {self.cell} cells of degree "
                 f"{self.degree} without energy, expected at least {needed}"
             )
-            raise ValueError(message)
         return self
 
 
@@ -397,11 +395,10 @@ class Block(_SixSided):
         # Volume relative to that of a right-angled cell with the same edges.
         edges = np.linalg.norm(slopes, axis=1).prod(axis=1)
         if not (np.linalg.det(slopes) > 1e-9 * edges).all():
-            message = (
+            raise ValueError(
                 "the corners enclose no volume or turn the block inside out, expected the images of (0,0,0), (1,0,0), "
                 "(0,1,0), (1,1,0), (0,0,1), (1,0,1), (0,1,1), (1,1,1) of a cube, in this order"
             )
-            raise ValueError(message)
         return self
 
 

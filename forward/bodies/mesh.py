@@ -181,8 +181,7 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
     """
     unknown = [name for name in towards if name not in mesh.boundaries]
     if unknown:
-        message = f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}"
-        raise ModelError(message)
+        raise ModelError(f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}")
     held = np.zeros(len(mesh.points))
     for name in towards:
         held[mesh.boundaries[name]] = 0.5 - QUARTER

@@ -134,8 +134,7 @@ class MeshFile(Settings):
             If it is divided already.
         """
         if self.divide is not None:
-            message = "its mesh is divided already"
-            raise ModelError(message)
+            raise ModelError("its mesh is divided already")
         return self.model_validate(self.model_dump(exclude={"contents"}) | {"divide": towards})
 
     @property
@@ -276,8 +275,7 @@ class MeshFile(Settings):
             fewer -= 1
         if fewer != round(fewer) or fewer > self.levels:
             divided = self.levels + (self.divide is not None)
-            message = f"cells {times:g} times as long: its mesh was divided {divided} times; expected 1, 2, 4 …"
-            raise ModelError(message)
+            raise ModelError(f"cells {times:g} times as long: its mesh was divided {divided} times; expected 1, 2, 4 …")
         kept = {"levels": self.levels - round(fewer), "divide": None if times > 1 else self.divide}
         elements = {} if degree is None else {"degree": degree, "quadrature_degree": None}
         contents = {"contents": self.contents} if times == 1 else {}

@@ -90,8 +90,7 @@ class RandomField(Settings):
     def _check_modes(self) -> RandomField:
         if (self.basis == "modes") != (self.modes is not None):
             wanted = "a number of modes" if self.basis == "modes" else "no modes"
-            message = f"basis = '{self.basis}', expected {wanted}"
-            raise ValueError(message)
+            raise ValueError(f"basis = '{self.basis}', expected {wanted}")
         return self
 
     def prior(self, body: Body) -> NodalPrior:

@@ -71,8 +71,7 @@ class MeshInMemory(MeshFile):
         ModelError
             Always.
         """
-        message = "a mesh in memory is not divided"
-        raise ModelError(message)
+        raise ModelError("a mesh in memory is not divided")
 
     def load(self) -> Loaded:
         """Return the mesh; on the first rank."""

@@ -116,8 +116,7 @@ class _External(ModelSpec):
             assert jacobian is not None
             found = real(jacobian(whole(point)), "jacobian")
             if found.size != m * len(names) or (found.shape != (m, len(names)) and 1 not in {m, len(names)}):
-                message = f"model.jacobian: returned shape {found.shape}, expected ({m}, {len(names)})"
-                raise ModelError(message)
+                raise ModelError(f"model.jacobian: returned shape {found.shape}, expected ({m}, {len(names)})")
             return found.reshape(m, len(names))[:, places]
 
         return FunctionModel(
@@ -131,8 +130,7 @@ class _External(ModelSpec):
     def _check_names(self) -> _External:
         for name, count in Counter(output.name for output in self.outputs).items():
             if count > 1:
-                message = f"{count} outputs have the name '{name}', expected different names"
-                raise ValueError(message)
+                raise ValueError(f"{count} outputs have the name '{name}', expected different names")
         return self
 
 
@@ -187,16 +185,13 @@ def _function(path: str, key: str) -> Callable[[FloatArray], Any]:
         function = getattr(imported(module), name)
     except AttributeError:
         known = tuple(word for word in dir(imported(module)) if not word.startswith("_"))
-        message = f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}"
-        raise ModelError(message) from None
+        raise ModelError(f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}") from None
     except (Exception, SystemExit) as error:
         if out_of_memory(error):
             raise
-        message = f"model.{key}: '{module}' cannot be imported: {_said(error)}"
-        raise ModelError(message) from None
+        raise ModelError(f"model.{key}: '{module}' cannot be imported: {_said(error)}") from None
     if not callable(function):
-        message = f"model.{key}: '{path}' is {type(function).__name__}, expected a function"
-        raise ModelError(message)
+        raise ModelError(f"model.{key}: '{path}' is {type(function).__name__}, expected a function")
     found: Callable[[FloatArray], Any] = function
     return found
 
@@ -219,21 +214,17 @@ def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -
         except SolveError:
             raise
         except TimeLimitError:
-            message = f"{path} took longer than solve_seconds = {seconds:g}"
-            raise SolveError(message) from None
+            raise SolveError(f"{path} took longer than solve_seconds = {seconds:g}") from None
         except SystemExit as error:
-            message = f"{path} ended the process: {_said(error)} at {at(point)}"
-            raise StopError(message) from None
+            raise StopError(f"{path} ended the process: {_said(error)} at {at(point)}") from None
         except Exception as error:
             if out_of_memory(error):
                 have = headroom()
                 left = f"; {have}" if have.size < LITTLE else ""  # there may be plenty, but not for what it asked for
-                message = f"memory ran out: {path} raised {_said(error)} at {at(point)}{left}"
-                raise StopError(message) from None
+                raise StopError(f"memory ran out: {path} raised {_said(error)} at {at(point)}{left}") from None
             if reason_to_stop(error) is not None:
                 raise
-            message = f"{path} raised {_said(error)}"
-            raise SolveError(message) from error
+            raise SolveError(f"{path} raised {_said(error)}") from error
 
     return guarded
 
@@ -320,12 +311,10 @@ class Client:
         info = self._ask("Info", None)
         models = info.get("models", [])
         if name is None and len(models) != 1:
-            message = f"model.name: missing, expected one of the models of {url}: {', '.join(models)}"
-            raise ModelError(message)
+            raise ModelError(f"model.name: missing, expected one of the models of {url}: {', '.join(models)}")
         self._model = models[0] if name is None else name
         if self._model not in models:
-            message = f"model.name: '{name}' is not a model of {url}; {nearest(str(name), tuple(models))}"
-            raise ModelError(message)
+            raise ModelError(f"model.name: '{name}' is not a model of {url}; {nearest(str(name), tuple(models))}")
         if info.get("protocolVersion") != PROTOCOL:
             message = f"model.url: {url} speaks version {info.get('protocolVersion')} of UM-Bridge, expected {PROTOCOL}"
             raise ModelError(message)
@@ -335,8 +324,7 @@ class Client:
         support = self._ask("ModelInfo", {})["support"]
         self._forward, self._reverse = (bool(support.get(word)) for word in ("ApplyJacobian", "Gradient"))
         if not support.get("Evaluate"):
-            message = f"model.url: the model '{self._model}' of {url} cannot be evaluated"
-            raise ModelError(message)
+            raise ModelError(f"model.url: the model '{self._model}' of {url} cannot be evaluated")
         self.differentiable = self._forward or self._reverse
 
     def evaluate(self, point: FloatArray) -> FloatArray:
@@ -391,15 +379,12 @@ class Client:
             message = f"model.url: {self._url} is not an UM-Bridge server: its answer to {what} is not JSON"
             raise ModelError(message) from None
         except OSError as error:
-            message = f"model.url: {self._url} broke off the connection ({_said(error)})"
-            raise ModelError(message) from None
+            raise ModelError(f"model.url: {self._url} broke off the connection ({_said(error)})") from None
 
     def _refuse_slowness(self, what: str, timeout: float | None) -> NoReturn:
         if what in {"Evaluate", "Gradient", "ApplyJacobian"}:
-            message = f"{self._url} took longer than solve_seconds = {timeout:g}"
-            raise SolveError(message)
-        message = f"model.url: {self._url} does not answer within {timeout:g} s, expected an UM-Bridge server"
-        raise ModelError(message)
+            raise SolveError(f"{self._url} took longer than solve_seconds = {timeout:g}")
+        raise ModelError(f"model.url: {self._url} does not answer within {timeout:g} s, expected an UM-Bridge server")
 
     def _refuse(self, what: str, code: int, body: bytes) -> None:
         """Say what a server's error means: a failed solve, or a model that cannot be used."""
@@ -409,7 +394,5 @@ class Client:
         except (ValueError, KeyError, TypeError):
             kind, message = "", f"status {code}"
         if code == 404 or kind in MISUSED:
-            message = f"model.url: {self._url} refuses {what}: {message}"
-            raise ModelError(message)
-        message = f"{self._url}: {message}"
-        raise SolveError(message)
+            raise ModelError(f"model.url: {self._url} refuses {what}: {message}")
+        raise SolveError(f"{self._url}: {message}")

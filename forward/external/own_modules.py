@@ -249,8 +249,7 @@ def imported(module: str) -> ModuleType:
     """
     if refused(module):
         cast("list[str]", _refused.get()).append(module)
-        message = f"'{module}' is not installed, and code from beside a study runs with --code alone"
-        raise OwnCodeError(message)
+        raise OwnCodeError(f"'{module}' is not installed, and code from beside a study runs with --code alone")
     importlib.invalidate_caches()
     now = sources([module]).files
     for name, (file, _) in now.items():

@@ -192,8 +192,7 @@ class Admission:
             else:
                 objection = None if math.isfinite(value) else "input should be a finite number"
             if objection is not None:
-                message = f"{path} = {value:.6g} is not admissible: {objection}"
-                raise InadmissibleError(message)
+                raise InadmissibleError(f"{path} = {value:.6g} is not admissible: {objection}")
         objection = self._materials.objection(given)
         if objection is not None:
             raise InadmissibleError(objection)

@@ -76,8 +76,7 @@ def measure(ops: ModuleType | SimpleNamespace, name: str, at: Deformation, fibre
         case "square":
             return ops.tr(at.strain * at.strain) / 4
         case _:
-            message = f"no measure of a deformation: '{name}'"
-            raise ValueError(message)
+            raise ValueError(f"no measure of a deformation: '{name}'")
 
 
 def excess(mean: Any, square: Any, product: Any, root: Any) -> Any:

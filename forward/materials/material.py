@@ -65,13 +65,11 @@ def with_volume(volume: Energy) -> Callable[[Energy], Energy]:
         If one of the two depends on something else.
     """
     if measures(volume) != ("j",):
-        message = f"the volumetric part is a function of {', '.join(measures(volume))}, expected j alone"
-        raise TypeError(message)
+        raise TypeError(f"the volumetric part is a function of {', '.join(measures(volume))}, expected j alone")
 
     def decorated(shape: Energy) -> Energy:
         if {"j", "trace", "square"} & {*measures(shape)} or constants(shape).keys() & constants(volume).keys():
-            message = "the isochoric part has a measure of the volume, or a constant of the volumetric part"
-            raise TypeError(message)
+            raise TypeError("the isochoric part has a measure of the volume, or a constant of the volumetric part")
         return Split(shape, volume)
 
     return decorated

@@ -75,17 +75,13 @@ class MaterialTest(Settings):
     @model_validator(mode="after")
     def _check(self) -> MaterialTest:
         if self.mode != "simple-shear" and min(self.at) <= 0:
-            message = f"at: stretch {min(self.at):g}, expected positive ones (1 is undeformed)"
-            raise ValueError(message)
+            raise ValueError(f"at: stretch {min(self.at):g}, expected positive ones (1 is undeformed)")
         if (self.across is not None) != (self.mode == "biaxial"):
-            message = "across: is only for mode = 'biaxial'"
-            raise ValueError(message)
+            raise ValueError("across: is only for mode = 'biaxial'")
         if self.component != "P1" and self.mode not in HELD:
-            message = f"component: {self.component} of a test '{self.mode}', expected P1: nothing acts across"
-            raise ValueError(message)
+            raise ValueError(f"component: {self.component} of a test '{self.mode}', expected P1: nothing acts across")
         if self.across is not None and len(self.across) != len(self.at):
-            message = f"across: {len(self.across)} stretches, expected as many as in at: {len(self.at)}"
-            raise ValueError(message)
+            raise ValueError(f"across: {len(self.across)} stretches, expected as many as in at: {len(self.at)}")
         return self
 
 
@@ -137,8 +133,7 @@ class HomogeneousModel(OneByOne):
         left_out = of_volume(energy) if incompressible(energy, given) else ()
         unknown, missing = set(given) - set(known), set(known) - set(given) - set(left_out)
         if unknown or missing:
-            message = f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}"
-            raise ValueError(message)
+            raise ValueError(f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}")
         self.parameters = tuple(parameters)
         self._names = tuple(name for name in known if name in given)
         self._energy = energy
@@ -196,10 +191,8 @@ class HomogeneousModel(OneByOne):
             return values
         name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
         if self._free:
-            message = f"no stress in the test {name}: the material has no energy, or no equilibrium, there"
-            raise SolveError(message)
-        message = f"no stress in the test {name}: the material has no energy there"
-        raise InadmissibleError(message)
+            raise SolveError(f"no stress in the test {name}: the material has no energy, or no equilibrium, there")
+        raise InadmissibleError(f"no stress in the test {name}: the material has no energy there")
 
     def _jacobian(self, parameters: FloatArray) -> FloatArray:
         return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])

@@ -33,11 +33,10 @@ class PointDisplacement(Observable):
         most = tolerance(spec) if isinstance(spec, MeshFile) else max(tolerance(spec), spec.longest_edge)
         if distance > most:
             where = ", ".join(f"{x:g}" for x in self.at)
-            message = (
+            raise ModelError(
                 f"output '{self.name}': the point ({where}) lies {distance:.3g} m outside the body, "
                 f"expected at most {most:.3g} m"
             )
-            raise ModelError(message)
         probe = spaces.function(equations.space)
         if found is not None:
             nodes, weights = found

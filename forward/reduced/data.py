@@ -200,13 +200,11 @@ def load(path: Path) -> ReducedData:
                 raise ModelError(message)
             found: ReducedData = _unpacked(table["model"], file)
     except OSError as error:
-        message = f"{path}: cannot be read: {error.strerror or 'it is not a reduced model'}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path}: cannot be read: {error.strerror or 'it is not a reduced model'}") from None
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         if isinstance(error, ModelError):
             raise
-        message = f"{path}: is not a reduced model, expected a file that `tissuq reduce` has made"
-        raise ModelError(message) from None
+        raise ModelError(f"{path}: is not a reduced model, expected a file that `tissuq reduce` has made") from None
     return found
 
 

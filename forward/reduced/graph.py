@@ -263,8 +263,7 @@ class Graph:
             case "abs":
                 return self.apply(SELECT, a, zero, self.constant(-1), one)
             case _:
-                message = f"no derivative of '{name}'"
-                raise ValueError(message)
+                raise ValueError(f"no derivative of '{name}'")
 
     def tape(self, outputs: Sequence[Node]) -> Tape:
         """Return the operations that outputs need."""
@@ -314,6 +313,5 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Tape:
     good = good and bool(((rows >= 0).sum(axis=1) == taken[codes]).all() and (rows < before[:, None]).all())
     last = inputs + len(constants) + len(codes)
     if not good or not ((outputs >= 0) & (outputs < last)).all():
-        message = "the file holds operations that are none"
-        raise ValueError(message)
+        raise ValueError("the file holds operations that are none")
     return Tape(inputs, constants.astype(float), *(one.astype(np.int64) for one in (codes, rows, outputs)))

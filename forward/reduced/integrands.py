@@ -113,8 +113,7 @@ class Reader:
             return self._graph.apply(SELECT, a, b, yes, no)
         if kind in {"GT", "GE"}:
             return self._graph.apply(SELECT, b, a, yes, no)
-        message = f"reduced models cannot read the condition {kind}"
-        raise NotImplementedError(message)
+        raise NotImplementedError(f"reduced models cannot read the condition {kind}")
 
 
 def _place(index: Any, at: dict[int, int]) -> int:
@@ -199,8 +198,7 @@ def _read(
         if isinstance(what, ufl.Argument):
             return count + own
         if gradient:
-            message = f"reduced models cannot read the gradient of {what}"
-            raise NotImplementedError(message)
+            raise NotImplementedError(f"reduced models cannot read the gradient of {what}")
         if id(what) in paths and paths[id(what)] in numbers:
             return first["numbers"] + numbers.index(paths[id(what)])
         if id(what) in logs:
@@ -214,8 +212,7 @@ def _read(
             if (what, component) not in given:
                 given.append((what, component))
             return first["given"] + given.index((what, component))
-        message = f"reduced models cannot read {kind}"
-        raise NotImplementedError(message)
+        raise NotImplementedError(f"reduced models cannot read {kind}")
 
     node = Reader(graph, known)(integrand)
     if virtual:

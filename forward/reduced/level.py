@@ -325,8 +325,7 @@ def _of_output(output: Output, level: Level, numbers: int) -> _Output:
             assert output.points is not None
             return _Peak(output, level, _all(output.points, level), numbers)
         case _:
-            message = f"the file has an output of the unknown kind '{output.kind}'"
-            raise ValueError(message)
+            raise ValueError(f"the file has an output of the unknown kind '{output.kind}'")
 
 
 def _all(points: Points, level: Level) -> Points:

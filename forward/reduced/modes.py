@@ -363,8 +363,7 @@ class AtRest:
         """
         layout, equations = self.equations.layout, self.equations
         if equations.p is not None:
-            message = "a body in the mixed form is not cut into blocks, expected none of them"
-            raise ModelError(message)
+            raise ModelError("a body in the mixed form is not cut into blocks, expected none of them")
         cells, _ = layout.cells()
         parts = partition(labels, cells, layout.coordinates, full)
         self.set()

@@ -58,8 +58,7 @@ class Outputs:
                 else:
                     self._of_output[one.name] = sampler
             elif not isinstance(one, MaxDisplacement) and not isinstance(functional, Linear):
-                message = f"the output '{one.name}' cannot be reduced"
-                raise ModelError(message)
+                raise ModelError(f"the output '{one.name}' cannot be reduced")
         self.tests = np.array(tests).reshape(-1, self._equations.size)
 
     @property

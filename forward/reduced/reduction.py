@@ -202,8 +202,7 @@ class Reduction:
             return boxes(cells, self.equations.layout.coordinates, cut)
         labels = self.model.space.regions()
         if labels is None:
-            message = "the body has no regions, expected numbers of blocks along each axis"
-            raise ModelError(message)
+            raise ModelError("the body has no regions, expected numbers of blocks along each axis")
         return labels
 
     def _of_adjoints(self, adjoints: FloatArray, modes: FloatArray, most: int) -> FloatArray:

@@ -108,8 +108,7 @@ class Reduced(ModelSpec):
                 names = tuple(parts["parameters"]["tuple"])
                 arrays = [file[f".{name}"] for name in ("nominal", "spread", "lower", "upper")]
         except OSError as error:
-            message = f"{self.file}: cannot be read: {error.strerror or 'it is no reduced model'}"
-            raise ModelError(message) from None
+            raise ModelError(f"{self.file}: cannot be read: {error.strerror or 'it is no reduced model'}") from None
         except (KeyError, ValueError, TypeError):
             message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
             raise ModelError(message) from None
@@ -274,10 +273,9 @@ class Reduced(ModelSpec):
         data = named("forward.reduced.data:load")(Path(self.file))
         if self.tolerance is not None and set(parameters) != set(data.parameters):
             missing = ", ".join(path for path in data.parameters if path not in parameters)
-            message = (
+            raise ModelError(
                 f"model.tolerance asks the full model, for which all its parameters are random; missing: {missing}"
             )
-            raise ModelError(message)
         body = self._about.body
         return named("forward.reduced.model:ReducedModel")(
             data,

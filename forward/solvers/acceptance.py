@@ -90,8 +90,7 @@ def check_jacobian(system: System, u: FloatArray) -> None:
     """Raise `Diverged` if a cell is inverted."""
     jacobian = system.smallest_jacobian(u)
     if not jacobian > 0:
-        message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
-        raise Diverged(message)
+        raise Diverged(f"a cell is turned inside out (smallest J = {jacobian:.3g})")
 
 
 def instability(system: System) -> str:

@@ -217,14 +217,12 @@ def _iterate_few(
     for iteration in range(iterations + 1):
         history.append(f"iteration {iteration} of {iterations}: relative residual {residual.relative:.3e}")
         if not np.isfinite(residual.size):
-            message = "the state has no finite residual"
-            raise Diverged(message)
+            raise Diverged("the state has no finite residual")
         if residual.size > ROUNDED * residual.scale > 0:
             sizes.clear()  # as in `mix`
         if converged(system, settings.tolerance, u, residual, sizes):
             if mixing is not None and last is not None and not convex(system, last, (u, residual)):
-                message = "the stiffness is indefinite along the last move"
-                raise Diverged(message)
+                raise Diverged("the stiffness is indefinite along the last move")
             tested = accepted(system, settings, u, residual, way if mixing is not None else None, history)
             stability = yield from tested
             return Found(u, residual.relative, corrected=mixing is not None, stability=stability)
@@ -238,7 +236,6 @@ def _iterate_few(
             factorise(system, u)
             u, residual = admissible_step(system, settings, u, system.solve(-residual.vector))
     if mixing is not None and residual.relative > ASTRAY:
-        message = "the reference is too far away"
-        raise Diverged(message)
+        raise Diverged("the reference is too far away")
     check_jacobian(system, u)  # no equilibrium, so neither stable nor unstable
     return Found(u, residual.relative, converged=False, corrected=mixing is not None)

@@ -323,13 +323,11 @@ class _Place:
         u = self.system.on_target(start)
         residual = self.system.residual(u)
         if not np.isfinite(residual.size):
-            message = "the state has no finite residual"
-            raise Diverged(message)
+            raise Diverged("the state has no finite residual")
         correct, limit = self.way.corrector(u), self.settings.corrections
         mixed = yield from mix(self.system, tolerance, u, residual, correct, limit, self.history)
         if not mixed.reached:
-            message = "the reference is too far away"
-            raise Diverged(message)
+            raise Diverged("the reference is too far away")
         return mixed.state
 
     def definite(self, u: FloatArray) -> Steps[bool]:

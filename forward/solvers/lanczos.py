@@ -87,8 +87,7 @@ def process(
     squared = float(total(np.array([r @ z]))[0])
     for k in range(steps):
         if not squared > 0:
-            message = "the preconditioner of the stiffness is not positive definite"
-            raise SolveError(message)
+            raise SolveError("the preconditioner of the stiffness is not positive definite")
         length = np.sqrt(squared)
         images[k], rows[k] = r / length, z / length
         r = multiply(rows[k])
@@ -102,8 +101,7 @@ def process(
         beside[k] = np.sqrt(max(squared, 0.0))
         T = np.diag(diagonal[: k + 1]) + np.diag(beside[:k], 1) + np.diag(beside[:k], -1)
         if not np.isfinite(T).all():
-            message = "the stiffness has entries that are not finite"
-            raise SolveError(message)
+            raise SolveError("the stiffness has entries that are not finite")
         values, vectors = np.linalg.eigh(T)
         found = Ritz(values, beside[k] * np.abs(vectors[-1]))
         if enough(found) or beside[k] <= ROUNDING * np.abs(values).max():

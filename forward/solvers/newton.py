@@ -61,8 +61,7 @@ def _iterate(
     sizes: list[float] = []
     longest, length, first = 0.0, np.inf, 0.0
     if not np.isfinite(residual.size):
-        message = "the starting state has no finite residual"
-        raise Diverged(message)
+        raise Diverged("the starting state has no finite residual")
     for iteration in range(limit + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if converged(system, settings.tolerance, u, residual, sizes):

@@ -50,8 +50,7 @@ def turn(x: FloatArray, R: FloatArray, *, back: bool = False) -> FloatArray:
 def _compiled() -> ctypes.CDLL:
     found = library(Path(__file__).with_suffix(".c").read_text(encoding="utf-8"))
     if found is None:
-        message = "rotations.c cannot be compiled: a C compiler is needed, as for the forms of FEniCSx"
-        raise StopError(message)
+        raise StopError("rotations.c cannot be compiled: a C compiler is needed, as for the forms of FEniCSx")
     long, array = ctypes.c_long, ctypes.c_void_p
     found.rotations.argtypes = [long, array, array, array]
     found.turn.argtypes = [long, array, ctypes.c_int, long, long, array, array]

@@ -41,8 +41,7 @@ class Displacement(Named):
     @model_validator(mode="after")
     def _check(self) -> Displacement:
         if not self.components:
-            message = "prescribes nothing, expected at least one of x, y, z"
-            raise ValueError(message)
+            raise ValueError("prescribes nothing, expected at least one of x, y, z")
         return self
 
 

@@ -61,8 +61,7 @@ def distance(ops: Any, shape: str, t: Any, across: Any, numbers: Mapping[str, An
             ahead = numbers["tip"] * cotangent**2  # of its apex
             return sine * (t - ahead + ops.sqrt(across * cotangent**2 + ahead**2))
         case _:
-            message = f"no tool is shaped like '{shape}'"
-            raise ValueError(message)
+            raise ValueError(f"no tool is shaped like '{shape}'")
 
 
 def energy(ops: Any, gap: Any, stiffness: float, width: float) -> Any:

@@ -250,6 +250,5 @@ def _worth(found: MeshError) -> MeshError:
         If it is worth nothing.
     """
     if not found.nonlinearity < 1:
-        message = "richer elements move the body too far for a few Newton steps: the mesh is much too coarse"
-        raise SolveError(message)
+        raise SolveError("richer elements move the body too far for a few Newton steps: the mesh is much too coarse")
     return found

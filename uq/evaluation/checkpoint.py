@@ -102,8 +102,7 @@ class Checkpoint:
             return False
         objection = self._code.objection(note) if self._code is not None else None
         if objection is not None:
-            message = f"{self._directory}: {objection}"
-            raise ModelError(message)
+            raise ModelError(f"{self._directory}: {objection}")
         return True
 
     def save(self, key: str, block: Evaluations | Block) -> None:
@@ -111,10 +110,9 @@ class Checkpoint:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            message = (
+            raise StopError(
                 f"{self._folder}: cannot be created: {error.strerror}; the same command continues once that is fixed"
-            )
-            raise StopError(message) from None
+            ) from None
         note = "" if self._code is None else self._code.note()
         body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
         _write(self.path(key), body, key)

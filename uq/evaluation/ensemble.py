@@ -81,8 +81,7 @@ class Ensemble:
             If the number of ranks is not a multiple of `ranks_per_model`.
         """
         if world.size % ranks_per_model:
-            message = f"{world.size} ranks cannot be split into groups of ranks_per_model = {ranks_per_model}"
-            raise ValueError(message)
+            raise ValueError(f"{world.size} ranks cannot be split into groups of ranks_per_model = {ranks_per_model}")
         index = world.rank // ranks_per_model
         return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index)
 

@@ -213,8 +213,7 @@ def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:
     sizes = np.abs(evaluations.outputs[evaluations.ok]).max(axis=0, initial=0.0)
     for name, size in zip(names, sizes.tolist(), strict=True):
         if size > LARGEST or (0 < size < 1 / LARGEST and len(evaluations.points) >= MANY):
-            message = (
+            raise ModelError(
                 f"output {name} is of size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}, beyond which "
                 "moments overflow or vanish; use another unit, or its logarithm"
             )
-            raise ModelError(message)

@@ -130,8 +130,7 @@ class Triangular(Bounded):
         """Raise a ValueError if the numbers do not go together."""
         super().check_numbers()
         if not self.lower <= self.mode <= self.upper:
-            message = f"mode = {self.mode:g}, expected a value between lower and upper"
-            raise ValueError(message)
+            raise ValueError(f"mode = {self.mode:g}, expected a value between lower and upper")
 
 
 class Beta(Bounded):

@@ -72,8 +72,7 @@ class Inputs:
                     message = f"correlation of '{name}', of which there are draws: they have correlations of their own"
                     raise ValueError(message)
                 if name not in self.marginals:
-                    message = f"correlation of '{name}', expected one of: {', '.join(self.names)}"
-                    raise ValueError(message)
+                    raise ValueError(f"correlation of '{name}', expected one of: {', '.join(self.names)}")
             if a == b or not -1 < rho < 1:
                 message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
                 raise ValueError(message)
@@ -211,8 +210,7 @@ class Inputs:
             If parameters are given by draws: no smooth map leads there.
         """
         if self.draws is not None:
-            message = f"{', '.join(self.draws.names)}: draws are not a smooth function of normal variables"
-            raise ValueError(message)
+            raise ValueError(f"{', '.join(self.draws.names)}: draws are not a smooth function of normal variables")
         factor = np.linalg.cholesky(self._copula)
         columns = zip(self.marginals.values(), (normals @ factor.T).T, strict=True)
         values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)

@@ -88,8 +88,7 @@ def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
     """
     polynomials, firsts = _table()
     if dimension > len(polynomials):
-        message = f"{dimension} dimensions, expected at most {len(polynomials)} for Sobol' points"
-        raise ValueError(message)
+        raise ValueError(f"{dimension} dimensions, expected at most {len(polynomials)} for Sobol' points")
     found = np.ones((count, dimension), dtype=np.uint64)  # odd numbers m, below 2^(k+1) in row k
     degrees = np.array([int(p).bit_length() - 1 for p in polynomials[:dimension]])
     for degree in np.unique(degrees[1:]):  # the first dimension has all ones

@@ -139,17 +139,15 @@ class Univariate(Settings):
         if np.isfinite(mean) and not (
             max(abs(mean), std) < EXTREME and std > 1 / EXTREME and std < EXTREME * abs(mean or std)
         ):
-            message = (
+            raise ValueError(
                 f"mean {mean:.6g} and standard deviation {std:.3g}: too large, small or wide for double precision, "
                 f"expected numbers between {1 / EXTREME:g} and {EXTREME:g} in their own units"
             )
-            raise ValueError(message)
         if not (np.isfinite(mean) and np.isfinite(std) and std > NARROW * abs(mean)):
-            message = (
+            raise ValueError(
                 f"mean {mean:.6g} and standard deviation {std:.3g}: too narrow for double precision, expected "
                 f"a standard deviation above {NARROW:g} of the mean, or a fixed value in the model"
             )
-            raise ValueError(message)
         return self
 
 
@@ -180,8 +178,7 @@ class Bounded(Univariate):
     def check_numbers(self) -> None:
         """Raise a ValueError if the numbers do not go together."""
         if not self.lower < self.upper:
-            message = f"lower = {self.lower:g} and upper = {self.upper:g}, expected lower < upper"
-            raise ValueError(message)
+            raise ValueError(f"lower = {self.lower:g} and upper = {self.upper:g}, expected lower < upper")
         if not np.isfinite(self.upper - self.lower):
             message = f"lower = {self.lower:g} and upper = {self.upper:g}, expected a range that a number can hold"
             raise ValueError(message)
@@ -225,17 +222,14 @@ class Chaospy(Univariate):
             if isinstance(one, type) and one.__module__.startswith("chaospy.distributions.collection")
         }
         if self.name not in known:
-            message = f"chaospy has no distribution '{self.name}'; {nearest(self.name, sorted(known))}"
-            raise ValueError(message)
+            raise ValueError(f"chaospy has no distribution '{self.name}'; {nearest(self.name, sorted(known))}")
         numbers, wanted = dict(self.model_extra or {}), inspect.signature(known[self.name]).parameters
         for number in numbers:
             if number not in wanted:
-                message = f"chaospy's {self.name} has no number '{number}'; {nearest(number, list(wanted))}"
-                raise ValueError(message)
+                raise ValueError(f"chaospy's {self.name} has no number '{number}'; {nearest(number, list(wanted))}")
         for number, one in wanted.items():
             if one.default is one.empty and number not in numbers:
-                message = f"chaospy's {self.name} needs a number '{number}', expected {', '.join(wanted)}"
-                raise ValueError(message)
+                raise ValueError(f"chaospy's {self.name} needs a number '{number}', expected {', '.join(wanted)}")
         try:
             made = known[self.name](**numbers)
         except Exception as error:
@@ -293,15 +287,13 @@ class Chaospy(Univariate):
             values, slopes = self.from_normal(z)
         off = np.abs(self.cumulative(values) - ndtr(z))
         if not (np.isfinite(values).all() and np.isfinite(slopes).all() and off.max() < SIX_DIGITS):
-            message = f"chaospy's quantiles of this {self.name} are not those of its distribution function"
-            raise ValueError(message)
+            raise ValueError(f"chaospy's quantiles of this {self.name} are not those of its distribution function")
         squares = weights * (values - weights @ values) ** 2
         if squares[np.abs(z) > FAR].sum() > SIX_DIGITS * squares.sum():
-            message = (
+            raise ValueError(
                 f"the tails of this {self.name} are too heavy: its standard deviation rests on what has a "
                 "probability of 1e-12"
             )
-            raise ValueError(message)
 
 
 @cache

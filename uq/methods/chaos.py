@@ -101,10 +101,9 @@ class Chaos(Amount):
         if self.fit == "regression":
             super().check_amount()
         elif self.asked:
-            message = (
+            raise ValueError(
                 "gives samples, tolerance or budget_seconds, expected none: a projection takes (max_order + 2)^d points"
             )
-            raise ValueError(message)
 
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""

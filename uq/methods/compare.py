@@ -82,8 +82,7 @@ class Given(Method):
 
         missing = [name for name in evaluate.outputs if name not in self.values]
         if missing:
-            message = f"the reference gives no values of {', '.join(missing)}, expected those of every output"
-            raise ValueError(message)
+            raise ValueError(f"the reference gives no values of {', '.join(missing)}, expected those of every output")
         values = [self.values[name] for name in evaluate.outputs]
         return xr.Dataset({name: ("output", [getattr(known, name) for known in values]) for name in ESTIMATES})
 
@@ -123,17 +122,14 @@ class Entry(Settings):
             return value
         expected = "expected different numbers of samples, such as [16, 32, 64]"
         if "budgets" not in value:
-            message = f"gives no budgets, {expected}"
-            raise ValueError(message)
+            raise ValueError(f"gives no budgets, {expected}")
         budgets = value["budgets"]
         whole = isinstance(budgets, tuple) and all(isinstance(n, int) and n >= 2 for n in budgets)
         if not (whole and budgets and len(set(budgets)) == len(budgets)):
-            message = f"budgets = {list(budgets) if isinstance(budgets, tuple) else budgets}, {expected}"
-            raise ValueError(message)
+            raise ValueError(f"budgets = {list(budgets) if isinstance(budgets, tuple) else budgets}, {expected}")
         refused = [name for name in _NOT_ITS_OWN if name in value]
         if refused:
-            message = f"gives {' and '.join(refused)}, expected none: a comparison says it for all methods"
-            raise ValueError(message)
+            raise ValueError(f"gives {' and '.join(refused)}, expected none: a comparison says it for all methods")
         own = {name: value[name] for name in ("name", "budgets") if name in value}
         rest = {name: item for name, item in value.items() if name not in own}
         return {**own, "sampling": {**rest, "samples": budgets[0]}}
@@ -145,8 +141,7 @@ class Entry(Settings):
                 self.at(budget)
             except ValidationError as error:
                 reason = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-                message = f"budget {budget}: {reason}"
-                raise ValueError(message) from None
+                raise ValueError(f"budget {budget}: {reason}") from None
         return self
 
     @classmethod
@@ -217,13 +212,11 @@ class Compare(Method):
     @model_validator(mode="after")
     def _check_names(self) -> Compare:
         if not self.methods:
-            message = "gives no methods, expected at least one"
-            raise ValueError(message)
+            raise ValueError("gives no methods, expected at least one")
         names = [entry.label for entry in self.methods]
         for name in dict.fromkeys(names):
             if names.count(name) > 1:
-                message = f"{names.count(name)} methods are called '{name}', expected different names"
-                raise ValueError(message)
+                raise ValueError(f"{names.count(name)} methods are called '{name}', expected different names")
         return self
 
     @property

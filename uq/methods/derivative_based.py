@@ -149,8 +149,7 @@ class DerivativeBased(Amount):
         if objection is not None:
             raise ValueError(objection)
         if not evaluate.differentiable:
-            message = "the model has no derivatives, expected one that has for method.kind = 'derivative-based'"
-            raise ModelError(message)
+            raise ModelError("the model has no derivatives, expected one that has for method.kind = 'derivative-based'")
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         R = self.scrambles
@@ -297,8 +296,7 @@ class _Samples:
         some = ok.any(axis=1)
         if some.sum() < 2:
             reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}"
-            raise SolveError(message)
+            raise SolveError(f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}")
         ok, points = ok[some], self.points[some, :each]
         tangents = np.where(ok[..., None, None], self.tangents[some, :each], 0.0)
         scaled = tangents * self._centre.coordinates.steps(points)[:, :, None, :]

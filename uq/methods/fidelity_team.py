@@ -213,13 +213,11 @@ class Team:
         found = Samples(group, deviations, np.where(inside, self._controls(taken.points), 0.0))
         if found.answered.sum() < 2:
             reasons = "; ".join(sorted(taken.reasons)[:3])
-            message = f"{found.answered.sum()} of {found.count} samples have an answer, expected 2: {reasons}"
-            raise SolveError(message)
+            raise SolveError(f"{found.answered.sum()} of {found.count} samples have an answer, expected 2: {reasons}")
         return found
 
 
 def _known(one: CheapModel, cost: float | None) -> float:
     if cost is None:
-        message = f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`"
-        raise ValueError(message)
+        raise ValueError(f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`")
     return cost

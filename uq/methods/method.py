@@ -71,8 +71,7 @@ class Method(Settings):
         ValueError
             If the method cannot stop at a goal; otherwise as `run`.
         """
-        message = f"method.kind = '{self.kind}' does not stop at a tolerance of all errors"
-        raise ValueError(message)
+        raise ValueError(f"method.kind = '{self.kind}' does not stop at a tolerance of all errors")
 
     @abstractmethod
     def planned(self, dimension: int) -> int:
@@ -188,8 +187,7 @@ class Amount(Method):
     def check_amount(self) -> None:
         """Raise a ValueError if no amount is given."""
         if not self.asked:
-            message = "gives neither samples nor tolerance nor budget_seconds, expected at least one of them"
-            raise ValueError(message)
+            raise ValueError("gives neither samples nor tolerance nor budget_seconds, expected at least one of them")
 
     @property
     def asked(self) -> bool:

@@ -122,8 +122,7 @@ class MonteCarlo(Amount):
     def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
         control = self._control
         if control is not None and not evaluate.differentiable:
-            message = f"the model has no derivatives, expected one that has for method.kind = '{self.kind}'"
-            raise ModelError(message)
+            raise ModelError(f"the model has no derivatives, expected one that has for method.kind = '{self.kind}'")
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         slopes = centre.state_slopes if control and len(centre.slopes) else None
@@ -215,8 +214,7 @@ def _scalar_moments(
     ok = evaluations.ok
     n = int(ok.sum())
     if n < 2:
-        message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {evaluations.why}"
-        raise SolveError(message)
+        raise SolveError(f"{n} of {len(ok)} samples have an answer, expected at least 2: {evaluations.why}")
     values = evaluations.outputs[ok]
     if control is None:
         plain = estimate(monomials(values - centre.outputs, None).sum(axis=1), n, centre.outputs)

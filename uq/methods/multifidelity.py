@@ -104,16 +104,13 @@ class Multifidelity(Amount):
         labels = [one.label for one in self.cheap]
         for label in dict.fromkeys(labels):
             if labels.count(label) > 1:
-                message = f"{labels.count(label)} cheap models are called '{label}', expected different names"
-                raise ValueError(message)
+                raise ValueError(f"{labels.count(label)} cheap models are called '{label}', expected different names")
             if label == OWN_LABEL or label.startswith(MESH):
-                message = f"a cheap model is called '{label}', expected another name"
-                raise ValueError(message)
+                raise ValueError(f"a cheap model is called '{label}', expected another name")
         if self.full_solves == "differences" and len(self.cheap) < 2:
             raise ValueError("full_solves = 'differences' with a single cheap model, expected two or more")
         if self.samples is not None and self.samples <= self.first:
-            message = f"samples = {self.samples}, expected more than the {self.first} of the pilot"
-            raise ValueError(message)
+            raise ValueError(f"samples = {self.samples}, expected more than the {self.first} of the pilot")
         return self
 
     @property

@@ -79,8 +79,7 @@ class MultilevelMonteCarlo(Amount):
     @model_validator(mode="after")
     def _check_pilot(self) -> MultilevelMonteCarlo:
         if self.samples is not None and self.samples < self.pilot:
-            message = f"samples = {self.samples}, expected at least pilot = {self.pilot}"
-            raise ValueError(message)
+            raise ValueError(f"samples = {self.samples}, expected at least pilot = {self.pilot}")
         return self
 
     def planned(self, dimension: int) -> int:

@@ -93,8 +93,7 @@ class QuasiMonteCarlo(MonteCarlo):
             message = f"scrambles = {R}, expected at least 4 for coefficient = 'optimal', which is fitted to them"
             raise ValueError(message)
         if self.control_samples is not None and self.control != "chaos":
-            message = f"control_samples = {self.control_samples}, expected none for control = '{self.control}'"
-            raise ValueError(message)
+            raise ValueError(f"control_samples = {self.control_samples}, expected none for control = '{self.control}'")
         return self
 
     @property
@@ -217,8 +216,7 @@ class QuasiMonteCarlo(MonteCarlo):
         try:
             return fit_deviations(inputs, evaluate, centre, points, ORDER, fields=self.fields)
         except SolveError as error:
-            message = f"control = 'chaos': {error.reason}"
-            raise SolveError(message, error.history) from None
+            raise SolveError(f"control = 'chaos': {error.reason}", error.history) from None
 
     def _dataset(
         self,

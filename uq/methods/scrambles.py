@@ -214,8 +214,7 @@ class Scrambles:
         if not self.usable(each):
             answers = int(self.ok[:, :each].any(axis=1).sum())
             reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"{answers} of {self.scrambles} scrambles have an answer, expected more: {reasons}"
-            raise SolveError(message)
+            raise SolveError(f"{answers} of {self.scrambles} scrambles have an answer, expected more: {reasons}")
         found, hidden = self._estimated(each, self._controls(each))
         if self._fitted is None:  # Taylor polynomials of a low order have little far out
             return found

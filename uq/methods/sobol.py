@@ -95,16 +95,14 @@ class Sobol(Amount):
         """Raise a ValueError if design, amount and source are inconsistent."""
         if self.design == "given-data":
             if self.source is None or self.asked:
-                message = (
+                raise ValueError(
                     "expected source, the results to take, and neither samples nor tolerance nor budget_seconds with "
                     "design = 'given-data'"
                 )
-                raise ValueError(message)
             return
         super().check_amount()
         if self.source is not None:
-            message = f"source = '{self.source}', expected design = 'given-data' with it"
-            raise ValueError(message)
+            raise ValueError(f"source = '{self.source}', expected design = 'given-data' with it")
         if self.design == "saltelli":
             check_scrambles(self.samples, self.scrambles)
 
@@ -249,11 +247,10 @@ class Sobol(Amount):
         centre = linearise(inputs, evaluate)
         theirs = source["nominal"].to_numpy()
         if not np.allclose(theirs, centre.outputs, rtol=SAME, atol=SAME * np.abs(theirs).max()):
-            message = (
+            raise FileNotFoundError(
                 f"{self.source}: holds results of another model (at the mean parameters {theirs.tolist()}, here "
                 f"{centre.outputs.tolist()}), expected those of the model of this study"
             )
-            raise FileNotFoundError(message)
         dataset = source.drop_vars([name for name in ("node_position", "cell_nodes", "unit") if name in source])
         dataset.attrs = {
             "stopped": f"from the results of {Path(str(self.source)).name}: {source.attrs.get('stopped', 'samples')}"
@@ -331,8 +328,7 @@ def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evalua
         and np.allclose(source["parameter_std"], inputs.std, rtol=1e-10, atol=0)
         and all(ours[name] == value for name, value in written.items())  # coefficients of fields are not written
     ):
-        message = f"{directory}: holds results of other distributions, expected those of this study"
-        raise FileNotFoundError(message)
+        raise FileNotFoundError(f"{directory}: holds results of other distributions, expected those of this study")
     return source
 
 

@@ -229,8 +229,7 @@ class Rows:
         some = self._usable(each)
         if some.sum() < 2:
             reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"{some.sum()} of {len(some)} parts have a row of answers, expected more: {reasons}"
-            raise SolveError(message)
+            raise SolveError(f"{some.sum()} of {len(some)} parts have a row of answers, expected more: {reasons}")
         ok = self._cut(self.ok, each)[some]
         deviations = self._cut(self.outputs, each)[some] - self._centre.outputs
         values = np.where(ok[..., None, None], deviations, 0.0)

@@ -57,8 +57,7 @@ class Expansion:
             If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
         """
         if "multi_index" not in results:
-            message = "these results hold no expansion, expected results of method.kind = 'chaos'"
-            raise ValueError(message)
+            raise ValueError("these results hold no expansion, expected results of method.kind = 'chaos'")
         arrays = {str(name): variable.to_numpy() for name, variable in results.data_vars.items()}
         d, joint = len(arrays["coordinate_mean"]), None
         if "joint_index" in arrays:
@@ -105,15 +104,13 @@ class Expansion:
             If the field was not expanded.
         """
         if self.fields is None:
-            message = "the field was not expanded, expected a study with method.fields = true"
-            raise ValueError(message)
+            raise ValueError("the field was not expanded, expected a study with method.fields = true")
         return np.asarray(np.tensordot(self.basis.values(self._checked(points)), self.fields, axes=1))
 
     def _checked(self, points: FloatArray) -> FloatArray:
         points = np.asarray(points, dtype=float)
         if points.ndim != 2 or points.shape[1] != len(self.parameters):
-            message = f"points of shape {points.shape}, expected (n, {len(self.parameters)})"
-            raise ValueError(message)
+            raise ValueError(f"points of shape {points.shape}, expected (n, {len(self.parameters)})")
         slack = 1e-12 * (self.upper - self.lower)
         outside = ((points < self.lower - slack) | (points > self.upper + slack)).any(axis=0)
         if outside.any() and not self._told:

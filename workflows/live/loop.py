@@ -345,8 +345,7 @@ class Loop:
         names = self._data.parameters
         for path in values:
             if path not in names:
-                message = f"'{path}' is not a parameter, expected one of: {', '.join(names)}"
-                raise _UnknownError(message)
+                raise _UnknownError(f"'{path}' is not a parameter, expected one of: {', '.join(names)}")
         self._now = self._now.copy()
         for path, value in values.items():
             self._now[names.index(path)] = value
@@ -444,8 +443,7 @@ def listen(host: str, port: int, option: str) -> socket.socket:
     except (OSError, OverflowError) as error:
         number = getattr(error, "errno", None) or 0
         reason = os.strerror(number) if number > 0 else error
-        message = f"{option} {port}: cannot be used on {host}: {reason}"
-        raise StudyError(message) from None
+        raise StudyError(f"{option} {port}: cannot be used on {host}: {reason}") from None
 
 
 def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False, secret: bool = True) -> None:

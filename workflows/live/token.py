@@ -42,8 +42,7 @@ def kept() -> str:
         message = f"{path}: the token of `tissuq live` cannot be kept there: {reason}; --no-token does without"
         raise StudyError(message) from None
     if len(word) < BYTES:
-        message = f"{path}: is no token of `tissuq live`; delete it, and another one is made"
-        raise StudyError(message)
+        raise StudyError(f"{path}: is no token of `tissuq live`; delete it, and another one is made")
     return word
 
 

@@ -42,10 +42,9 @@ def cache_folder() -> Path:
     try:
         _CACHE.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        message = (
+        raise StopError(
             f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
-        )
-        raise StopError(message) from None
+        ) from None
     return _CACHE
 
 

@@ -272,17 +272,14 @@ class DirectSolver:
         needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
         self._renew()  # or else PETSc would report this failure for ever
         if status == SINGULAR:
-            message = "the stiffness is singular"
-            raise SolveError(message)
+            raise SolveError("the stiffness is singular")
         if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
             have = headroom()
-            message = (
+            raise StopError(
                 f"memory ran out: the factor of the stiffness of {unknowns:,} unknowns needs {needed:,} MiB"
                 f"{' on one rank' if ranks > 1 else ''}, {have}"
             )
-            raise StopError(message)
-        message = f"the factorisation failed (MUMPS error {status})"
-        raise SolveError(message)
+        raise SolveError(f"the factorisation failed (MUMPS error {status})")
 
     def _try(self) -> int:
         """Factorise; return MUMPS's status, negative if it failed."""

@@ -74,8 +74,7 @@ class MultigridSolver:
 
         bound = self._total(np.array([0.0 if np.isfinite(blocks).all() else 1.0]))[0]
         if bound:
-            message = "a block on the diagonal of the stiffness is singular or not finite"
-            raise SolveError(message)
+            raise SolveError("a block on the diagonal of the stiffness is singular or not finite")
         largest = MARGIN * multigrid.largest_eigenvalue(self._multiply, smooth, self._random, self._total)
         self._levels = Levels(self._multiply, smooth, self._on_coarse, self._total, largest)
 
@@ -131,8 +130,7 @@ class MultigridSolver:
         else:
             x, converged = self._minimised(levels, free, tolerance, transpose=transpose)
         if not converged:
-            message = f"the linear solver did not converge to {tolerance:g}"
-            raise NoConvergence(message)
+            raise NoConvergence(f"the linear solver did not converge to {tolerance:g}")
         x[self._fixed] = right[self._fixed]
         return x
 
@@ -169,8 +167,7 @@ class MultigridSolver:
         levels, size = self._levels, self._stiffness.matrix.getSize()[0]
         found = finish(negative_eigenvalues(levels.multiply, self._random, self._total, size), levels.cycle)
         if found is None:
-            message = "the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero"
-            raise NoConvergence(message)
+            raise NoConvergence("the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero")
         return found
 
     def memory(self) -> int:
