@@ -100,11 +100,13 @@ class _SixSided(Settings):
         if not self.grading:
             return self.shaped(points)
         axes = zip(points.T, self.meshed, AXES, strict=True)
-        moved = [
-            length * _graded(x / length, *(self.grading.get(f"{axis}-{end}", 1.0) for end in ("min", "max")))  # type: ignore[call-overload]
-            for x, length, axis in axes
-        ]
+        moved = [length * _graded(x / length, *self._grades(axis)) for x, length, axis in axes]
         return self.shaped(np.column_stack(moved))
+
+    def _grades(self, axis: str) -> tuple[float, float]:
+        """How many times thinner cells are at the ends of an axis."""
+        given = {str(face): value for face, value in self.grading.items()}
+        return given.get(f"{axis}-min", 1.0), given.get(f"{axis}-max", 1.0)
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
         """Return the same body with so many times the cells along each edge, graded to some faces and those beside.
@@ -121,7 +123,7 @@ class _SixSided(Settings):
         for face in self.boundaries:
             rims = any(face[0] != other[0] for other in towards)
             least = grading if face in towards else beside if rims else 1.0
-            graded[face] = max(least, self.grading.get(face, 1.0))  # type: ignore[call-overload]
+            graded[face] = max(least, self._grades(face[0])[face.endswith("max")])
         return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
 
     def with_cells(self, times: float, kept: Collection[Axis] = ()) -> Self:
@@ -205,8 +207,7 @@ class _SixSided(Settings):
         corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
         edges = []
         for a, n in enumerate(self.cells):
-            ends = (self.grading.get(f"{AXES[a]}-{end}", 1.0) for end in ("min", "max"))  # type: ignore[call-overload]
-            share = np.diff(_graded(np.linspace(0, 1, n + 1), *ends)).max()
+            share = np.diff(_graded(np.linspace(0, 1, n + 1), *self._grades(AXES[a]))).max()
             edges.append(np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() * share)
         return float(max(edges))
 

@@ -21,7 +21,7 @@ from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 from forward.model import ModelError
 
@@ -247,8 +247,9 @@ def imported(module: str) -> ModuleType:
     OwnCodeError
         If it may not be imported here.
     """
-    if refused(module):
-        cast("list[str]", _refused.get()).append(module)
+    refusals = _refused.get()
+    if refusals is not None and refused(module):
+        refusals.append(module)
         raise OwnCodeError(f"'{module}' is not installed, and code from beside a study runs with --code alone")
     importlib.invalidate_caches()
     now = sources([module]).files

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ Coefficient = Literal["one", "optimal"]
 SecondMoment = Literal["quadratic", "linear"]
 
 ESTIMATES = ("mean", "mean_error", "std", "std_error")
+Variables = dict[str, tuple[tuple[str, ...], Any]]
 ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
 MORE = 0.5  # over n − 1: relative increase of the scatter of n samples from which a control is dropped
@@ -74,6 +75,10 @@ class Estimates:
     std_error: FloatArray
     coefficient: FloatArray
     second_coefficient: FloatArray
+
+    def variables(self, *names: str) -> Variables:
+        """Return these by output, as variables of results; by default all four estimates."""
+        return {name: (("output",), getattr(self, name)) for name in names or ESTIMATES}
 
     @property
     def relative_error(self) -> FloatArray:
@@ -393,6 +398,13 @@ def either(which: NDArray[np.bool_], first: Estimates, second: Estimates) -> Est
     """Return the first of two estimates where `which` says so, the second elsewhere."""
     names = [one.name for one in fields(Estimates)]
     return Estimates(*(np.where(which, getattr(first, name), getattr(second, name)) for name in names))
+
+
+def running(rounds: Iterable[Estimates]) -> Variables:
+    """Return means and their errors, round by round, as variables of results."""
+    means, errors = zip(*((one.mean, one.mean_error) for one in rounds), strict=True)
+    by = ("round", "output")
+    return {"running_mean": (by, np.array(means)), "running_mean_error": (by, np.array(errors))}
 
 
 def _scatter(values: FloatArray) -> FloatArray:

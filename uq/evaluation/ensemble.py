@@ -202,7 +202,8 @@ class Ensemble:
     def told(self, order: O) -> O:
         """Return what rank 0 says, for which the others may wait long; collective."""
         gather_here(self.world)
-        return cast("O", self.world.bcast(order))
+        told: O = self.world.bcast(order)
+        return told
 
 
 def _told_to_others(error: Exception) -> Exception:

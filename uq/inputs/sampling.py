@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,3 +136,8 @@ def check_scrambles(samples: int | None, scrambles: int) -> None:
         nearest = f"{below} or {2 * below}" if samples > scrambles else str(scrambles)
         message = f"samples = {samples}, expected scrambles = {scrambles} times a power of two, such as {nearest}"
         raise ValueError(message)
+
+
+def in_order(values: NDArray[Any]) -> NDArray[Any]:
+    """Flatten (R, n, …) of scrambles to (n R, …), first points of all of them first: a shorter study is a prefix."""
+    return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])

@@ -317,8 +317,7 @@ class Compare(Method):
                 trials[i].append(trial_of(entry.at(budget, _seed(self.seed, r)), inputs, memory))
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
         dataset = dataset.assign(_compared(rows, trials, reference, floors))
-        names = list(dict.fromkeys(dataset["row_method"].to_numpy().tolist()))
-        dataset = dataset.assign_coords(estimator=names)
+        dataset = dataset.assign_coords(estimator=list(dict.fromkeys(dataset["row_method"].to_numpy().tolist())))
         budgets = f"{len(self.methods)} methods at {len(rows)} budgets"
         dataset.attrs["stopped"] = f"{budgets} in all, {self.repeats} repeats of each, as asked"
         add(dataset, *_doubts(rows, trials))

@@ -30,13 +30,12 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
-from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates
+from uq.estimators.moments import Estimates, estimate_from_replicates, running
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
@@ -54,7 +53,7 @@ from uq.inputs.distributions import (
     Uniform,
 )
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
+from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
 from uq.inputs.univariate import Chaospy
 from uq.methods.method import Amount
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
@@ -369,14 +368,10 @@ class _Samples:
         first, second = (one[ok] for one in self._controlled(each))
         return counted(found, self._inputs, self.outputs[:, :each][ok], (first, second))
 
-    def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        """Flatten (R, n, …) to (n R, …), first points of all scrambles first: a shorter study is a prefix."""
-        return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
-
     def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
         """Return all estimates as labelled arrays."""
         method, inputs = self._method, self._inputs
-        points, values, ok = (self._in_order(a) for a in (self.points, self.outputs, self.ok))
+        points, values, ok = (in_order(a) for a in (self.points, self.outputs, self.ok))
         scramble = np.tile(np.arange(method.scrambles), self.each)
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], method.quantiles)
         rounds = [1 << k for k in range(self.each.bit_length()) if self.ok[:, : 1 << k].any(axis=1).sum() > 1]
@@ -387,16 +382,13 @@ class _Samples:
         dataset = local_dataset(inputs, self._evaluate, self._centre, fields=method.fields)
         dataset = dataset.assign_coords(quantile=list(method.quantiles), round=list(moments)).assign(
             {
-                **{name: (("output",), getattr(last, name)) for name in ESTIMATES},
+                **last.variables(),
                 **of_quantiles.variables,
                 "points": (("sample", "parameter"), points),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),
                 "scramble": (("sample",), scramble),
-                **{
-                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for e in moments.values()]))
-                    for name in ("mean", "mean_error")
-                },
+                **running(moments.values()),
                 "poincare": (("parameter",), np.where(logarithmic, self._constants[1], self._constants[0])),
                 "local_share": (("output", "parameter"), shares(local, local.sum(axis=1, keepdims=True))),
                 **{
@@ -408,7 +400,7 @@ class _Samples:
         wanted = len(inputs.names) <= FULL if method.indices is None else method.indices
         if wanted:
             with suppress(SolveError):  # of too few samples for an expansion: the bounds stand alone
-                regression = Regression.of(inputs, points[ok], values[ok], self._in_order(self.tangents)[ok], ORDER)
+                regression = Regression.of(inputs, points[ok], values[ok], in_order(self.tangents)[ok], ORDER)
                 estimates = regression.estimates()
                 for name in ("sobol_first", "sobol_total"):
                     for end in ("", "_error"):

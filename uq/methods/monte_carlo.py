@@ -262,10 +262,9 @@ def _dataset(
     of_quantiles = quantiles(evaluations.outputs[ok], method.quantiles)
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
     dataset = dataset.assign_coords(quantile=list(method.quantiles))
-    by_output = ("output",)
     dataset = dataset.assign(
         {
-            **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
+            **scalars.variables(),
             **of_quantiles.variables,
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
@@ -273,12 +272,11 @@ def _dataset(
         }
     )
     if control is not None:
-        gains = ("variance_ratio", "std_variance_ratio", "coefficient")
         plain = _scalar_moments(evaluations, inputs, centre, None)
         dataset = dataset.assign(
             {
-                **{name: (by_output, getattr(scalars, name)) for name in gains},
-                **{f"plain_{name}": (by_output, getattr(plain, name)) for name in ESTIMATES},
+                **scalars.variables("variance_ratio", "std_variance_ratio", "coefficient"),
+                **{f"plain_{name}": found for name, found in plain.variables().items()},
             }
         )
     if evaluations.fields.size:

@@ -23,7 +23,6 @@ from forward.findings import Finding
 from forward.model import FloatArray, ModelError
 from forward.registry import OfKind
 from uq.estimators.fidelities import Found, correlations
-from uq.estimators.moments import ESTIMATES
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN, Evaluate
 from uq.findings import add
@@ -252,7 +251,7 @@ def described(
     dataset = dataset.assign_coords(fidelity=[one.label for one in team.members], group=np.arange(len(blocks)))
     dataset = dataset.assign(
         {
-            **{name: (by_output, getattr(estimates, name)) for name in ESTIMATES},
+            **estimates.variables(),
             "fidelity_cost": (fidelity, np.array([one.cost for one in team.members])),
             "fidelity_samples": (fidelity, sizes_of @ inside),
             "fidelity_nominal": (("output", "fidelity"), np.array([m.centre.outputs for m in team.members]).T),

@@ -17,7 +17,6 @@ from forward.model import FloatArray, ModelError
 from uq.estimators.doubts import of_differences, of_tails
 from uq.estimators.estimate import part
 from uq.estimators.moments import (
-    ESTIMATES,
     ratio,
 )
 from uq.evaluation.evaluate import Recorder
@@ -189,7 +188,7 @@ class MultilevelMonteCarlo(Amount):
         consistency, shares = found.consistency, ratio(plain[1:], np.array([s.std**2 for s in single[1:]]))
         dataset = dataset.assign_coords(level=np.arange(len(meshes))).assign(
             {
-                **{name: (by_output, getattr(found.estimates, name)) for name in ESTIMATES},
+                **found.estimates.variables(),
                 "bias_error": (by_output, found.bias_error),
                 part("mean", "total"): (by_output, found.total_error),
                 "std_bias_error": (by_output, found.std_bias_error),

@@ -23,7 +23,7 @@ from pydantic import Field
 
 from forward.model import WORK, FloatArray
 from uq.estimators.indices import coefficient_moments
-from uq.estimators.moments import Moments, estimate, monomials, ratio
+from uq.estimators.moments import ESTIMATES, Moments, estimate, monomials, ratio
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request, Start
 from uq.inputs.random_parameters import Inputs
@@ -195,8 +195,8 @@ class MultilevelChaos(Amount):
         dataset = expansion_dataset(evaluate, expanded, self.seed, self.quantiles, further, fields=self.fields)
         return dataset.assign(_by_level(levels)).assign(
             {
-                f"control_{name}": (("output",), getattr(controlled, name))
-                for name in ("mean", "mean_error", "std", "std_error", "variance_ratio")
+                f"control_{name}": variable
+                for name, variable in controlled.variables(*ESTIMATES, "variance_ratio").items()
             },
         )
 

@@ -15,14 +15,14 @@ from pydantic import Field, model_validator
 
 from forward.model import ModelError, SolveError
 from uq.estimators.doubts import of_control, of_tails
-from uq.estimators.moments import ESTIMATES, Coefficient, Estimates, estimate, monomials, ratio, student
+from uq.estimators.moments import Coefficient, Estimates, estimate, monomials, ratio, running, student
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
+from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.methods.scrambles import Scrambles
 from uq.surrogates.basis import FULL, ROWS_PER_TERM
@@ -229,29 +229,24 @@ class QuasiMonteCarlo(MonteCarlo):
         *,
         as_asked: bool,
     ) -> xr.Dataset:
-        values, ok, scramble = samples.in_order(samples.outputs), samples.in_order(samples.ok), samples.scramble
+        values, ok, scramble = in_order(samples.outputs), in_order(samples.ok), samples.scramble
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
         # What plain Monte Carlo would claim from as many independent samples.
         plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
         plain = counted(plain, inputs, values[ok])
-        running = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
+        rounds = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
-        dataset = dataset.assign_coords(
-            quantile=list(self.quantiles), round=[samples.scrambles * n for n, _ in running]
-        )
+        dataset = dataset.assign_coords(quantile=list(self.quantiles), round=[samples.scrambles * n for n, _ in rounds])
         dataset = dataset.assign(
             {
-                **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
+                **scalars.variables(),
                 **of_quantiles.variables,
-                "points": (("sample", "parameter"), samples.in_order(samples.points)),
+                "points": (("sample", "parameter"), in_order(samples.points)),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),
                 "scramble": (("sample",), scramble),
-                **{
-                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for _, e in running]))
-                    for name in ("mean", "mean_error")
-                },
+                **running(found for _, found in rounds),
                 "variance_ratio": (by_output, ratio(plain.mean_error**2, scalars.mean_error**2, empty=1.0)),
                 "std_variance_ratio": (by_output, ratio(plain.std_error**2, scalars.std_error**2, empty=1.0)),
             }

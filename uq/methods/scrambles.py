@@ -153,10 +153,6 @@ class Scrambles:
         """Scramble (R n,) of each sample in the order of results."""
         return np.tile(np.arange(self.scrambles), self.each)
 
-    def in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        """Flatten (R, n, …) to (R n, …), first points of all scrambles first: a shorter study is a prefix."""
-        return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
-
     def extend(self, each: int, scrambles: int | None = None) -> None:
         """Go on to `each` points in every scramble, of which there may be more from now on."""
         R, more = self.scrambles, (scrambles or self.scrambles) - self.scrambles

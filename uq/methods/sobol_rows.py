@@ -32,7 +32,7 @@ from uq.estimators.indices import (
     partial_variances,
     shares,
 )
-from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates
+from uq.estimators.moments import Estimates, estimate_from_replicates, running
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.request import Evaluate, Evaluations, Request
@@ -216,7 +216,7 @@ class Rows:
         self._reasons |= {failure.reason for failure in found.failures}
         return found
 
-    def _cut(self, values: NDArray, each: int) -> NDArray:  # type: ignore[type-arg]
+    def _cut(self, values: NDArray[Any], each: int) -> NDArray[Any]:
         """Return the first rows in parts of `each` (R, each, …)."""
         return values[: self._parts * each].reshape(self._parts, each, *values.shape[1:])
 
@@ -300,25 +300,22 @@ class Rows:
         of_quantiles = quantiles_from_replicates(values[independent], part[independent], design.quantiles)
         rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
         moments = {each: self._moments(each) for each in rounds}
-        running = {each * self._parts * K: self.indices(each) for each in rounds}
+        indices = {each * self._parts * K: self.indices(each) for each in rounds}
         of_field, doubts = self.field()
         dataset = local_dataset(self._inputs, self._evaluate, centre, fields=design.fields)
         dataset = dataset.assign_coords(
-            quantile=list(design.quantiles), round=list(running), index_round=list(running)
+            quantile=list(design.quantiles), round=list(indices), index_round=list(indices)
         ).assign(
             {
-                **{name: (("output",), getattr(moments[self.each], name)) for name in ESTIMATES},
+                **moments[self.each].variables(),
                 **of_quantiles.variables,
                 **by_output(found),
                 "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), answered),
                 "scramble": (("sample",), part),
-                **{
-                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for e in moments.values()]))
-                    for name in ("mean", "mean_error")
-                },
-                **by_round(running),
+                **running(moments.values()),
+                **by_round(indices),
                 **of_field,
             }
         )
