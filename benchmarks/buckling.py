@@ -223,7 +223,7 @@ def samples(case: Problem, count: int, seed: int = 0) -> list[Sample]:
             pass
         else:
             negative, lowest = dense_inertia(accepting, state, point)
-            seen = screened(strict.take_reference(reference), strict, state, point)
+            seen = screened(strict.reference.at(reference), strict, state, point)
         try:
             solution = strict.solve(point, guess(point))
         except SolveError as error:
@@ -291,7 +291,7 @@ def costs(count: int = 30) -> None:
             reference = guess(beam.inputs.mean).reference
             begin = time.process_time()
             if solver != "newton":
-                model.take_reference(reference)
+                model.reference.at(reference)
                 if k == 1:
                     model.reference.prepare_screen()
             ready[k] = time.process_time() - begin

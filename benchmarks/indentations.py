@@ -140,7 +140,7 @@ class Kind:
         return record | {"verdict": "; ".join(wrong) if wrong else VERIFIED}
 
     def _wrong(self, found: Any, record: dict[str, Any]) -> Any:
-        equations = self.model.visit(found)
+        equations = found.visit()
         numbers = {name.rpartition(".")[2]: value for name, value in zip(self.names, found.parameters, strict=True)}
         own = {name: value for name, value in numbers.items() if name in self.tool.scalars}
         pushed, held = found.outputs[:3], found.outputs[3:]

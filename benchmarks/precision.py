@@ -43,7 +43,7 @@ def _measured(size: float, precision: str, samples: int) -> tuple[np.ndarray, np
     points = study.inputs.points(random_points(1, 0, samples, len(study.inputs.names)))
     reference = start(points[0]).reference
     assert reference is not None
-    factor = model.take_reference(reference)
+    factor = model.reference.at(reference)
     solver: Any = factor._solver
     factorisation = _milliseconds(solver.factorise, 1)
     rights = np.random.default_rng(0).standard_normal((max(TOGETHER), model.equations.size))
@@ -53,7 +53,7 @@ def _measured(size: float, precision: str, samples: int) -> tuple[np.ndarray, np
     begin = time.process_time()
     found: list[Any] = list(model.solve_many(points, map(start, points)))
     sample = (time.process_time() - begin) / samples * 1e3
-    model.take_reference(reference).slopes()
+    model.reference.at(reference).slopes()
     begin = time.process_time()
     tangents = np.array([one.tangent(np.eye(len(study.inputs.names))) for one in found[:REPEATS]])
     of_tangents = (time.process_time() - begin) / REPEATS * 1e3

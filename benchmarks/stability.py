@@ -282,7 +282,7 @@ def run(case: Case) -> Row:
     if along is not None:
         path = float(np.linalg.norm(along.state - solution.state) / np.linalg.norm(along.state))
         if path > SAME:
-            there = negatives(other.linearise(along), along.state)
+            there = negatives(along.linearise(), along.state)
             note = f"small steps lead elsewhere: {there} negative eigenvalues there"
     refuted = {
         "J ≤ 0": not row.smallest_jacobian > 0,
@@ -326,7 +326,7 @@ def inspect(
     check.set_parameters(point)
     check.at_load(1.0)
     residual = check.residual(solution.state)
-    equations = model.linearise(solution)
+    equations = solution.linearise()
     correction = equations.norm(equations.back_substitute(-residual.vector)) / equations.norm(solution.state)
     seen = replace(
         row,

@@ -275,7 +275,7 @@ def _indicators(
     open_ones = relative > spec.adapt.tolerance
     chosen = named[open_ones] if open_ones.any() else known
     if spec.adapt.indicator == "recovery" or not len(chosen):  # of a mesh too coarse for estimates, stresses tell
-        equations = model.visit(solution)
+        equations = solution.visit()
         stresses = _by_cell(model, equations.stresses_at_vertices())
         corners = _by_cell(model, meshes.corners_as_given(equations.mesh))  # in the order of those stresses
         if stresses is None or corners is None or mesh is None:

@@ -198,7 +198,7 @@ class FinerMesh:
         there = _moved(self._model.enriched.equations, other.equations, richer)
         start = other.equations.layout.scatter(there[:1])[0]
         near = ReferenceSolution(parameters, start)
-        if other.take_reference(near).indefinite():
+        if other.reference.at(near).indefinite():
             return self._tested, self._tested.solve(parameters, Guess(start)), there
         return other, other.solve(parameters, Guess(start, near)), there
 

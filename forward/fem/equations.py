@@ -117,7 +117,10 @@ class Discretisation(Linearisation):
         return {load.label: -ranks.smallest(self.comm, float(gaps().min(initial=0.0))) for load, gaps in self._gaps}
 
     def stressed(self) -> FloatArray | None:
-        """Stresses (Pa) and strains (2, N, 6) at all nodes, as of `FiniteElementSolution`; collective."""
+        """Cauchy stresses (Pa) and Green–Lagrange strains (2, N, 6) at all nodes in canonical order; collective.
+
+        On the first rank only. Components xx, yy, zz, xy, yz, xz; averages over the cells that meet at a node.
+        """
         rows = np.zeros((4, self.size))  # as parts of states, which have three numbers at a node
         found = self.stresses_at_nodes().reshape(4, 3, -1)
         rows[:, : found[0].size] = np.moveaxis(found, 1, 2).reshape(4, -1)

@@ -232,13 +232,9 @@ class HistorySolution:
         model.equations.work = self.work
         return model.equations
 
-    def touched(self) -> dict[str, FloatArray]:
-        """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
-        return self._visit(len(self.passed) - 1).touched()
-
-    def stressed(self) -> FloatArray | None:
-        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
-        return self._visit(len(self.passed) - 1).stressed()
+    def visit(self) -> Discretisation:
+        """Return the equations, set to the last step."""
+        return self._visit(len(self.passed) - 1)
 
     def _linearise(self, i: int) -> Discretisation:
         """The same, with the factor of the stiffness there."""

@@ -30,7 +30,6 @@ from forward.model import (
     ReferenceSolution,
     Solution,
     SolveError,
-    Stability,
     Work,
 )
 from forward.solvers.equilibrium import solve, solving
@@ -299,40 +298,3 @@ class HyperelasticModel(OneByOne):
                     "too sharp, or its depth too small, for the mesh; refine the mesh there"
                 )
                 raise SolveError(message, work=equations.work)
-
-    def visit(self, solution: FiniteElementSolution) -> Discretisation:
-        """Set parameters and state to those of a solution, unless they are already."""
-        equations = self.equations
-        if equations.latest.solution is not solution:
-            equations.set_parameters(solution.parameters, solution.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(solution.state)
-            equations.latest.solution = solution
-        equations.work = solution.work
-        return equations
-
-    def linearise(self, solution: FiniteElementSolution) -> Discretisation:
-        """Factorise the stiffness at a solution, unless the current factor is its own."""
-        equations = self.visit(solution)
-        if equations.latest.factorised is not solution:
-            equations.factorise(solution.state)
-            equations.latest.factorised = solution
-            if solution.stability == Stability.SCREENED and equations.symmetric:
-                negative = equations.inertia()
-                if negative is not None and negative > 0:
-                    message = (
-                        f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
-                        "derivative has shown: the body buckles, or its mesh is too coarse"
-                    )
-                    raise SolveError(message, work=solution.work, stability=Stability.MISSED)
-                solution.stability = Stability.COUNTED
-        return equations
-
-    def has_factor(self, solution: FiniteElementSolution) -> bool:
-        """Whether the current factor is that of a solution."""
-        return self.equations.latest.factorised is solution
-
-    def take_reference(self, reference: ReferenceSolution) -> ReferenceFactor:
-        """Return the factor at a reference; this may change parameters and state."""
-        self.reference.prepare(reference)
-        return self.reference

@@ -146,13 +146,9 @@ class PathSolution(JoinedSolution):
     solutions: tuple[StepSolution, ...]
     body: HyperelasticModel
 
-    def touched(self) -> dict[str, FloatArray]:
-        """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
-        return self.solutions[-1].solution.touched()
-
-    def stressed(self) -> FloatArray | None:
-        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
-        return self.solutions[-1].solution.stressed()
+    def visit(self) -> Discretisation:
+        """Return the equations, set to the last step."""
+        return self.solutions[-1].solution.visit()
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh, step by step on one finer mesh; collective."""

@@ -39,6 +39,11 @@ class ReferenceFactor:
         self._random: FloatArray | None = None  # forces that Lanczos' process begins with
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
 
+    def at(self, reference: ReferenceSolution) -> ReferenceFactor:
+        """Return the factor at a reference; this may change parameters and state."""
+        self.prepare(reference)
+        return self
+
     def prepare(self, reference: ReferenceSolution) -> bool:
         """Factorise at a reference, unless the current factor is its own; this changes parameters and state.
 

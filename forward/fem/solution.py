@@ -19,7 +19,7 @@ from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.fem.reference import WayFromReference
 from forward.fem.saturation import factors, typical
-from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Work
+from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
 from forward.registry import named
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
@@ -58,7 +58,7 @@ class FiniteElementSolution:
             array.flags.writeable = False
         self.reference = None if way is None else way.reference
         self._rotation = None if way is None else way.rotation
-        model.visit(self)
+        self.visit()
         outputs = np.array([f.value() for f in model.functionals])
         self.outputs = self._seen(model.equations, self.state, lambda: outputs)
         self.outputs.flags.writeable = False
@@ -76,31 +76,54 @@ class FiniteElementSolution:
         loads, of_outputs = rows.apart(self._model.equations, weights, len(self._model.functionals))
         return (loads + of_outputs @ self._gradients, of_outputs) if rows.of_outputs else (loads, None)
 
-    def touched(self) -> dict[str, FloatArray]:
-        """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices under each tool; collective."""
-        return self._model.visit(self).touched()
+    def visit(self) -> Discretisation:
+        """Return the equations, set to parameters and state of this solution."""
+        equations = self._model.equations
+        if equations.latest.solution is not self:
+            equations.set_parameters(self.parameters, self.stiffer)
+            equations.at_load(1.0)
+            equations.set_state(self.state)
+            equations.latest.solution = self
+        equations.work = self.work
+        return equations
 
-    def stressed(self) -> FloatArray | None:
-        """Cauchy stresses (Pa) and Green–Lagrange strains (2, N, 6) at all nodes in canonical order; collective.
+    def linearise(self) -> Discretisation:
+        """Return the same with the factor of the stiffness there, unless the current factor is its own.
 
-        On the first rank only. Components xx, yy, zz, xy, yz, xz; averages over the cells that meet at a node.
+        Raises
+        ------
+        SolveError
+            If the factor shows that the equilibrium is unstable.
         """
-        return self._model.visit(self).stressed()
+        equations = self.visit()
+        if equations.latest.factorised is not self:
+            equations.factorise(self.state)
+            equations.latest.factorised = self
+            if self.stability == Stability.SCREENED and equations.symmetric:
+                negative = equations.inertia()
+                if negative is not None and negative > 0:
+                    message = (
+                        f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
+                        "derivative has shown: the body buckles, or its mesh is too coarse"
+                    )
+                    raise SolveError(message, work=self.work, stability=Stability.MISSED)
+                self.stability = Stability.COUNTED
+        return equations
 
     @cached_property
     def _right_sides(self) -> FloatArray:
-        return self._model.visit(self).right_sides()
+        return self.visit().right_sides()
 
     @cached_property
     def _gradients(self) -> FloatArray:
         """∂ψ/∂u (m, U_local)."""
-        self._model.visit(self)
+        self.visit()
         return np.array([f.gradient() for f in self._model.functionals])
 
     @cached_property
     def _partials(self) -> FloatArray:
         """∂ψ/∂ω (m, d)."""
-        self._model.visit(self)
+        self.visit()
         return np.array([f.partial() for f in self._model.functionals])
 
     def solve(
@@ -116,7 +139,7 @@ class FiniteElementSolution:
         For tangents, `directions` (k, d) are given. By default the tolerance is that of derivatives.
         """
         model = self._model
-        near = self.reference is not None and not model.has_factor(self)
+        near = self.reference is not None and model.equations.latest.factorised is not self
         if near and self.reference is not None and self._rotation is not None and len(right) <= FEW:
             if tolerance is None:
                 tolerance = model.spec.solver.derivative_tolerance
@@ -125,7 +148,7 @@ class FiniteElementSolution:
             )
             if found is not None:
                 return found
-        return model.linearise(self).back_substitute(right, transpose=transpose)
+        return self.linearise().back_substitute(right, transpose=transpose)
 
     def _solve_near(
         self,
@@ -139,14 +162,14 @@ class FiniteElementSolution:
     ) -> FloatArray | None:
         """Solve with the factor at the reference, rotated as for its prediction; None if that is too far away."""
         model = self._model
-        factor = model.take_reference(reference)
+        factor = model.reference.at(reference)
         fixed = model.equations.fixed
         first = None
         if directions is not None and directions.shape[1] <= FEW:
             # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
             first = turn(directions @ factor.slopes(), R)
             first[:, fixed] = 0
-        equations = model.visit(self)
+        equations = self.visit()
         free = np.array(right)
         free[:, fixed] = 0
         found = block_galerkin(
@@ -169,7 +192,7 @@ class FiniteElementSolution:
         equations = self._model.equations
         right = directions[:, equations.scalars] @ self._right_sides
         if equations.fields:
-            right += self._model.visit(self).field_right_sides(directions)
+            right += self.visit().field_right_sides(directions)
         du = self.solve(right, directions=directions)
         return du.reshape(*np.shape(direction)[:-1], -1)
 
@@ -210,7 +233,7 @@ class FiniteElementSolution:
         gradients = np.zeros((len(loads), len(self.parameters)))
         gradients[:, equations.scalars] = equations.total(multipliers @ self._right_sides.T)
         if equations.fields:
-            equations = self._model.visit(self)
+            equations = self.visit()
             multipliers[:, equations.fixed] = 0
             gradients -= np.array([equations.field_products(multiplier) for multiplier in multipliers])
         return gradients.reshape(*np.shape(weights)[:-1], -1)
@@ -218,7 +241,7 @@ class FiniteElementSolution:
     @cached_property
     def enriched_state(self) -> EnrichedState:
         """The state in elements of one degree higher, by one linear solve from this state; collective."""
-        self._model.visit(self)
+        self.visit()
         return self.estimated(self._model.enriched)
 
     def estimated(self, enriched: Enriched, nearer: tuple[EnrichedState, float] | None = None) -> EnrichedState:
@@ -226,7 +249,7 @@ class FiniteElementSolution:
 
         With `nearer`, go on from one until its nonlinearity is below a bound.
         """
-        self._model.visit(self)
+        self.visit()
         kept, self.work = self.work, Work()
         try:
             found = enriched.state(self) if nearer is None else enriched.nearer(self, *nearer)
@@ -257,7 +280,7 @@ class FiniteElementSolution:
         None where that takes too much memory, or is too rough.
         """
         model = self._model
-        model.visit(self)
+        self.visit()
         twice = model.enriched_twice
         if twice is None:
             return None
@@ -318,6 +341,6 @@ class FiniteElementSolution:
         They are (n_cells,), or (k, n_cells) for k rows of weights, in DOLFINx's order, and not negative
         (`Enriched.indicators`).
         """
-        self._model.visit(self)
+        self.visit()
         found = self._model.enriched.indicators(self, np.atleast_2d(weights))
         return found.reshape(*np.shape(weights)[:-1], -1)

@@ -55,7 +55,7 @@ class Touched:
         nodes = cKDTree(model.space.coordinates)
 
         def rows(solution: Any, _: FloatArray) -> FloatArray:
-            found = solution.touched()
+            found = solution.visit().touched()
             whole = np.zeros((len(self.tools), model.equations.comm.allreduce(len(solution.state))))
             for row, tool in zip(whole, self.tools, strict=True):
                 at = 3 * nodes.query(found[tool][:, :3])[1]
@@ -124,7 +124,7 @@ def stressed(model: Any, mean: FloatArray) -> FloatArray | None:
         other ranks than the first.
     """
     try:
-        found: FloatArray | None = model.solve(mean).stressed()
+        found: FloatArray | None = model.solve(mean).visit().stressed()
     except SolveError:
         return None
     return found

@@ -7,6 +7,7 @@ import pytest
 
 from forward.fem.enriched import EnrichedState
 from forward.fem.history import HistorySolution, Increment, Passed
+from forward.fem.latest import Latest
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
 
@@ -35,7 +36,13 @@ class Equations:
         self.K[:, 0, :], self.K[:, :, 0] = 0, 0
         self.K[:, 0, 0] = 1
         self.P[:, :, 0] = 0
-        self.at = 0
+        self.at, self.latest, self.symmetric = 0, Latest(), False
+
+    def set_parameters(self, parameters, stiffer):
+        pass
+
+    def at_load(self, fraction):
+        pass
 
     def total(self, values):
         return values
@@ -107,8 +114,6 @@ def test_tangent_and_adjoint_of_a_solution():
     equations = Equations(1)
     model = SimpleNamespace(
         equations=equations,
-        visit=lambda _: equations,
-        linearise=lambda _: equations,
         functionals=functionals(equations),
         rows=None,
     )
@@ -129,9 +134,7 @@ def test_errors_of_the_mesh_are_what_richer_elements_add():
         state=lambda _: richer, values=lambda *_: enriched_outputs, down=lambda x: 2 * x, equations=None
     )
     outputs = [SimpleNamespace(value=lambda: 1.0), SimpleNamespace(value=lambda: 0.5)]
-    model = SimpleNamespace(
-        visit=lambda _: equations, functionals=outputs, enriched=enriched, rows=None, equations=None
-    )
+    model = SimpleNamespace(functionals=outputs, enriched=enriched, rows=None, equations=equations)
     found = SimpleNamespace(state=np.zeros(SIZE), residual=0.0, converged=True, stability=Stability.COUNTED)
     error = FiniteElementSolution(model, np.zeros(2), found, Work(), None).mesh_error()
     np.testing.assert_allclose(error.outputs, [2.0, -2.5])  # exact minus computed

@@ -14,7 +14,7 @@ def test_outputs_that_are_made_and_dropped_never_get_forms_of_each_other():
     """An address of memory is used again by what is made next: it says nothing of what a form is of."""
     spec = loaded_body("mooney-rivlin")
     model = spec.build(MPI.COMM_SELF, ("material.C1",))
-    model.visit(model.solve(np.array([1.1e4])))
+    model.solve(np.array([1.1e4])).visit()
     outputs = (StrainEnergy(name="energy"), VolumeChange(name="volume"))
     kept = [output.functional(model.equations) for output in outputs]
     expected = [(one.gradient(), one.partial()) for one in kept]

@@ -175,7 +175,7 @@ def test_lanczos_takes_the_place_of_the_factor_for_counting_where_there_is_nothi
     for solution in stable:
         assert solution.stability == Stability.COUNTED
         assert solution.work.factorisations == 0
-        model.visit(solution)
+        solution.visit()
         assert model.equations.negative_eigenvalues(solution.state) == 0
 
 
@@ -229,7 +229,7 @@ def test_changes_of_the_stiffness_are_those_of_assembled_ones(column):
     problem, centre = column
     model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
     reference = centre.prediction.on(model)(np.array([115.0])).reference
-    factor, equations = model.take_reference(reference), model.equations
+    factor, equations = model.reference.at(reference), model.equations
     spread, step = float(reference.spread[0]), 1e-3
     rows = np.random.default_rng(0).standard_normal((3, equations.size)) * equations.free_displacements
     slope = spread * factor.slopes()[0]

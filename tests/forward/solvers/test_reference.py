@@ -176,7 +176,7 @@ def test_a_few_corrections_say_how_far_they_are(case):
         assert not found.converged
         assert found.work.back_substitutions == d == found.work.residuals - 1
         assert found.work.factorisations == 0
-        body = model.visit(found)
+        body = found.visit()
         assert body.residual(found.state).relative == pytest.approx(found.residual, rel=1e-6)
         errors.append(np.abs(found.state - exact.state).max())
     assert errors[2] < 0.1 * errors[1] < 0.1 * errors[0]

@@ -69,7 +69,7 @@ def test_a_solve_without_end_is_stopped(monkeypatch):
 def test_the_condition_number_is_that_of_the_stiffness(case):
     spec = case.spec
     model = spec.build(stability.MPI.COMM_SELF, ())
-    body = model.linearise(model.solve(np.empty(0)))
+    body = model.solve(np.empty(0)).linearise()
     free = np.setdiff1d(np.arange(body.size), body.fixed)
     unit = np.eye(body.size)
     stiffness = np.array([body.stiffness_times(unit[i])[free] for i in free])

@@ -216,7 +216,7 @@ def test_tools_are_made_stiffer_until_the_body_stays_out():
     assert (
         stiff.stiffer > 1
     )  # the tool was made stiffer for this sample, and its derivatives are those of what it gives
-    model.visit(stiff)
+    stiff.visit()
     assert model.equations.penetrations()["indenter"] < 1e-3 * 1e-3
     step = 50 * np.array([1e-3 * C1, 0])
     ends = [model.solve(50 * np.array([C1, D1]) + sign * step).outputs[0] for sign in (1, -1)]
@@ -257,7 +257,7 @@ def test_predictions_are_worth_no_more_than_newtons_method_takes():
 def test_contact_is_complementary():
     """At quadrature points: p ≥ 0, no gap below the aim, and p g = 0 up to it."""
     model = body(tool(at=(4e-3, 3e-3, SIDE), depth=2e-3)).build(MPI.COMM_SELF, ())
-    model.visit(model.solve(np.zeros(0)))
+    model.solve(np.zeros(0)).visit()
     pressure, gap = model.equations.contact_values["indenter"]().T
     assert (pressure >= 0).all()
     assert pressure.max() > 100
@@ -455,8 +455,7 @@ for comm in groups():
     model = spec.build(comm, tuple(names))
     solution = model.solve(values)
     states = comm.bcast(model.space.gather(solution.state[None]))
-    model.visit(solution)
-    touched = solution.touched()
+    touched = solution.visit().touched()
     found = [
         solution.outputs,
         solution.tangent(np.eye(4)),
