@@ -18,13 +18,16 @@ from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
+import ufl
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from forward.bodies.hexahedra import CORNERS
 from forward.bodies.mesh import FACES, TETRAHEDRA
+from forward.fem.invariants import OPS
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError
+from forward.terms import tools
 
 SIDE = 20e-3
 TOOLS: dict[str, dict[str, Any]] = {
@@ -104,6 +107,13 @@ def specification(shape: str, cell: str, material: str, formulation: str) -> Hyp
     )
 
 
+def contact_values(equations: Any, label: str) -> Any:
+    """Return what finds pressures (Pa) and gaps (m), (n, 2), at the quadrature points under a tool."""
+    load, at = equations.tool(label)
+    touch = load.touch(at, at.X + at.u)
+    return equations.on_facets(ufl.as_vector([tools.pressure(OPS, *touch), touch.gap]), load.on, load.degree)
+
+
 class Kind:
     """A model whose numbers are drawn: place, depth and size of the tool, and the constants of the material."""
 
@@ -116,7 +126,7 @@ class Kind:
         self.names += [f"material.{name}" for name in MATERIALS[self.material]]
         self.nominal = np.array([spec.scalars[name].value for name in self.names])
         self.model = spec.build(MPI.COMM_SELF, tuple(self.names))
-        self.pressure = self.model.equations.contact_values["indenter"]
+        self.pressure = contact_values(self.model.equations, "indenter")
 
     def draw(self, rng: np.random.Generator) -> Any:
         """Draw a point (d,)."""

@@ -182,39 +182,6 @@ def check_derivatives(
     )
 
 
-def check_mesh_errors(model: ForwardModel, exact: ForwardModel, parameters: ArrayLike, accuracy: float = EXACT) -> None:
-    """Check that a model with its calibrated error of the mesh is the model without that error; collective.
-
-    Parameters
-    ----------
-    model
-        Made of models whose errors, once calibrated, are exact.
-    exact
-        Made in the same way of the same models without an error.
-    parameters
-        Parameter vector (d,) at which to check.
-    accuracy
-        Allowed relative error of the outputs.
-
-    Raises
-    ------
-    AssertionError
-        With the names of the outputs that differ.
-    """
-    point = np.array(parameters, dtype=float)
-    solution, expected = model.solve(point), np.asarray(exact.solve(point).outputs)
-    error, saturation = solution.mesh_error(), solution.saturation()
-    if error is None or saturation is None:
-        message = "no error of a mesh is estimated, though the model has one"
-        raise AssertionError(message)
-    found = solution.outputs + error.calibrated(saturation).outputs
-    off = np.abs(found - expected) > accuracy * np.abs(expected).max(initial=0.0)
-    wrong = [f"mesh error of '{name}'" for name, bad in zip(model.outputs, off, strict=True) if bad]
-    if wrong:
-        message = f"{', '.join(wrong)}: the corrected output is not the exact one"
-        raise AssertionError(message)
-
-
 def _columns(values: FloatArray, outputs: int) -> FloatArray:
     """Sizes of the outputs and, where there is one, the norm of the state, along the last axis."""
     parts = [np.abs(values[..., :outputs]), np.linalg.norm(values[..., outputs:], axis=-1, keepdims=True)]

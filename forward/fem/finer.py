@@ -186,10 +186,10 @@ def extrapolated(model: AnyModel, start: FloatArray | None = None) -> FinerMeshe
         equal, less = (_hurried(_on(spec, times, thin=False), spec.solver.minimum_load_step) for times in (TIMES, 1.0))
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)
-        otherwise = FinerMeshes(model, OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start)
+        otherwise = FinerMeshes(OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start)
         fine, beside = _hurried(fine, LOAD_STEP), None if beside is None else _hurried(beside, LOAD_STEP)
     coarse = None if beside is None else OtherMesh(model, beside)
-    return FinerMeshes(model, OtherMesh(model, fine), coarse, share(spec), start, otherwise)
+    return FinerMeshes(OtherMesh(model, fine), coarse, share(spec), start, otherwise)
 
 
 def _hurried(spec: Any, smallest: float) -> Any:
@@ -307,31 +307,26 @@ class FromStart(OfOne):
         return found
 
 
+@dataclass(frozen=True)
 class FinerMeshes:
     """A body on finer meshes.
 
     Parameters
     ----------
-    own
-        On its own mesh.
     fine, coarse
         On the finest, and on the other one; None where that is its own.
     share, start, otherwise
         As of `limit` and `FromStart`, and what takes their place (`Otherwise`).
+    begun
+        As of `FromStart`.
     """
 
-    def __init__(
-        self,
-        own: AnyModel,
-        fine: OtherMesh,
-        coarse: OtherMesh | None,
-        share: float,
-        start: FloatArray | None,
-        otherwise: FinerMeshes | None = None,
-    ) -> None:
-        self.own, self.fine, self.coarse, self.share, self.start = own, fine, coarse, share, start
-        self.otherwise = otherwise
-        self._begun: list[Begun | SolveError] = []
+    fine: OtherMesh
+    coarse: OtherMesh | None
+    share: float
+    start: FloatArray | None = None
+    otherwise: FinerMeshes | None = None
+    begun: list[Begun | SolveError] = field(default_factory=list)
 
     def of(self, observed: ForwardModel) -> ForwardModel:
         """Return the model of what a model of the body has as outputs; collective when it is first solved.
@@ -345,7 +340,7 @@ class FinerMeshes:
         body = observed if rows is None else rows.model
         fine, coarse = (body if mesh is None else mesh.of(body) for mesh in (self.fine, self.coarse))
         both = Joined((fine, coarse), (*body.outputs, *(f"{name} (coarse)" for name in body.outputs)))
-        begun = FromStart(both, self.start, self._begun, self.otherwise is not None)
+        begun = FromStart(both, self.start, self.begun, self.otherwise is not None)
         weights = csr_matrix(identity(len(body.outputs))) if rows is None else rows.S
         found = limit(begun, weights, observed.outputs, self.share)
         return found if self.otherwise is None else Otherwise(found, self.otherwise.of(observed))

@@ -324,17 +324,6 @@ class Forms:
             for _, load, at in self._tools
         ]
 
-    @cached_property
-    def contact_values(self) -> dict[str, assembly.FacetValues]:
-        """Pressures (Pa) and gaps (m), (n, 2), at the quadrature points under each tool."""
-        found = {}
-        for load in (load for load in self.spec.loads if load.contact):
-            _, at = self.tool(load.label)
-            touch = load.touch(at, at.X + at.u)  # type: ignore[attr-defined]
-            values = ufl.as_vector([tools.pressure(OPS, *touch), touch.gap])
-            found[load.label] = self.on_facets(values, load.on, load.degree)  # type: ignore[attr-defined]
-        return found
-
     def pressures_at_vertices(self, label: str) -> PressuresAtVertices:
         """Pressures under a tool, averaged by hat functions."""
         load, at = self.tool(label)

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from forward.combine import Joined, Mapped, Rows, Sparse, selected
-from forward.conformance import check_derivatives, check_mesh_errors
+from forward.conformance import check_derivatives
 from forward.fem.finer import FromStart, Otherwise, limit
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, Work
 
@@ -92,6 +92,14 @@ COMBINED = {
 }
 
 
+def check_mesh_errors(model, exact, point):
+    """A model with its calibrated error of the mesh is the model without that error."""
+    solution, expected = model.solve(point), exact.solve(point).outputs
+    found = solution.outputs + solution.mesh_error().calibrated(solution.saturation()).outputs
+    off = np.abs(found - expected) > 1e-10 * np.abs(expected).max()
+    assert not off.any(), np.array(model.outputs)[off]
+
+
 @pytest.mark.parametrize("made", COMBINED.values(), ids=COMBINED)
 def test_a_combination_conforms(made):
     point = np.array([0.7, 1.2, 0.4])[: len(made(1.0).parameters)]
@@ -108,7 +116,7 @@ def test_a_wrong_sign_of_a_mesh_error_is_seen():
             )
 
     wrong = Turned(on(1.0), csr_matrix(-np.eye(3)), ("u", "v", "w"))
-    with pytest.raises(AssertionError, match="mesh error of 'u', mesh error of 'v'"):
+    with pytest.raises(AssertionError, match="'u', 'v'"):
         check_mesh_errors(wrong, on(0.0), POINT)
 
 
