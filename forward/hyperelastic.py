@@ -13,11 +13,9 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from forward import adapt as adaptive
-from forward.adapt import Adapt
+from forward.adapt import Adapt, Refinable
 from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
 from forward.bodies.inclusions import too_narrow
-from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Ranges
@@ -29,7 +27,6 @@ from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import nearest, shown
-from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
 from forward.spec import UNREFINED
 from forward.terms.displacement import Block, Displacement, lists, too_far
@@ -44,7 +41,7 @@ IN_WORDS = {  # what linear systems are solved with
 }
 
 
-class Hyperelastic(Solid):
+class Hyperelastic(Refinable):
     """A hyperelastic body under loads, solved by finite elements.
 
     Parameters
@@ -221,9 +218,7 @@ class Hyperelastic(Solid):
         ModelError
             If the mesh is divided already, or coefficients of fields are those of its vertices.
         """
-        objection = adaptive.of_fields(self)
-        if objection is not None:
-            raise ModelError(objection)
+        self.require_modes()
         if isinstance(self.body, MeshFile):
             return self.refined(math.ceil(math.log2(times) - 1e-9))
         return self.model_copy(update={"body": self.body.with_cells(times, self.plane)})
@@ -237,9 +232,7 @@ class Hyperelastic(Solid):
             If a mesh from a file was not divided as often, coefficients of fields are those of its vertices, or there
             are fewer of these than modes.
         """
-        objection = adaptive.of_fields(self)
-        if objection is not None:
-            raise ModelError(objection)
+        self.require_modes()
         body = self.body.coarser(times, degree)
         for field in self.fields:
             if (field.modes or 0) > body.vertex_count:
@@ -253,42 +246,9 @@ class Hyperelastic(Solid):
         """Residual that solutions may have, relative to the loads."""
         return self.solver.tolerance
 
-    def enriched(self) -> Self:
-        """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
-        formulation = "mixed" if self.mixed else "displacement"
-        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
-
-    @property
-    def adaptive(self) -> bool:
-        """Whether the mesh is refined before anything else is solved."""
-        return self.adapt is not None
-
-    @property
-    def unrefined(self) -> bool:
-        """Whether that is still to be done."""
-        return self.adapt is not None and not self.adapt.refined
-
-    @property
-    def largest_bytes(self) -> float:
-        """Predicted memory (bytes) of the largest mesh that it may be refined to; 0 where it is not."""
-        return adaptive.largest_bytes(self) if self.unrefined else 0.0
-
     def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
         """Refine the mesh at a point (d,) of parameters by their paths, as `forward.fem.adapt` does; collective."""
         return named("forward.fem.adapt:adapt")(self, comm, parameters, point, say)
-
-    def on_mesh(self, file: str, contents: Contents | None = None) -> Self:
-        """Return the same problem with the same elements on a refined mesh in a file, or one that holds the same.
-
-        Raises
-        ------
-        ValidationError
-            If the file cannot be read.
-        """
-        elements = {"degree": self.body.degree, "quadrature_degree": self.body.quadrature_degree}
-        body = MeshFile.model_validate({"file": file, "contents": contents, **elements})
-        adapt = None if self.adapt is None else self.adapt.model_copy(update={"refined": True})
-        return self.model_copy(update={"body": body, "adapt": adapt})
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Findings before anything is solved, for values of parameters within ranges, by their paths."""
@@ -428,7 +388,7 @@ class Hyperelastic(Solid):
         yield from self._mistakes_of_linear_solver()
         support = Support(self.body, self.clamp, self.displacements, self.loads)
         yield from support.contradictions()
-        yield from adaptive.mistakes(self)
+        yield from self.mistakes_of_adapt()
         if self.adapt is not None and self.frictional:
             yield ("adapt",), "errors of the mesh are not estimated with friction, expected friction = 0", True
         yield from support.mistakes(complete=not unknown)

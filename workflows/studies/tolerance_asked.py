@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.adapt import Adapt, largest_bytes
+from forward.adapt import Adapt
 from forward.findings import Finding, entries
 from forward.machine import MIB
 from forward.model import ModelError
@@ -231,7 +231,7 @@ def most_unknowns(study: Study) -> int:
     if refinement(study)[0] == "adapt":
         while most < 10**7:
             more = int(most * STEP) + 1
-            if largest_bytes(model.model_copy(update={"adapt": Adapt(tolerance=0.5, unknowns=more)})) > memory:
+            if model.model_copy(update={"adapt": Adapt(tolerance=0.5, unknowns=more)}).largest_bytes > memory:
                 break
             most = more
         return most
