@@ -326,10 +326,6 @@ class JoinedSolution:
     count: int
     order: tuple[int, ...]
 
-    def side_by_side(self, states: Sequence[FloatArray]) -> FloatArray:
-        """Return states (…, U_local) of all, or changes of them, as one; of different meshes there is none (…, 0)."""
-        return side_by_side(states, self.order)
-
     @cached_property
     def outputs(self) -> FloatArray:
         """Values of all outputs (m,)."""
@@ -340,7 +336,7 @@ class JoinedSolution:
     @cached_property
     def state(self) -> FloatArray:
         """This rank's part of the states (U_local,)."""
-        found = self.side_by_side([one.state for one in self.solutions])
+        found = side_by_side([one.state for one in self.solutions], self.order)
         found.flags.writeable = False
         return found
 
@@ -384,7 +380,7 @@ class JoinedSolution:
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local) of k of them."""
-        return self.side_by_side([one.state_tangent(direction) for one in self.solutions])
+        return side_by_side([one.state_tangent(direction) for one in self.solutions], self.order)
 
     def mesh_error(self) -> MeshError | None:
         """Estimate the errors that all meshes make; None where there are none."""
@@ -395,7 +391,7 @@ class JoinedSolution:
         outputs = [np.zeros(len(one.outputs)) if error is None else error.outputs for one, error in found]
         return MeshError(
             np.concatenate(outputs),
-            self.side_by_side([one.state for one in known]),
+            side_by_side([one.state for one in known], self.order),
             sum(one.energy for one in known),
             max(one.relative for one in known),
             Work.sum_of(one.work for one in known),

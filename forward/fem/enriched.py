@@ -12,17 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from forward.fem.cost import MOST_BYTES
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
 from forward.fem.enriched_equations import EnrichedEquations
 from forward.fem.equations import Discretisation
-from forward.fem.mesh_error_cost import Way, estimate
+from forward.fem.mesh_error_cost import Way
 from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
 
@@ -283,27 +281,6 @@ class Enriched(EnrichedEquations):
             sizes = np.abs(equations.imbalance_by_vertices(z - self.up(self.down(z))))
             found.append(shared_by_cells(sizes, equations))
         return np.array(found)
-
-
-class Enrichments:
-    """A body in elements of higher degrees, made when they are first asked for."""
-
-    def __init__(self, spec: Hyperelastic, equations: Discretisation, functionals: list[Functional]) -> None:
-        self._spec, self._equations, self._functionals = spec, equations, functionals
-
-    @cached_property
-    def once(self) -> Enriched:
-        """In elements of one degree more."""
-        return Enriched(self._equations, self._spec.enriched(), self._functionals)
-
-    @cached_property
-    def twice(self) -> Enriched | None:
-        """In elements of two degrees more; None where they take too much memory, or are solved too roughly."""
-        spec = self._spec.enriched().enriched()
-        cost = estimate(self._spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
-        rough = spec.mixed and cost.way == Way.SMOOTHING
-        return Enriched(self._equations, spec, self._functionals) if cost.bytes <= MOST_BYTES and not rough else None
 
 
 def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:

@@ -14,9 +14,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from forward.fem.cost import Linear, together
-from forward.fem.enriched import Enriched, Enrichments
+from forward.fem.cost import MOST_BYTES, Linear, together
+from forward.fem.enriched import Enriched
 from forward.fem.equations import Discretisation
+from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor, WayFromReference
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, Observation
@@ -103,7 +104,7 @@ class HyperelasticModel(OneByOne):
         self.differentiable = True
         self.rows: Observation | None = None  # what is observed in place of the outputs
         self.functionals = [output.functional(self.equations) for output in spec.outputs]
-        self._enrichments = Enrichments(spec, self.equations, self.functionals)
+        self._richer: dict[int, Enriched] = {}  # by how many degrees; copies share it
 
     @cached_property
     def reference(self) -> ReferenceFactor:
@@ -133,12 +134,20 @@ class HyperelasticModel(OneByOne):
     @property
     def enriched(self) -> Enriched:
         """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
-        return self._enrichments.once
+        if 1 not in self._richer:
+            self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
+        return self._richer[1]
 
     @property
     def enriched_twice(self) -> Enriched | None:
-        """The same in elements of two degrees more, which calibrate that; None as in `Enrichments`."""
-        return self._enrichments.twice
+        """The same of two degrees more, to calibrate that; None where they take too much or are solved too roughly."""
+        spec = self.spec.enriched().enriched()
+        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
+        rough = spec.mixed and cost.way == Way.SMOOTHING
+        if cost.bytes <= MOST_BYTES and not rough and 2 not in self._richer:
+            self._richer[2] = Enriched(self.equations, spec, self.functionals)
+        return self._richer.get(2)
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.

@@ -24,7 +24,6 @@ from forward.fem.layout import Layout, vertices_of
 from forward.fem.model import HyperelasticModel
 from forward.fem.space import JoinedSpace, Observation, log_factor
 from forward.model import FloatArray, Guess, MeshError, Saturation
-from forward.specimen import Observed, Specimen
 
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
 Numbers = Sequence[int] | NDArray[np.int64]
@@ -37,7 +36,7 @@ class SpecimenModel(Joined):
     Attributes
     ----------
     spec
-        The specimen.
+        The specimen (`forward.specimen.Specimen`).
     bodies
         The bodies of the cases with what is observed of them.
     places
@@ -53,7 +52,7 @@ class SpecimenModel(Joined):
     models: tuple[Mapped, ...]
     _: KW_ONLY
     space: JoinedSpace
-    spec: Specimen
+    spec: Any
     bodies: tuple[HyperelasticModel, ...]
     places: FloatArray
     axes: NDArray[np.int64]
@@ -173,8 +172,8 @@ class SpecimenSolution(JoinedSolution):
         return replace(found, outputs=outputs, shifts=None, doubts=None)
 
 
-def built(spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
-    """Return a specimen as a model of some of its numbers, by their paths; collective.
+def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
+    """Return a specimen (`forward.specimen.Specimen`) as a model of some of its numbers, by their paths; collective.
 
     Raises
     ------
@@ -211,7 +210,7 @@ def built(spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> SpecimenMod
     names, places, axes, cases = list[str](), [np.zeros((0, 3))], list[int](), list[int]()
     for number, (case, body) in enumerate(zip(spec.cases, bodies, strict=True)):
         for item in spec.seen(case):
-            at = _places(body, item)
+            at = np.array(item.at) if item.on is None else _nodes(body, item.on)
             names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(at)) for axis in item.components]
             places.append(np.repeat(at, len(item.components), axis=0))
             axes += [AXES.index(axis) for axis in item.components] * len(at)
@@ -222,10 +221,8 @@ def built(spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> SpecimenMod
     return model.observing(np.concatenate(places), axes, cases, names=names)
 
 
-def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
-    """Points (n, 3) at which displacements are observed; collective."""
-    if item.on is None:
-        return np.array(item.at)
+def _nodes(model: HyperelasticModel, boundary: str) -> FloatArray:
+    """Points (n, 3) of the nodes of a boundary; collective."""
     equations, layout = model.equations, model.equations.layout
-    mine = layout.nodes()[spaces.boundary_nodes(equations.space, equations.facets[item.on])]
+    mine = layout.nodes()[spaces.boundary_nodes(equations.space, equations.facets[boundary])]
     return np.asarray(layout.coordinates[np.unique(np.concatenate(equations.comm.allgather(mine)))])
