@@ -1,47 +1,18 @@
-"""The specification of a hyperelastic body under loads; no FEniCSx until built.
-
-What the body consists of is in `forward.solid`, what holds it in `forward.terms.support`.
-"""
+"""The specification of a hyperelastic body under loads; no FEniCSx until built."""
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
-
-from forward.adapt import Adapt, Refinable
-from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
-from forward.bodies.inclusions import too_narrow
-from forward.bodies.mesh_file import MeshFile
-from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
-from forward.fem.locking import Ranges
-from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
-from forward.findings import Finding
-from forward.materials.material import splits
+from forward.bodies.in_words import in_words
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, ModelError
-from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar, refuse
-from forward.settings import nearest, shown
-from forward.solvers.settings import SolverSettings
 from forward.spec import UNREFINED
-from forward.terms.displacement import Block, Displacement, lists, too_far
-from forward.terms.support import Support
-from forward.terms.term import Load
-
-INCREMENTS = 10  # of a load with friction
-IN_WORDS = {  # what linear systems are solved with
-    Linear.FACTOR: "factors of the stiffness",
-    Linear.BOTH: "multigrid; a factor of the stiffness for the reference only",
-    Linear.MULTIGRID: "multigrid, without a factor of the stiffness",
-}
 
 
-class Hyperelastic(Refinable):
+class Hyperelastic(LoadedBody):
     """A hyperelastic body under loads, solved by finite elements.
 
     Parameters
@@ -78,258 +49,15 @@ class Hyperelastic(Refinable):
         Whether results hold stresses and strains too, at the mean of the inputs.
     """
 
-    meshed: ClassVar[bool] = True
-    iterative: ClassVar[bool] = True
-    shareable: ClassVar[bool] = True
     kind: Literal["hyperelastic"] = "hyperelastic"
-    clamp: tuple[str, ...] = ()
-    displacements: tuple[Displacement, ...] = ()
-    loads: tuple[Load, ...] = ()
-    outputs: tuple[Output, ...] = Field(min_length=1)
-    adapt: Adapt | None = None
-    stresses: bool = False
-
-    @field_validator("loads", "displacements", mode="before")
-    @classmethod
-    def _no_lists(cls, given: Any, of: ValidationInfo) -> Any:
-        """Refuse lists in place of numbers."""
-        block: Block = "loads" if of.field_name == "loads" else "displacements"
-        for item in given if isinstance(given, tuple) else ():
-            for name, values in lists(block, item).items():
-                message = f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'"
-                raise ValueError(message)
-        return given
-
-    @property
-    def scalars(self) -> dict[str, Scalar]:
-        """Every number that can be made a parameter, by its path."""
-        found = self.own_scalars
-        for load in self.loads:
-            for name, scalar in load.scalars.items():
-                found[f"loads.{load.label}.{name}"] = scalar
-        for displacement in self.displacements:
-            for axis, value in displacement.components.items():
-                found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
-        return found
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the stiffness is symmetric: no load follows the body, and no tool rubs on it."""
-        return all(load.symmetric for load in self.loads)
-
-    @property
-    def linear(self) -> Linear:
-        """What its linear systems are solved with."""
-        if self.mixed or self.body.degree < 2 or self.frictional:
-            return Linear.FACTOR
-        if self.solver.linear != "auto":
-            return Linear(self.solver.linear)
-        if self.solver.kind == "newton" or self.touched or not self.symmetric:
-            return Linear.FACTOR
-        return linear_solver(self.body, symmetric=self.symmetric)
-
-    @property
-    def single(self) -> bool:
-        """Whether the factor of a reference is in single precision, where that is there and leaves enough digits."""
-        if self.solver.precision != "auto":
-            return self.solver.precision == "single"
-        return factor(self.body, mixed=self.mixed, symmetric=self.symmetric).bytes > SINGLE_FROM
-
-    @property
-    def frictional(self) -> bool:
-        """Whether a tool rubs on it, so that its state depends on the states before."""
-        return any(load.contact and not load.symmetric for load in self.loads)
-
-    @property
-    def unavailable(self) -> Mapping[str, str]:
-        """Why some of its numbers cannot be parameters, by their paths."""
-        smooth = [load.label for load in self.loads if load.contact and load.symmetric]
-        why = "a tool without friction has no such number, expected a friction above 0 in the load too"
-        return {f"loads.{label}.friction": why for label in smooth}
-
-    @property
-    def remembers(self) -> str:
-        """What makes its states depend on those before; empty if nothing does."""
-        return "friction" if self.frictional else ""
-
-    @property
-    def touched(self) -> bool:
-        """Whether tools touch it."""
-        return any(load.contact for load in self.loads)
-
-    @property
-    def increments(self) -> int:
-        """In how many increments the load grows where there is friction, in all; 1 without."""
-        return self._increments_in(1)
-
-    def _increments_in(self, steps: int) -> int:
-        stated = [getattr(load, "increments", None) or -(-INCREMENTS // steps) for load in self.loads if load.contact]
-        return steps * max(stated, default=1) if self.frictional else 1
-
-    def unlocked(self) -> Self:
-        """Return the same body on the same mesh in the form that locks least."""
-        body = self.body.model_copy(update={"degree": 2, "quadrature_degree": None})
-        return self.model_copy(update={"body": body, "formulation": "mixed" if splits(self.energy) else "displacement"})
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings about the body before anything is solved."""
-        points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
-        return (
-            *self.body.findings,
-            *too_narrow(self.body, self.inclusions),
-            *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
-            *moved_points(self.body, points),
-            *self._of_followers(),
-            *(finding for load in self.loads for finding in load.findings(self.body)),
-        )
-
-    def _of_followers(self) -> Iterator[Finding]:
-        """What the stability test cannot see under loads that follow the body."""
-        followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
-        if followers and not self.solver.accept_unstable:
-            yield Finding("followers", "note", {"loads": ", ".join(followers)})
-
-    def refined(self, level: int) -> Self:
-        """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""
-        return self.model_copy(update={"body": self.body.refined(level)})
-
-    @property
-    def plane(self) -> tuple[Axis, ...]:
-        """Axes along which a box or block is one cell thick between faces that slide: nothing varies along them.
-
-        Not of bodies with inclusions or random fields, which vary everywhere.
-        """
-        if isinstance(self.body, MeshFile) or self.inclusions or self.fields:
-            return ()
-        held = {on: set(AXES) for on in self.clamp}
-        for item in self.displacements:
-            held.setdefault(item.on, set()).update(item.components)
-        thick = zip(AXES, self.body.cells, strict=True)
-        return tuple(
-            axis for axis, n in thick if n == 1 and all(held.get(f"{axis}-{end}") == {axis} for end in ("min", "max"))
-        )
-
-    def finer(self, times: float) -> Self:
-        """Return the same problem with so many times the cells along each edge but those of a plane, or a few more.
-
-        Raises
-        ------
-        ModelError
-            If the mesh is divided already, or coefficients of fields are those of its vertices.
-        """
-        self.require_modes()
-        if isinstance(self.body, MeshFile):
-            return self.refined(math.ceil(math.log2(times) - 1e-9))
-        return self.model_copy(update={"body": self.body.with_cells(times, self.plane)})
-
-    def coarser(self, times: float, degree: Literal[1, 2] | None = None) -> Self:
-        """Return the same problem with longer cells, perhaps linear ones, which have displacements only.
-
-        Raises
-        ------
-        ModelError
-            If a mesh from a file was not divided as often, coefficients of fields are those of its vertices, or there
-            are fewer of these than modes.
-        """
-        self.require_modes()
-        body = self.body.coarser(times, degree)
-        for field in self.fields:
-            if (field.modes or 0) > body.vertex_count:
-                few = f"has {body.vertex_count} vertices, expected at least as many as a random field has modes"
-                raise ModelError(f"the mesh with cells {times:g} times as long {few}, {field.modes}")
-        changed = {"formulation": "displacement"} if body.degree == 1 else {}
-        return self.model_copy(update={"body": body, "adapt": None, **changed})
-
-    @property
-    def solver_tolerance(self) -> float:
-        """Residual that solutions may have, relative to the loads."""
-        return self.solver.tolerance
 
     def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
         """Refine the mesh at a point (d,) of parameters by their paths, as `forward.fem.adapt` does; collective."""
         return named("forward.fem.adapt:adapt")(self, comm, parameters, point, say)
 
-    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
-        of_loads: list[Finding] = []
-        for load in self.loads:
-            own = f"loads.{load.label}."
-            numbers = {path.removeprefix(own): ends for path, ends in ranges.items() if path.startswith(own)}
-            of_loads += load.findings_over(self.body, numbers) if numbers else ()
-        return (*dict.fromkeys((*self.findings, *of_loads, *too_far(self.body, ranges))), *self.locking(ranges))
-
-    def textbook(self) -> Self:
-        """Return the same problem solved by Newton's method from zero, with a new factor for every step."""
-        return self.model_copy(update={"solver": self.solver.model_copy(update={"kind": "newton"})})
-
-    def tighter(self, factor: float) -> Self:
-        """Return the same problem with the solver's tolerances multiplied by a factor."""
-        tolerances = {name: factor * getattr(self.solver, name) for name in ("tolerance", "derivative_tolerance")}
-        return self.model_copy(update={"solver": self.solver.model_copy(update=tolerances)})
-
-    def solved_to(self, tolerance: Any) -> Self:
-        """Return the same problem with another tolerance of its solver."""
-        solver = SolverSettings.model_validate(self.solver.model_dump() | {"tolerance": tolerance})
-        return self.model_copy(update={"solver": solver})
-
-    def cost(self, factors: int = 2) -> Times:
-        """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
-        predicted = self.solver.kind != "newton" and not self.frictional
-        contact, mixed, symmetric = self.touched, self.mixed, self.symmetric
-        one = times(
-            self.body,
-            mixed=mixed,
-            symmetric=symmetric,
-            predicted=predicted,
-            factors=factors,
-            contact=contact,
-            linear=self.linear,
-        )
-        if self.increments == 1:
-            alone = contact or self.linear == Linear.MULTIGRID
-            held = held_together(self.unknowns) if predicted and factors > 1 and not alone else 0
-            return replace(one, bytes=one.bytes + held)
-        whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
-        return replace(whole, setup=one.setup, bytes=one.bytes)
-
-    def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
-        """Predict what an estimate of the error of the mesh takes, and what calibrates it."""
-        own, calibrating = own_estimate(self), finer(self, spare)
-        if calibrating is None:
-            return own
-        return replace(own, calibration=calibrating.seconds, calibration_bytes=calibrating.bytes)
-
-    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Say what a mesh file holds, and how many unknowns there are of which kind."""
-        decision, body = self.decision(ranges), self.body
-        form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
-        unknowns = self.over(ranges).unknowns
-        yield from body.listed.items()
-        first = "at first " if self.unrefined else ""
-        yield "unknowns", f"{first}{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
-        yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
-        yield "linear", self.over(ranges)._linear_in_words()
-        if self.adapt is not None:
-            yield "mesh", self.adapt.in_words(self)
-
-    def _linear_in_words(self) -> str:
-        """Say what linear systems are solved with."""
-        referred = self.linear != Linear.MULTIGRID and self.solver.kind != "newton" and not self.frictional
-        return IN_WORDS[self.linear] + (
-            "; that of the reference in single precision" if referred and self.single else ""
-        )
-
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""
-        words: Iterator[tuple[str, list[str]]] = named("forward.bodies.in_words:in_words")(self, said, where)
-        return words
-
-    def identity(self) -> dict[str, Any]:
-        """Return everything that results depend on; a mesh file counts by its hash, not by its path."""
-        found = super().identity()
-        found["body"].pop("file", None)
-        return found
+        yield from in_words(self, said, where)
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms on a communicator; collective.
@@ -350,77 +78,6 @@ class Hyperelastic(Refinable):
         if self.unrefined:
             message = f"model.adapt: {UNREFINED}"
             raise ModelError(message)
-        model = "history:HistoryModel" if self.frictional else "model:HyperelasticModel"
+        alone = "path:built" if self.stepped else "model:HyperelasticModel"
+        model = "history:HistoryModel" if self.frictional else alone
         return named(f"forward.fem.{model}")(self, comm, parameters)
-
-    @model_validator(mode="after")
-    def _check(self) -> Hyperelastic:
-        refuse(type(self).__name__, self._mistakes())
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
-        """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
-        boundaries = self.body.boundaries
-        places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
-        for block in ("displacements", "loads", "outputs"):
-            for i, item in enumerate(getattr(self, block)):
-                if hasattr(item, "on"):
-                    places.append(((block, i, "on"), item.on))
-        unknown = [(place, on) for place, on in places if on not in boundaries]
-        for place, on in unknown:
-            yield place, f"unknown boundary; {nearest(on, boundaries)}", on
-        for block, label in (
-            ("inclusions", "label"),
-            ("fields", "label"),
-            ("displacements", "label"),
-            ("loads", "label"),
-            ("outputs", "name"),
-        ):
-            names = Counter(getattr(item, label) for item in getattr(self, block))
-            for name, count in names.items():
-                if count > 1:
-                    yield (block,), f"{count} of them are called '{name}', expected different names", name
-        yield from self.own_mistakes()
-        for i, field in enumerate(self.fields):
-            if field.of == "density" and not any(load.of_density for load in self.loads):
-                yield ("fields", i, "of"), "no load is gravity, expected one where the density varies", field.of
-        yield from self._mistakes_of_outputs()
-        yield from self._mistakes_of_linear_solver()
-        support = Support(self.body, self.clamp, self.displacements, self.loads)
-        yield from support.contradictions()
-        yield from self.mistakes_of_adapt()
-        if self.adapt is not None and self.frictional:
-            yield ("adapt",), "errors of the mesh are not estimated with friction, expected friction = 0", True
-        yield from support.mistakes(complete=not unknown)
-
-    def _mistakes_of_outputs(self) -> Iterator[Mistake]:
-        held = set(self.clamp) | {item.on for item in self.displacements}
-        tools = [load.label for load in self.loads if load.contact]
-        for i, output in enumerate(self.outputs):
-            on, at, tool = (getattr(output, name, None) for name in ("on", "at", "tool"))
-            if tool is not None and tool not in tools:
-                hint = nearest(tool, tools) if tools else "no load is an indenter"
-                if "tool" in output.model_fields_set:
-                    yield ("outputs", i, "tool"), f"unknown tool; {hint}", tool
-                else:
-                    yield ("outputs", i, "tool"), f"which tool? {hint}", {}
-            if output.of_held and on in self.body.boundaries and on not in held:
-                yield ("outputs", i, "on"), "nothing holds this boundary, expected one that is clamped or moved", on
-            if at is not None and not holds(self.body, at):
-                yield ("outputs", i, "at"), f"outside the body, which lies in {extent(self.body)}", list(at)
-
-    def _mistakes_of_linear_solver(self) -> Iterator[Mistake]:
-        asked = self.solver.linear
-        if asked not in {"multigrid", "both"}:
-            return
-        objection = ""
-        if self.body.degree < 2:
-            objection = "multigrid needs cells of degree 2, between which and linear ones it goes to and fro"
-        elif self.formulation == "mixed":
-            objection = "multigrid solves for displacements only, and the form is mixed"
-        elif self.frictional:
-            objection = "multigrid is not available with friction"
-        elif self.solver.kind == "newton":
-            objection = "the textbook solver has a factor for every step"
-        if objection:
-            yield ("solver", "linear"), f"{objection}; expected 'factor' or 'auto'", asked

@@ -21,7 +21,6 @@ from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
 from forward.observables.observable import Output
 from forward.readable import scale
-from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.terms.displacement import Block, label, lists, too_far
@@ -81,6 +80,11 @@ class Path(Hyperelastic):
         return {**given, **changed, "steps": stated if found == stated else found}
 
     @property
+    def stepped(self) -> Mapping[str, tuple[float, ...]]:
+        """The lists by the paths of the numbers."""
+        return self.steps
+
+    @property
     def count(self) -> int:
         """Number of steps."""
         return len(next(iter(self.steps.values())))
@@ -138,11 +142,6 @@ class Path(Hyperelastic):
         ends = {path: (min(values), max(values)) for path, values in self.steps.items()}
         return tuple(dict.fromkeys((*super().findings, *too_far(self.body, ends))))
 
-    @property
-    def increments(self) -> int:
-        """In how many increments the load takes all steps where there is friction."""
-        return self._increments_in(self.count)
-
     def cost(self, factors: int = 1) -> Times:
         """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
         found = super().cost(factors)
@@ -173,11 +172,6 @@ class Path(Hyperelastic):
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""
         return super().words(lambda path: self.in_words(path) if path in self.steps else said(path), where)
-
-    def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
-        """Mesh the body and compile the forms on a communicator; collective. As `Hyperelastic.build`."""
-        model = "history:HistoryModel" if self.frictional else "path:built"
-        return named(f"forward.fem.{model}")(self, comm, parameters)
 
     def _mistakes(self) -> Iterator[Mistake]:
         yield from super()._mistakes()

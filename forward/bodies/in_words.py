@@ -11,10 +11,10 @@ from forward.words import listed, named, settings
 if TYPE_CHECKING:
     from forward.bodies.inclusions import Inclusion
     from forward.bodies.random_fields import RandomField
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
 
 
-def in_words(model: Hyperelastic, said: Callable[[str], str], where: str) -> Iterator[tuple[str, list[str]]]:
+def in_words(model: LoadedBody, said: Callable[[str], str], where: str) -> Iterator[tuple[str, list[str]]]:
     """Describe a body, its material, supports and loads; arguments as in `ModelSpec.words`."""
     body = model.body
     yield "body", [f"{body.description}; {body.cells_in_words} cells ({body.cell}, degree {body.degree}){where}"]

@@ -28,7 +28,7 @@ from forward.model import FloatArray, Guess, SolveError
 
 if TYPE_CHECKING:
     from forward.fem.solution import FiniteElementSolution
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
 
 BULK = 0.5  # share of the refined cells in the sum of all indicators
 TIES = 1e-6  # indicators that differ by less, relative to each other, are equal: symmetric meshes stay so
@@ -100,7 +100,7 @@ class Adapted:
 
 
 def adapt(
-    spec: Hyperelastic,
+    spec: LoadedBody,
     comm: Any,
     parameters: tuple[str, ...],
     point: FloatArray,
@@ -215,7 +215,7 @@ class _Solved:
         return np.asarray(np.einsum("nk,nka->na", weights, displacements[node].reshape(*weights.shape, 3)))
 
 
-def _cycle(before: tuple[Cycle, ...], spec: Hyperelastic, solution: FiniteElementSolution) -> Cycle:
+def _cycle(before: tuple[Cycle, ...], spec: LoadedBody, solution: FiniteElementSolution) -> Cycle:
     """Estimate the errors of a solution, after meshes `before`; collective."""
     values, error = solution.outputs, solution.mesh_error()
     seen = error.outputs if error.nonlinearity < 1 else np.full(len(values), np.nan)  # worth nothing
@@ -251,7 +251,7 @@ def largest(indicators: FloatArray) -> IntArray:
     return np.asarray(np.flatnonzero(indicators >= (1 - TIES) * last))
 
 
-def _too_large(spec: Hyperelastic, most: int) -> str | None:
+def _too_large(spec: LoadedBody, most: int) -> str | None:
     """Say why the mesh is too large to be made; None if it is not."""
     if spec.unknowns > most:
         return f"the next mesh would have {spec.unknowns:,} unknowns, unknowns = {most:,}"
@@ -300,7 +300,7 @@ def _by_cell(model: HyperelasticModel, values: NDArray[Any]) -> NDArray[Any] | N
     return np.asarray(rows[np.argsort(numbers)])
 
 
-def _line(spec: Hyperelastic, cycle: Cycle) -> str:
+def _line(spec: LoadedBody, cycle: Cycle) -> str:
     assert spec.adapt is not None
     if not np.isfinite(cycle.errors).any():
         return f"mesh of {cycle.unknowns:,} unknowns: too coarse for estimates, refined where stresses jump"

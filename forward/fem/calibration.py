@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from forward.fem.enriched import Enriched, EnrichedState
     from forward.fem.equations import Discretisation
     from forward.fem.solution import FiniteElementSolution
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders
 USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
@@ -148,7 +148,7 @@ class FinerMesh:
         once = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
         return self._built(spec.model_copy(update={"solver": spec.solver.model_copy(update=once)}))
 
-    def _built(self, spec: Hyperelastic) -> HyperelasticModel:
+    def _built(self, spec: LoadedBody) -> HyperelasticModel:
         names = tuple(self._model.parameters[i] for i in self._scalars)
         return HyperelasticModel(spec, self._model.equations.comm, names)
 

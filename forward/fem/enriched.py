@@ -26,7 +26,7 @@ from forward.observables.observable import Functional
 
 if TYPE_CHECKING:
     from forward.fem.solution import FiniteElementSolution
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
 
 
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
@@ -148,7 +148,7 @@ class Enriched(EnrichedEquations):
         The outputs of the body.
     """
 
-    def __init__(self, equations: Discretisation, spec: Hyperelastic, functionals: Sequence[Functional]) -> None:
+    def __init__(self, equations: Discretisation, spec: LoadedBody, functionals: Sequence[Functional]) -> None:
         super().__init__(equations, spec)
         self._of_forces = [output.of_held for output in spec.outputs]
         self._functionals = [

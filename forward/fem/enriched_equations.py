@@ -22,7 +22,7 @@ from forward.solvers.multigrid import minimised, smoothed
 
 if TYPE_CHECKING:
     from forward.fem.solution import FiniteElementSolution
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
 
 
 ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
@@ -50,7 +50,7 @@ class EnrichedEquations:
         How they are solved; depends only on sizes, form and degree.
     """
 
-    def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
+    def __init__(self, equations: Discretisation, spec: LoadedBody) -> None:
         self._coarse = equations
         self.equations = Discretisation(spec, equations.comm, equations.parameters, equations)
         pairs = [(equations.unknowns.displacement, self.equations.unknowns.displacement)]

@@ -23,7 +23,7 @@ from forward.fem import ranks
 from forward.fem.dolfinx import spaces
 from forward.fem.forms import Forms
 from forward.fem.linearisation import Linearisation
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 from forward.materials.admissible import moduli
 from forward.materials.material import constants
 from forward.model import FloatArray, SolveError, Work
@@ -45,7 +45,7 @@ class Discretisation(Linearisation):
     _deadline: tuple[float, float] | None = None  # when the time of a solve ends, and its length
     _deformed: tuple[FloatArray, FloatArray] | None = None  # a state, and the deformation gradients there
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
         self._jacobians = self.at_points(self.J, often=True)
         self._external = 0.0

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.fem.path import PathModel
     from forward.fem.specimen import SpecimenModel
-    from forward.hyperelastic import Hyperelastic
+    from forward.loaded import LoadedBody
     from forward.specimen import Specimen
 
-    AnyBody = Hyperelastic | Specimen
+    AnyBody = LoadedBody | Specimen
     AnyModel = HyperelasticModel | PathModel | SpecimenModel
 
 TIMES = 1.5  # cells along an edge, over those of the body

@@ -16,7 +16,7 @@ from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 from forward.materials.material import energy_of, isochoric
 from forward.model import FloatArray
 from forward.solid import CONTRAST
@@ -39,7 +39,7 @@ class Forms:
         Forms of the same body in other elements, whose mesh and random fields these share.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         self.spec = spec
         self.comm = comm
         self.parameters = parameters

@@ -19,9 +19,8 @@ from forward.fem.equations import Discretisation
 from forward.fem.model import RAISES, STIFFER, HyperelasticModel
 from forward.fem.path import last_first, reached
 from forward.fem.space import JoinedSpace
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, MeshError, OneByOne, Saturation, SolveError, Stability, Work
-from forward.path import Path
 from forward.solvers.acceptance import Diverged
 from forward.solvers.newton import newton
 from forward.solvers.system import Found
@@ -74,13 +73,12 @@ class HistoryModel(OneByOne):
         As in `HyperelasticModel`.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: object, parameters: tuple[str, ...]) -> None:
+    def __init__(self, spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> None:
         self.spec, self.parameters = spec, parameters
-        steps = spec.steps if isinstance(spec, Path) else {}
-        whole = spec.whole if isinstance(spec, Path) else spec
+        steps = spec.stepped
         self.outputs = tuple(output.name for output in spec.returned)
         self.values = np.array(list(steps.values())).T if steps else np.zeros((1, 0))  # (steps, numbers with steps)
-        self.body = HyperelasticModel(whole, comm, (*parameters, *steps))
+        self.body = HyperelasticModel(spec.whole, comm, (*parameters, *steps))
         self.equations: Discretisation = self.body.equations
         self._paths = tuple(steps)
         self._each = spec.increments // len(self.values)
@@ -195,7 +193,7 @@ class HistoryModel(OneByOne):
         """Raise the reason with the outputs of the steps that were reached."""
         known = HistorySolution(self, parameters, tuple(passed), self.equations.work, stiffer).outputs
         stop = error
-        if isinstance(self.spec, Path):
+        if self.spec.labels:
             stop = error.within(self.spec.labels[len(known) // len(self.body.outputs)])
         found = reached([known], len(self.outputs))
         raise type(error)(stop.reason, history, self.equations.work, error.stability, found) from error

@@ -17,7 +17,7 @@ from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unk
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
 from forward.solvers.system import ROUGH, TIGHT, LinearSolver
 
@@ -48,7 +48,7 @@ class Linearisation(Forms):
     Vectors hold this rank's part (U_local,); rows of prescribed unknowns are those of the identity.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
         self.work = Work()
         self.latest = Latest()

@@ -21,7 +21,7 @@ from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor, WayFromReference
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import BodySpace, Observation
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 from forward.materials.admissible import Admission
 from forward.model import (
     FloatArray,
@@ -86,7 +86,7 @@ class HyperelasticModel(OneByOne):
         For a path that is not a number of the model, or an output at a point outside the body.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
         scalars = spec.scalars
         coefficients = set(spec.coefficients)
         for path in parameters:

@@ -15,8 +15,8 @@ from forward.fem.equations import Discretisation
 from forward.fem.model import HyperelasticModel
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, Saturation, SolveError, Work
-from forward.path import Path
 
 FEW = 16  # parameters up to which derivatives of the states of all steps are kept
 
@@ -40,7 +40,7 @@ class PathModel(Joined):
 
     models: tuple[Mapped, ...]
     _: KW_ONLY
-    spec: Path
+    spec: LoadedBody
     steps: tuple[HyperelasticModel, ...]
     values: FloatArray
 
@@ -91,19 +91,19 @@ class PathModel(Joined):
         return last + ahead * (last - solutions[-2].state)
 
 
-def built(spec: Path, comm: object, parameters: tuple[str, ...]) -> PathModel:
+def built(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathModel:
     """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
-    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.steps))
-    steps = tuple(whole.with_own_reference() for _ in range(spec.count))
-    values = np.array(list(spec.steps.values())).T
-    extended = eye(len(parameters) + len(spec.steps), len(parameters), format="csr")
+    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.stepped))
+    steps = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
+    values = np.array(list(spec.stepped.values())).T
+    extended = eye(len(parameters) + len(spec.stepped), len(parameters), format="csr")
     maps = [Sparse(extended, np.append(np.zeros(len(parameters)), of_step)) for of_step in values]
     return PathModel(
         tuple(Mapped(step, by, parameters) for step, by in zip(steps, maps, strict=True)),
         tuple(output.name for output in spec.returned),
         spec.labels,
-        last_first(spec.count),
-        JoinedSpace(whole.space, spec.count, maps[0].along, whole.space.displacements),
+        last_first(len(spec.labels)),
+        JoinedSpace(whole.space, len(spec.labels), maps[0].along, whole.space.displacements),
         spec=spec,
         steps=steps,
         values=values,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
 
 
-def mistakes(spec: Hyperelastic) -> Iterator[str]:
+def mistakes(spec: LoadedBody) -> Iterator[str]:
     """Say what of a body cannot be reduced, one line each."""
     rubbing = [load.label for load in spec.loads if load.contact and not load.symmetric]
     if rubbing:
