@@ -27,8 +27,7 @@ from forward.observables.observable import Output
 from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import nearest, shown
 from forward.solvers.settings import SolverSettings
-from forward.terms.displacement import Displacement, too_far
-from forward.terms.steps import Block, lists
+from forward.terms.displacement import Block, Displacement, lists, too_far
 from forward.terms.support import Support
 from forward.terms.term import Load
 
