@@ -21,6 +21,7 @@ from forward.model import FloatArray
 from inverse.data.measurements import Measurements
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.record import Problem
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
@@ -110,7 +111,7 @@ def _inverted(
     sigma, numbers = np.hypot(size, mine.error), range(len(outputs))
     data = Measurements.of(values, sigma, numbers, numbers, outputs, parts=outputs, some=True)
     method = Invert(samples=SAMPLES, starts=1, seed=1)
-    return invert_few(inputs, SerialEvaluate(mine.model), data, method, finer=mine.finer).dataset, size
+    return invert_few(inputs, SerialEvaluate(mine.model), Problem(data, method, finer=mine.finer)).dataset, size
 
 
 def _mesh(mine: SharedExpansion, truth: FloatArray, clean: FloatArray, size: float) -> float:

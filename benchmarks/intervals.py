@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from inverse.criticism.answer import quantiles
 from inverse.methods.invert_few import invert_few
-from uq.evaluation.ensemble import Ensemble
+from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import parse
@@ -110,7 +110,7 @@ def held(folder: Path, count: int, seed: int, samples: int = SAMPLES) -> tuple[n
     study = parse(blocks | {"data": {"outputs": {"p0": 1.0}, "sigma": {"p0": 1.0}}})
     inputs = study.inputs
     measured = study.spec.build(MPI.COMM_SELF, inputs.names)
-    solved = SerialEvaluate(predicted.build(study, Ensemble.split(MPI.COMM_SELF)))
+    solved = SerialEvaluate(study.predicted.build(MPI.COMM_SELF, predicted.parameters(study)))
     before = predicted.prior_band(study, solved)
     points = inputs.random(seed, 0, count)
     found, exact = [], []
@@ -123,7 +123,9 @@ def held(folder: Path, count: int, seed: int, samples: int = SAMPLES) -> tuple[n
             kind: dict(zip(OUTPUTS, map(float, x), strict=True)) for kind, x in (("outputs", data), ("sigma", sigma))
         }
         one = parse(blocks | {"data": given})
-        inverted = invert_few(inputs, SerialEvaluate(measured), one.measured(0), one.method, finer=None).dataset
+        inverted = invert_few(
+            inputs, SerialEvaluate(measured), Problem(one.measured(0), one.method, finer=None)
+        ).dataset
         record = predicted.of_few(one, inverted, solved, solved, lambda: before)
         found.append([record["prediction_lower"], record["prediction_upper"]])
     truth = np.array([model["predicted"](point) for point in points])

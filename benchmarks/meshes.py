@@ -35,6 +35,7 @@ from inverse.data.measurements import Measurements
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.mesh_correction import Treatment, error_of
+from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -343,7 +344,9 @@ def inverted(
     inputs, model, finer = case
     data = measured(model, clean, noise, seed)
     start = partial(Nearby.at, model, spread=inputs.std)
-    found = invert_few(inputs, SerialEvaluate(model), data, method, finer=finer, start=start, model=model).dataset
+    found = invert_few(
+        inputs, SerialEvaluate(model), Problem(data, method, finer=finer), start=start, model=model
+    ).dataset
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),

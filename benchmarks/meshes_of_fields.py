@@ -46,6 +46,7 @@ from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.mesh_correction import error_of
+from inverse.methods.record import Problem as Asked
 from uq.evaluation.evaluate import SerialEvaluate
 
 if TYPE_CHECKING:
@@ -195,7 +196,7 @@ def _inverted(problem: Problem, data: Measurements, vertices: Vertices, truth: F
     """Invert one data set for a field."""
     begin = time.process_time()
     posterior = FieldPosterior(problem.model, data.values, data.sigma, problem.prior)
-    found = invert_field(posterior, data, Invert(), vertices, problem.finer)
+    found = invert_field(posterior, Asked(data, Invert(), finer=problem.finer), vertices)
     rest = _of_field(found, truth, problem.prior.matern.mass, problem.root)
     return rest | {"s": time.process_time() - begin}
 

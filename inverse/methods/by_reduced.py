@@ -9,7 +9,6 @@ smallest change that suits the new solves, and new draws are solved: what is che
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,14 +16,12 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel
 from inverse.criticism.doubts import SAME
-from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.weights import effective_sample_size, normalised, resampled
-from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
-from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Inverted, invert_few
+from inverse.methods.record import Problem
 from uq.evaluation.evaluate import OfEvaluate, Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
@@ -106,21 +103,12 @@ class Agreement:
         return cls(effective_sample_size(w) / n, shift, log_ratio, float(n * w.std(ddof=1) / np.sqrt(n)))
 
 
-def invert_by_reduced(
-    inputs: Inputs,
-    evaluate: Evaluate,
-    reduced: ForwardModel,
-    data: Measurements,
-    method: Invert,
-    errors: NormalErrors | StudentErrors = NORMAL,
-    finer: Finer | None = NOT_LOOKED,
-    say: Callable[[str], None] = lambda line: None,
-) -> xr.Dataset:
+def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel, problem: Problem) -> xr.Dataset:
     """Invert a data set with a reduced model of a body.
 
     Parameters
     ----------
-    inputs, data, method, errors, finer, say
+    inputs, problem
         As of `inverse.methods.invert_few`.
     evaluate
         The body.
@@ -132,14 +120,15 @@ def invert_by_reduced(
     SolveError
         If either has no answer where the search needs one.
     """
+    method = problem.method
     assert method.reduced is not None
     full, cheap = Recorder(evaluate), Recorder(SerialEvaluate(reduced))
-    centre, corrected = _corrected(inputs, full, cheap, data, method, errors)
+    centre, corrected = _corrected(inputs, full, cheap, problem)
     for number in range(1, ROUNDS + 1):
-        found = invert_few(inputs, corrected, data, method, errors=errors, finer=finer, start=lambda _: None, say=say)
+        found = invert_few(inputs, corrected, problem, start=lambda _: None)
         checked, points, left = _checked(found, full, centre, corrected, method)
         share = f"weights worth {100 * checked.share:.0f} % of {method.reduced.solves} draws"
-        say(f"posterior by the reduced model against full solves: {share}")
+        problem.say(f"posterior by the reduced model against full solves: {share}")
         if checked.share >= SAME or number == ROUNDS:
             break
         corrected = corrected.nearer(points, left, found.dataset["std"].to_numpy()[: len(inputs.names)])
@@ -155,16 +144,10 @@ def invert_by_reduced(
     )
 
 
-def _corrected(
-    inputs: Inputs,
-    full: Evaluate,
-    cheap: Evaluate,
-    data: Measurements,
-    method: Invert,
-    errors: NormalErrors | StudentErrors,
-) -> tuple[Linearisation, Corrected]:
+def _corrected(inputs: Inputs, full: Evaluate, cheap: Evaluate, problem: Problem) -> tuple[Linearisation, Corrected]:
     """Search with the reduced model as it is, and solve the body where that ends."""
-    posterior = Posterior(inputs, cheap, data.values, data.sigma, method.noise, data.which, errors=errors)
+    data, method = problem.data, problem.method
+    posterior = Posterior(inputs, cheap, data.values, data.sigma, method.noise, data.which, errors=problem.errors)
     gaussian = laplace(posterior, starts=method.starts, seed=method.seed, exact=False)
     point = posterior.physical(gaussian.mode[None])[0, : len(inputs.names)]
     own = cheap(Request(point[None], tangents=True))

@@ -15,13 +15,10 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution
 from inverse.criticism.answer import Answer, answer, by_gaussian
 from inverse.criticism.assessment import Assessment, Points, even, of_chains, of_gaussian, weighted
-from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import resampled
-from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.measurements import Measurements
-from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
@@ -32,6 +29,7 @@ from inverse.methods.record import (
     ENDS,
     SOURCES,
     TRUST,
+    Problem,
     Record,
     as_dataset,
     diagnosed,
@@ -99,33 +97,22 @@ class Inverted:
 def invert_few(
     inputs: Inputs,
     evaluate: Evaluate,
-    data: Measurements,
-    method: Invert,
+    problem: Problem,
     look: Look | None = None,
     *,
-    errors: NormalErrors | StudentErrors = NORMAL,
-    finer: Finer | None = NOT_LOOKED,
     start: Starts | None = None,
-    say: Callable[[str], None] = lambda line: None,
-    shared: Shared | None = None,
     model: ForwardModel | None = None,
 ) -> Inverted:
     """Invert a data set for few parameters.
 
     Parameters
     ----------
-    inputs, evaluate, data, method, errors
-        The unknowns, the model, the data, the method, and the distribution of the errors.
+    inputs, evaluate, problem
+        The unknowns, the model, and what is inverted.
     look
         The stiffness of the interior as a function of the parameters; None if there is none.
-    finer
-        The model on finer meshes; None where it has no mesh.
     start
         Predicts states from a solution at parameters (d,); by default by tangents there.
-    say
-        Shows the user a line before the search.
-    shared
-        What errors the data share; None if they are independent.
     model
         The model itself, whose gradients chains follow.
 
@@ -134,10 +121,11 @@ def invert_few(
     SolveError
         If the model has no answer where the search needs one.
     """
+    data, method, errors = problem.data, problem.method, problem.errors
     counted = Recorder(evaluate)
     of_data_set = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
-    looked = None if finer is None else Looked(finer, data.spread, method.treatment)
+    looked = None if problem.finer is None else Looked(problem.finer, data.spread, method.treatment)
     inferred = infer(
         of_data_set,
         start or (lambda point: linearise(inputs, evaluate, point).prediction),
@@ -145,10 +133,10 @@ def invert_few(
         starts=method.starts,
         seed=method.seed,
         look=looked,
-        shared=shared,
+        shared=problem.shared,
         chains=method.chains,
         model=model,
-        say=say,
+        say=problem.say,
     )
     posterior, searched, one, mesh = inferred.posterior, inferred.searched, inferred.assessment, inferred.mesh
     gaussian, found, chains = one.gaussian, one.evidence, one.chains

@@ -20,8 +20,6 @@ from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine
 from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
-from inverse.data.measurements import Measurements
-from inverse.data.shared_motion import Shared
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode, find_mode
@@ -33,6 +31,7 @@ from inverse.methods.record import (
     ENDS,
     SHOWN,
     TRUST,
+    Problem,
     Record,
     as_dataset,
     diagnosed,
@@ -88,26 +87,22 @@ def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) 
 
 def invert_field(
     posterior: FieldPosterior,
-    data: Measurements,
-    method: Invert,
+    problem: Problem,
     vertices: Vertices,
-    finer: Finer = NOT_LOOKED,
-    say: Callable[[str], None] = lambda line: None,
-    shared: Shared | None = None,
     predict: Callable[[LowRankPosterior, tuple[FloatArray, FloatArray] | None], Record] | None = None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
 
     A posterior, and the values with weights that correct it if it cannot be trusted, `predict` what else is asked for.
-    What errors the data share is said by a function of the values of the field; by default they are independent.
 
     Raises
     ------
     SolveError
         If the model has no answer at the centre of the prior.
     """
+    data, method, shared, finer = problem.data, problem.method, problem.shared, problem.finer or NOT_LOOKED
     g = vertices.volumes / vertices.volumes.sum()
-    before = _before(posterior, finer, say) if method.treatment is not None else None
+    before = _before(posterior, finer, problem.say) if method.treatment is not None else None
     first = None
     if shared is not None:  # which depends on the displacements
         posterior = replace(posterior, shared=shared(posterior.values(np.zeros(posterior.size))))

@@ -7,7 +7,8 @@ directions that all cases together constrain, exact to the first λ that was neg
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,11 +16,12 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.chains import Chains
-from inverse.criticism.finer import MeshFound
+from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.predictive import ResidualTest
 from inverse.data.approximation_error import Whitening
+from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.measurements import Measurements
-from inverse.data.shared_motion import determined
+from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
 from uq.estimators.estimate import part
@@ -134,6 +136,30 @@ DIMS: dict[str, tuple[str, ...]] = {
     "prediction_solves": (),
     "prediction_why": (),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A data set, and how it is inverted.
+
+    Attributes
+    ----------
+    data, method, errors
+        What was measured, the method, and the distribution of the errors.
+    finer
+        The model on finer meshes; None where it has no mesh.
+    shared
+        What errors the data share, at parameters (d,) or values of a field (N,); None if they are independent.
+    say
+        Shows the user a line before the search.
+    """
+
+    data: Measurements
+    method: Invert
+    errors: NormalErrors | StudentErrors = NORMAL
+    finer: Finer | None = NOT_LOOKED
+    shared: Shared | None = None
+    say: Callable[[str], None] = field(default=lambda line: None)
 
 
 def as_dataset(record: Record) -> xr.Dataset:

@@ -12,10 +12,10 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
-from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.criticism.finer import Finer
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
-from inverse.methods.record import with_record
+from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.kept import Kept, KeptModel
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
     from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
-    from inverse.methods.record import Record
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.predicted import FieldPredictions
@@ -148,53 +147,46 @@ def _judged(study: Inversion, made: _Made, found: xr.Dataset) -> xr.Dataset:
     return found
 
 
+On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
+
+
+def _problem(study: Inversion, number: int, seen: _Observed, on: On, say: Callable[[str], None]) -> Problem:
+    """Return what is inverted of a data set, by its number."""
+    finer = None
+    if seen.there is not None:
+        model, why = seen.there
+        finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
+    shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
+    return Problem(study.measured(number), study.method, study.data.errors, finer, shared, say)
+
+
 def _inverted(
     study: Inversion,
     made: _Made,
-    number: int,
     seen: _Observed,
-    full: Recorder,
-    on: Callable[[str, ForwardModel], Evaluate],
+    problem: Problem,
+    evaluate: Recorder,
     cheap: ForwardModel | None,
     start: Starts | None,
-    say: Callable[[str], None],
 ) -> xr.Dataset:
-    """Invert a data set, by its number, for few parameters.
-
-    Parameters
-    ----------
-    seen, full
-        What it is compared with, and its evaluation.
-    on
-        Evaluates other models, by names.
-    cheap
-        The reduced model that stands for it, if there is one.
-    start, say
-        As of `invert_few`.
-    """
-    data, method, errors = study.measured(number), study.method, study.data.errors
-    finer = _finer(seen.there, lambda model: Finer.by(on(FINER, model)))
-    shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
+    """Invert a data set for few parameters, with a reduced model if there is one, which is `cheap`."""
     if cheap is None:
-        return invert_few(
-            study.inputs,
-            full,
-            data,
-            method,
-            made.look,
-            errors=errors,
-            finer=finer,
-            start=start,
-            say=say,
-            shared=shared,
-            model=seen.model,
-        ).dataset
-    if shared is not None:  # a reduced model would have to know what moved points do
+        return invert_few(study.inputs, evaluate, problem, made.look, start=start, model=seen.model).dataset
+    if problem.shared is not None:  # a reduced model would have to know what moved points do
         message = "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
         raise SolveError(message)
     from inverse.methods.by_reduced import invert_by_reduced
 
-    return invert_by_reduced(study.inputs, full, cheap, data, method, errors, finer, say)
+    return invert_by_reduced(study.inputs, evaluate, cheap, problem)
+
+
+def _with_predictions(
+    study: Inversion, found: xr.Dataset, model: ForwardModel, on: On, before: Callable[[], Band]
+) -> xr.Dataset:
+    """Add what the posterior of few parameters says on the model of what is predicted, beside what the prior says."""
+    from workflows.studies.predicted import of_few
+
+    return with_record(found, of_few(study, found, on(PREDICTED, model), on(f"{PREDICTED}, mesh", model), before))
 
 
 def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
@@ -218,13 +210,22 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
         return KeptModel(model, kept(name))
 
     invert_field = _inverting_field(study, made, ensemble, states_of) if study.field else None
-    predicting = None if study.predict is None or study.field else _predicting(study, ensemble, beside)
+    predicted = None if study.predict is None or study.field else _predicted(study, ensemble)
+
+    @cache
+    def before() -> Band:
+        assert predicted is not None
+        found: Band = named("workflows.studies.predicted:prior_band")(study, beside(f"prior, {PREDICTED}", predicted))
+        return found
 
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
-        found = inverted(number, solved)
-        return found if predicting is None else with_record(found, predicting(names[number], found))
+        def on(name: str, model: ForwardModel) -> SerialEvaluate:
+            return beside(f"{names[number]}/{name}", model)
 
-    def inverted(number: int, solved: list[Evaluations]) -> xr.Dataset:
+        found = inverted(number, solved, on)
+        return found if predicted is None else _with_predictions(study, found, predicted, on, before)
+
+    def inverted(number: int, solved: list[Evaluations], on: On) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         if study.method.expansion is not None:
@@ -233,16 +234,13 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
                 solved += log
             return _by_expansion(study, found, number, ensemble.say)
         seen = made.observed(number)
-
-        def on(name: str, model: ForwardModel) -> SerialEvaluate:
-            return beside(f"{names[number]}/{name}", model)
-
+        problem = _problem(study, number, seen, on, ensemble.say)
         if invert_field is not None:
-            return invert_field(number, KeptModel(seen.model, kept(names[number]), solved), seen, on)
+            return invert_field(names[number], KeptModel(seen.model, kept(names[number]), solved), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
         near = partial(Nearby.at, seen.model, spread=study.inputs.std)
         cheap = None if reduced is None else reduced(seen.model)
-        return _inverted(study, made, number, seen, full, on, cheap, near, ensemble.say)
+        return _inverted(study, made, seen, problem, full, cheap, near)
 
     def forget() -> None:
         """Remove the solves of a data set, whose results are stored."""
@@ -287,27 +285,17 @@ def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Ca
     data = study.measured(number)
     missed = found.error[data.axes]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
-    errors = study.data.errors
-    evaluate, near = SerialEvaluate(found.model), partial(Nearby.at, found.model, spread=study.inputs.std)
-    one = invert_few(
-        study.inputs,
-        evaluate,
-        wider,
-        study.method,
-        errors=errors,
-        finer=found.finer,
-        start=near,
-        say=say,
-        model=found.model,
-    ).dataset
+    problem = Problem(wider, study.method, study.data.errors, found.finer, say=say)
+    near = partial(Nearby.at, found.model, spread=study.inputs.std)
+    one = invert_few(study.inputs, SerialEvaluate(found.model), problem, start=near, model=found.model).dataset
     size, count = float((missed / data.sigma).max()), found.solves + found.finer_solves
     return one.assign(solves=0.0, expansion_error=size, expansion_solves=float(count))
 
 
 def _inverting_field(
     study: Inversion, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
-) -> Callable[[int, ForwardModel, _Observed, Callable[[str, ForwardModel], Evaluate]], xr.Dataset]:
-    """Return what inverts a data set, by its number, for a field of a specimen."""
+) -> Callable[[str, ForwardModel, Problem], xr.Dataset]:
+    """Return what inverts a data set, by its name, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
 
@@ -316,48 +304,23 @@ def _inverting_field(
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
     predicting: Callable[[str], FieldPredictions] | None = None
     if study.predict is not None:
-        other = named("workflows.studies.predicted:build")(study, ensemble)
+        other = _predicted(study, ensemble)
         predicting = named("workflows.studies.predicted:of_field")(study, lambda name: states_of(name, other))
 
-    def invert(
-        number: int, states: ForwardModel, seen: _Observed, on: Callable[[str, ForwardModel], Evaluate]
-    ) -> xr.Dataset:
-        finer = _finer(seen.there, lambda model: Finer.by(on(FINER, model))) or NOT_LOOKED
-        shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-        data, errors = study.measured(number), study.data.errors
+    def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
+        data, errors = problem.data, problem.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
-        vertices = Vertices(offset, prior.matern.mass)
-        predict = None if predicting is None else predicting(study.data.sets[number].name)
-        return invert_field(posterior, data, study.method, vertices, finer, ensemble.say, shared, predict)
+        predict = None if predicting is None else predicting(name)
+        return invert_field(posterior, problem, Vertices(offset, prior.matern.mass), predict)
 
     return invert
 
 
-def _predicting(
-    study: Inversion, ensemble: Ensemble, beside: Callable[[str, ForwardModel], Evaluate]
-) -> Callable[[str, xr.Dataset], Record]:
-    """Return what predicts from the name of a data set and its results."""
-    model: ForwardModel = named("workflows.studies.predicted:build")(study, ensemble)
+def _predicted(study: Inversion, ensemble: Ensemble) -> ForwardModel:
+    """Make the model of what is predicted; collective over the group."""
+    from workflows.studies.predicted import parameters
 
-    @cache
-    def before() -> Band:
-        found: Band = named("workflows.studies.predicted:prior_band")(study, beside(f"prior, {PREDICTED}", model))
-        return found
-
-    def record(name: str, found: xr.Dataset) -> Record:
-        solves, of_mesh = (beside(f"{name}/{PREDICTED}{part}", model) for part in ("", ", mesh"))
-        predicted: Record = named("workflows.studies.predicted:of_few")(study, found, solves, of_mesh, before)
-        return predicted
-
-    return record
-
-
-def _finer(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:
-    """Return what finer meshes are solved by; None where there is no mesh."""
-    if there is None:
-        return None
-    model, why = there
-    return Finer(None, why) if model is None else solved(model)
+    return study.predicted.build(ensemble.group, parameters(study))
 
 
 def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
@@ -383,23 +346,24 @@ def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
     seen, reduced = made.observed(0), _reduced(study)
     recorders: dict[str, Recorder] = {}
     cheap = None if reduced is None else reduced(seen.model)
-    models = {FINER: None if seen.there is None else seen.there[0], MOVED: seen.shared and seen.shared[1]}
-    if study.predict is not None:
-        models[PREDICTED] = named("workflows.studies.predicted:build")(study, ensemble)
+    predicted = None if study.predict is None else _predicted(study, ensemble)
+    moved = None if seen.shared is None else seen.shared[1]
+    models = {FINER: None if seen.there is None else seen.there[0], MOVED: moved, PREDICTED: predicted}
     others = {name: partial(_itself, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         full = recorders["/"] = Recorder(evaluate)
 
         def on(name: str, _: ForwardModel) -> Evaluate:
-            return full.on(name) if name == FINER else evaluate.on(name)  # values at moved points are not kept
+            if name == PREDICTED:
+                return recorders.setdefault(name, Recorder(evaluate.on(name)))
+            # Values at moved points and errors of meshes are not kept.
+            return full.on(name) if name == FINER else evaluate.on(name.partition(",")[0])
 
-        found = _inverted(study, made, 0, seen, full, on, cheap, None, ensemble.say)
-        if study.predict is not None:
-            recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
-            before = partial(named("workflows.studies.predicted:prior_band"), study, recorders[PREDICTED])
-            of_few = named("workflows.studies.predicted:of_few")
-            found = with_record(found, of_few(study, found, recorders[PREDICTED], evaluate.on(PREDICTED), before))
+        found = _inverted(study, made, seen, _problem(study, 0, seen, on, ensemble.say), full, cheap, None)
+        if predicted is not None:
+            before = partial(named("workflows.studies.predicted:prior_band"), study, on(PREDICTED, predicted))
+            found = _with_predictions(study, found, predicted, on, before)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band, Record
-    from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
     from workflows.studies.inversion import Inversion, Predict
 
@@ -153,12 +152,6 @@ def _of_model(study: Inversion, asked: Predict) -> Iterator[Mistake]:
 
 
 # --- what is done ----------------------------------------------------------------------------------------------------
-
-
-def build(study: Inversion, ensemble: Ensemble) -> ForwardModel:
-    """Make the model of what is predicted; collective over the group."""
-    model: ForwardModel = study.predicted.build(ensemble.group, parameters(study))
-    return model
 
 
 def of_few(

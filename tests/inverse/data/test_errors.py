@@ -16,6 +16,7 @@ from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
@@ -103,7 +104,9 @@ def test_what_does_not_belong_does_not_decide():
     data = Measurements.of(VALUES, SIGMA, [0] * 15, [0] * 15, places=RNG.uniform(size=(15, 3)))
     method = Invert(samples=128, starts=2)
     plain, heavy = (
-        invert_few(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), data, method, lambda p: p[:, :1], errors=errors).dataset
+        invert_few(
+            Inputs({"a": PRIOR}), SerialEvaluate(MODEL), Problem(data, method, errors), lambda p: p[:, :1]
+        ).dataset
         for errors in (NormalErrors(), HEAVY)
     )
     _, mean, std, _ = quadrature()

@@ -11,6 +11,7 @@ from inverse.data.outputs import stated
 from inverse.methods.by_reduced import Agreement, Corrected, invert_by_reduced
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.record import Problem
 from tests import launch
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
@@ -225,11 +226,11 @@ def by_reduced(body, reduced, **settings):
     """Invert with one function in place of another; no file is read."""
     method = Invert.model_construct(**(Invert().model_dump() | {"starts": 1, "samples": 256} | settings))
     method.__dict__["reduced"] = type("Solves", (), {"solves": 24})()
-    return invert_by_reduced(INPUTS, SerialEvaluate(body), reduced, DATA, method, finer=None)
+    return invert_by_reduced(INPUTS, SerialEvaluate(body), reduced, Problem(DATA, method, finer=None))
 
 
 def direct(body):
-    return invert_few(INPUTS, SerialEvaluate(body), DATA, Invert(starts=1, samples=256), finer=None).dataset
+    return invert_few(INPUTS, SerialEvaluate(body), Problem(DATA, Invert(starts=1, samples=256), finer=None)).dataset
 
 
 def test_a_wrong_reduced_model_is_corrected_to_the_exact_posterior():

@@ -23,7 +23,7 @@ from inverse.fields.newton_cg import find_mode
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.invert_field import Vertices, invert_field
-from inverse.methods.record import as_dataset, stacked
+from inverse.methods.record import Problem, as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
 from tests.launch import TISSUQ, run, run_script
 from tests.problems import curved
@@ -78,9 +78,15 @@ def exactly(rows):
     return np.linalg.solve(precision, right), np.linalg.inv(precision)
 
 
+def few(method):
+    return invert_few(
+        Inputs(PRIORS), SerialEvaluate(linear()), Problem(DATA, method), lambda points: points[:, :1]
+    ).dataset
+
+
 def test_linear_models_have_the_exact_posterior():
     method = Invert(samples=64, starts=2)
-    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
+    record = few(method)
     prior_std = np.array([p.std for p in PRIORS.values()])
     mean = np.array([p.mean for p in PRIORS.values()])
 
@@ -106,7 +112,7 @@ def test_linear_models_have_the_exact_posterior():
 
 def test_the_noise_can_be_unknown():
     method = Invert(samples=256, starts=1, noise=LogUniform(lower=0.1, upper=10.0))
-    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
+    record = few(method)
     assert len(record["mode"]) == 4
     assert record["lower"][3] < 1 < record["upper"][3]
     assert np.isnan(record["alone_std"][:, 3]).all()
@@ -129,7 +135,7 @@ def test_solves_near_the_mode_are_screened_rather_than_counted():
 def test_what_is_left_is_of_chains_that_have_mixed(kind):
     """Moments, intervals and draws: those of the exact posterior, closer than so few weighted points come."""
     method = Invert(samples=32, starts=1, chains=kind)
-    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
+    record = few(method)
     exact, covariance = exactly(np.arange(12))
     std = np.sqrt(np.diag(covariance))
     assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
@@ -145,7 +151,7 @@ def test_what_is_left_is_of_chains_that_have_mixed(kind):
 
 def test_what_is_predicted_is_as_sure_as_the_parameters():
     method = Invert(samples=32, starts=1)
-    record = invert_few(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1]).dataset
+    record = few(method)
     _, covariance = exactly(np.arange(12))
     np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
 
@@ -157,14 +163,14 @@ def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
     data = Measurements.of(posterior.data, posterior.sigma, [0] * n, [0] * n, places=np.zeros((n, 3)))
     vertices = Vertices(np.full(posterior.size, 0.1), np.ones(posterior.size))
     method = Invert(samples=512, draws=100)
-    plain = invert_field(posterior, data, method, vertices)
+    plain = invert_field(posterior, Problem(data, method), vertices)
     assert plain["trust"] == 0
     np.testing.assert_array_equal(plain["stiffness_mean"], plain["stiffness_mode"])
     assert abs(plain["log_evidence"] - plain["laplace_log_evidence"]) > 1e-6
     assert 0 < plain["log_evidence_error"] < 0.5
     verdict = inverse.methods.invert_field.Verdict("corrected", "")
     monkeypatch.setattr(inverse.methods.invert_field, "verdict_on_field", lambda *_: verdict)
-    record = invert_field(posterior, data, method, vertices)
+    record = invert_field(posterior, Problem(data, method), vertices)
     mode = find_mode(posterior)
     weighed = weigh_field(mode.point, LowRankPosterior.at(mode.point), 512)
     np.testing.assert_allclose(record["stiffness_mean"], 0.1 + weighed.mean, rtol=1e-6)

@@ -20,6 +20,7 @@ from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.record import Problem
 from inverse.methods.selection import Noise, Select, posterior
 from tests.launch import TISSUQ, run, run_script
 from tests.problems import bananas
@@ -673,7 +674,7 @@ def of_bananas(pairs, bend=0.7, **settings):
     named = tuple(f"z{k}" for k in range(d))
     of_outputs = Measurements.of(np.zeros(d), np.ones(d), range(d), range(d), named, named, named, some=True)
     beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
-    asked = partial(invert_few, curved.inputs, evaluate, of_outputs, beside, finer=None, model=model)
+    asked = partial(invert_few, curved.inputs, evaluate, Problem(of_outputs, beside, finer=None), model=model)
     return found.sel(model="it", group="all"), lambda: asked().dataset, truth
 
 
