@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
@@ -24,6 +24,7 @@ DEEPEST = 32  # levels of lists and tables in a study
 LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smallest is one over the first
 MOST_LINES = 50
 REDUCED = "reduced"  # the kind of a model that is a file
+EACH = "*"  # element of a list, on a way of keys
 _OPTIONS = "model.config"  # of another program's model, of which nothing is known
 
 
@@ -94,71 +95,60 @@ def _beyond(place: str, value: Any) -> Iterator[str]:
         yield f"{value:g} is too {'large' if abs(value) > 1 else 'small'}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}"
 
 
-def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Give the full paths of a mesh, a reduced model, another study and its results, relative to the study's folder.
+def _located(blocks: Any, folder: Path) -> dict[str, Any]:
+    """Give the full paths of a mesh, a reduced model, draws, another study and its results, by the study's folder.
 
     What is not a mesh may be in the working directory too.
     """
-    method, model = blocks.get("method"), blocks.get("model")
-    for key in ("source", "study"):
-        file = method.get(key) if isinstance(method, Mapping) else None
-        if isinstance(file, str):
-            blocks = blocks | {"method": {**blocks["method"], key: _beside(file, folder)}}
-    reduced = method.get("reduced") if isinstance(method, Mapping) else None
-    block = {"file": reduced} if isinstance(reduced, str) else reduced
-    if isinstance(block, Mapping) and isinstance(block.get("file"), str | Mapping):
-        blocks = blocks | {
-            "method": {**blocks["method"], "reduced": {**block, "file": _all_beside(block["file"], folder)}}
-        }
-    blocks = _with_draws(blocks, folder)
-    cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
-    if isinstance(cheap, list):
-        found = [dict(_of_files(one, folder)) if isinstance(one, Mapping) else one for one in cheap]
-        found = [one | {"model": _of_files(one["model"], folder)} if _has(one, "model") else one for one in found]
-        blocks = blocks | {"method": {**blocks["method"], "cheap": found}}
-    return blocks | {"model": _of_files(model, folder)} if isinstance(model, Mapping) else blocks
+
+    def in_block(given: Any) -> Any:
+        return {"file": given} if isinstance(given, str) else given
+
+    def beside(file: Any) -> Any:
+        """A file beside a study or in the working directory, or each of several by name."""
+        if isinstance(file, Mapping):
+            return {name: beside(one) for name, one in file.items()}
+        if not isinstance(file, str):
+            return file
+        place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+        return str(place.resolve())
+
+    def of_draws(block: Any) -> Any:
+        """In the directory of results that were begun with them, draws are kept."""
+        kept = isinstance(block, Mapping) and block.get("digest") and (folder / KEPT).exists()
+        return _changed(block, ("file",), lambda file: str((folder / KEPT).resolve()) if kept else beside(file))
+
+    def of_model(model: Any) -> Any:
+        if isinstance(model, Mapping) and model.get("kind") == REDUCED:
+            return _changed(model, ("file",), beside)
+        mesh = ("body", "file")
+        return _changed(model, mesh, lambda file: str((folder / file).resolve()) if isinstance(file, str) else file)
+
+    for way, change in (
+        (("method", "source"), beside),
+        (("method", "study"), beside),
+        (("method", "reduced"), in_block),
+        (("method", "reduced", "file"), beside),
+        (("parameters", "from"), in_block),
+        (("parameters", "from"), of_draws),
+        (("method", "cheap", EACH), of_model),
+        (("method", "cheap", EACH, "model"), of_model),
+        (("model",), of_model),
+    ):
+        blocks = _changed(blocks, way, change)
+    return dict(blocks)
 
 
-def _beside(file: str, folder: Path) -> str:
-    """Return the full path of a file beside a study, or in the working directory."""
-    place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
-    return str(place.resolve())
-
-
-def _all_beside(file: Any, folder: Path) -> Any:
-    """Return the full path of a file, or of each of several by name, as `_beside`."""
-    if isinstance(file, Mapping):
-        return {name: _all_beside(one, folder) for name, one in file.items()}
-    return _beside(file, folder) if isinstance(file, str) else file
-
-
-def _has(block: Any, key: str) -> bool:
-    return isinstance(block, Mapping) and isinstance(block.get(key), Mapping)
-
-
-def _of_files(model: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """Give the full paths of the files of a model, as `_located`."""
-    file = model.get("file")
-    if model.get("kind") == REDUCED and isinstance(file, str):
-        return {**model, "file": _beside(file, folder)}
-    file = model["body"].get("file") if _has(model, "body") else None
-    if not isinstance(file, str):
-        return model
-    return {**model, "body": {**model["body"], "file": str((folder / file).resolve())}}
-
-
-def _with_draws(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Give the full path of draws; in the directory of results that were begun with them, they are kept."""
-    parameters = blocks.get("parameters")
-    source = parameters.get("from") if isinstance(parameters, Mapping) else None
-    block = {"file": source} if isinstance(source, str) else source
-    if not isinstance(parameters, Mapping) or not isinstance(block, Mapping) or not isinstance(block.get("file"), str):
+def _changed(blocks: Any, way: Sequence[str], change: Callable[[Any], Any]) -> Any:
+    """Return a table in which what stands at a way of keys, if anything does, is changed."""
+    if not way:
+        return change(blocks)
+    key, *rest = way
+    if key == EACH:
+        return [_changed(one, rest, change) for one in blocks] if isinstance(blocks, list) else blocks
+    if not isinstance(blocks, Mapping) or key not in blocks:
         return blocks
-    file = block["file"]
-    kept = folder / KEPT
-    places = (*([kept] if block.get("digest") else []), folder / file, Path(file))
-    place = next((path for path in places if path.exists()), folder / file)
-    return blocks | {"parameters": {**parameters, "from": {**block, "file": str(place.resolve())}}}
+    return {**blocks, key: _changed(blocks[key], rest, change)}
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:

@@ -258,9 +258,10 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> 
         raise StudyError(message)
     rank_groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
     if rank_groups > blocks:
-        _note(
-            f"{rank_groups} groups of ranks were started for {blocks} task{'s' * (blocks > 1)}: {rank_groups - blocks} "
-            "of them will be idle; parallel.ranks_per_model makes groups larger"
+        tasks, idle = f"{blocks} task{'s' * (blocks > 1)}", rank_groups - blocks
+        _say(
+            f"note: {rank_groups} groups of ranks were started for {tasks}: {idle} of them will be idle; "
+            "parallel.ranks_per_model makes groups larger"
         )
     kept = directory / "study.toml"
     try:
@@ -358,11 +359,6 @@ def _finished(directory: Path) -> int | None:
 
 def _say(text: str) -> None:
     sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()
-
-
-def _note(text: str) -> None:
-    sys.stderr.write(f"note: {text}\n")
     sys.stderr.flush()
 
 

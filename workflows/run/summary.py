@@ -70,7 +70,7 @@ def summarised(
             **({} if source is None else {"source": source}),
             "versions": {"python": platform.python_version(), **versions()},
         },
-        **study.summary(job),
+        **job.told,
     }
 
 

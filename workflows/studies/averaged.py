@@ -34,9 +34,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluations
-    from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
-    from uq.inputs.random_parameters import Inputs
 
 LEAST = 1e-3  # probability of candidates that are left out
 
@@ -78,20 +76,10 @@ class AveragedStudy(Study):
     def _first(self) -> Study:
         return next(iter(self.parts.values()))
 
-    @property
-    def inputs(self) -> Inputs:
-        """Those of the most probable candidate."""
-        return self._first.inputs
-
     @cached_property
     def draws(self) -> Draws | None:
         """Those of the most probable candidate."""
         return self._first.draws
-
-    @property
-    def given(self) -> dict[str, Distribution]:
-        """Those of the most probable candidate."""
-        return self._first.given
 
     @cached_property
     def spec(self) -> ModelSpec:
@@ -159,10 +147,6 @@ class AveragedStudy(Study):
             told = branch.findings(self.parts[name].inputs, found, continued=False)
             add(dataset, *(one.of(f"Candidate '{name}'") for one in told))
         return with_unknown_meshes(self, dataset)
-
-    def summary(self, job: Job) -> dict[str, Any]:
-        """Return the probabilities."""
-        return job.told
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be averaged."""

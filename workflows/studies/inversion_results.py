@@ -16,6 +16,7 @@ from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, SOURCES, TRUST, stacked, usual_sizes
 from uq.estimators.estimate import part
+from workflows.config.priors import admissible
 from workflows.studies.findings_inversion import judged
 
 if TYPE_CHECKING:
@@ -179,12 +180,7 @@ def _prior_stiffness_std(study: Inversion, places: FloatArray, prior: NodalPrior
 
 def prior_draws(study: Inversion) -> FloatArray:
     """Prior draws (n, d) of the parameters."""
-    rng = np.random.default_rng(study.method.seed)
-    kept = np.zeros((0, len(study.inputs.names)))
-    while len(kept) < PRIOR_DRAWS:
-        points = study.inputs.from_normals(rng.standard_normal((PRIOR_DRAWS, len(study.inputs.names))))[0]
-        kept = np.concatenate([kept, points[study.inputs.allowed(points)]])
-    return kept[:PRIOR_DRAWS]
+    return admissible(study.inputs, np.random.default_rng(study.method.seed), PRIOR_DRAWS)
 
 
 def _true_at(study: Inversion, measurement: Measurements | None, places: FloatArray) -> FloatArray:

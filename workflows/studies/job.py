@@ -84,12 +84,8 @@ class MethodJob(Job):
         Whether solves are worth storing: if not, an interrupted study starts again.
     node_volumes
         Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
-    estimates
-        Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
     passing
         Names of other models of which only the last one is kept in memory.
-    meshes_before
-        Meshes whose errors were estimated before this one was taken, as `workflows.studies.tolerance` keeps them.
     """
 
     model: ForwardModel
@@ -98,9 +94,7 @@ class MethodJob(Job):
     recorders: dict[str, Recorder]
     costly: bool = True
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
-    estimates: Sequence[Evaluations] = ()
     passing: frozenset[str] = frozenset()
-    meshes_before: Sequence[Mapping[str, Any]] = ()
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:

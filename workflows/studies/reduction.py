@@ -81,10 +81,6 @@ class ReductionStudy(Study):
         """Results are complete."""
         return dataset
 
-    def summary(self, job: Job) -> dict[str, Any]:
-        """Return how large it is, its errors, and where it is."""
-        return job.told
-
 
 def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
     """Return the study of one load case of a specimen, if that is what is to be reduced.

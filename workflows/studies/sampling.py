@@ -234,16 +234,6 @@ class Study(Sourced, StudyKind):
         found = named("workflows.studies.sampling_job:with_unknown_meshes")(self, found)
         return named("workflows.studies.adapted_mesh:with_history")(self, found) if self.model.adaptive else found
 
-    def summary(self, job: Job) -> dict[str, Any]:
-        """Return what was solved on each mesh, if there are several, and what estimates and refinement took."""
-        found: dict[str, Any] = named("workflows.studies.sampling_job:of_estimates")(self, job)
-        if len(self.meshes) > 1:
-            found["meshes"] = named("workflows.studies.sampling_job:of_meshes")(self, job)
-        if self.method.kind == "multifidelity":
-            found["fidelities"] = named("workflows.studies.sampling_job:of_fidelities")(self, job)
-        told = named("workflows.studies.adapted_mesh:history")(self) if self.model.adaptive else None
-        return found if told is None else found | {"adapted": told}
-
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
         others = {name: other.identity() for name, other in self.models.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -25,7 +25,7 @@ from workflows.results.directory import label, read_dataset, with_random_fields,
 from workflows.results.norms import node_volumes
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
-from workflows.studies.solves import measured, of_answers, stressed, with_stresses
+from workflows.studies.solves import measured, of_answers, stressed, with_contact, with_stresses
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,14 +46,14 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
     recorders: dict[str, Recorder] = {}
     estimates: list[Evaluations] = []
+    told: dict[str, Any] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         found = sampled(evaluate)
+        told.update(_told(study, recorders["/"], estimates, directory))
         if not (study.spec.meshed and study.spec.touched):
             return found
-        from workflows.studies.solves import with_contact
-
         tools = tuple(load.label for load in model.spec.loads if load.contact)
         return with_contact(found, tools, model.space.coordinates, inputs, evaluate, recorders["/"].first)
 
@@ -81,7 +81,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
                 add(found, *of_answers(function, inputs, own))
             return found
 
-        return MethodJob(function, others, task, recorders, labelled=described)
+        return MethodJob(function, others, task, recorders, labelled=described, told=told)
 
     model = cast("HyperelasticModel", function)
     # Rank 0 may leave the task by an exception: nothing collective may follow it.
@@ -102,7 +102,6 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         return with_random_fields(with_stresses(found, tensors), factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
-    before = named("workflows.studies.tolerance:meshes_before")(directory) if study.accuracy.tolerance else ()
     return MethodJob(
         model,
         others,
@@ -110,8 +109,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         recorders,
         labelled=labelled,
         node_volumes=volumes,
-        estimates=estimates,
-        meshes_before=before,
+        told=told,
     )
 
 
@@ -217,48 +215,32 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
     return dataset
 
 
-def of_estimates(study: Study, job: Job) -> dict[str, Any]:
-    """Number and time of the estimates of the error of the mesh, which `evaluations` does not count."""
-    assert isinstance(job, MethodJob)
-    told: dict[str, Any] = {}
-    seconds = 0.0
-    if job.estimates:
-        every = merge(job.estimates)
-        seconds = float(every.seconds.sum()) * study.parallel.ranks_per_model
+def _told(study: Study, recorder: Recorder, estimates: Sequence[Evaluations], directory: Path) -> dict[str, Any]:
+    """Return what was solved on each mesh or of each model, if there are several, and what estimates and meshes took.
+
+    Estimates of the error of the mesh are not among the evaluations. Solves stopped early are the model's.
+    """
+    ranks, told, seconds = study.parallel.ranks_per_model, dict[str, Any](), 0.0
+    refined = named("workflows.studies.adapted_mesh:history")(study) if study.model.adaptive else None
+    if estimates:
+        every = merge(estimates)
+        seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        sampled = sum(float(found.seconds.sum()) for found in job.evaluations.values())
-        earlier = sum(one["seconds"] for one in job.meshes_before)
-        refined = named("workflows.studies.adapted_mesh:history")(study) if study.model.adaptive else None
+        before = named("workflows.studies.tolerance:meshes_before")(directory)
+        earlier = sum(one["seconds"] for one in before)
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
-        ranks = study.parallel.ranks_per_model
-        told["accuracy_seconds"] = {"sampling": sampled * ranks, "mesh": seconds + earlier * ranks}
-    return told
+        told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}
 
+    def solved(model: str) -> dict[str, Any]:
+        parts = [part for part, name in zip(recorder.log, recorder.models, strict=True) if name == model]
+        taken = float(sum(part.seconds.sum() for part in parts)) * ranks
+        return {"solves": sum(len(part.points) for part in parts), "cpu_seconds": taken}
 
-def of_fidelities(study: Study, job: Job) -> list[dict[str, Any]]:
-    """What was solved of the model and of each cheap one, and its cost; solves stopped early are the model's."""
-    assert isinstance(job, MethodJob)
-    recorder = job.recorders["/"]
-    found = []
-    for name in (OWN, *study.models):
-        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == name]
-        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
-        solves = sum(len(part.points) for part in parts)
-        found.append({"name": name or "model", "solves": solves, "cpu_seconds": seconds})
-    return found
-
-
-def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:
-    """What was solved on each mesh, and its cost."""
-    assert isinstance(job, MethodJob)
-    recorder = job.recorders["/"]
-    found = []
-    for name, mesh in zip([OWN, *study.models], study.meshes, strict=True):
-        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == name]
-        if not parts:  # it was not needed
-            continue
-        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
-        solves = sum(len(part.points) for part in parts)
-        found.append({"unknowns": mesh.unknowns, "solves": solves, "cpu_seconds": seconds})
-    return found
+    if len(study.meshes) > 1:
+        meshes = zip((OWN, *study.models), study.meshes, strict=True)
+        needed = [(name, mesh) for name, mesh in meshes if name in recorder.models]
+        told["meshes"] = [{"unknowns": mesh.unknowns, **solved(name)} for name, mesh in needed]
+    if study.method.kind == "multifidelity":
+        told["fidelities"] = [{"name": name or "model", **solved(name)} for name in (OWN, *study.models)]
+    return told if refined is None else told | {"adapted": refined}

@@ -11,6 +11,7 @@ import numpy as np
 from forward.findings import Finding
 from forward.readable import percent
 from forward.words import number, with_error
+from workflows.config.priors import admissible
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -399,9 +400,5 @@ def _before(inputs: Inputs, factor: Distribution | None, seed: int) -> dict[str,
     from inverse.low_dimensional.posterior import NOISE
 
     rng = np.random.default_rng(seed)
-    kept = np.zeros((0, len(inputs.names)))
-    while len(kept) < DRAWS:
-        points = inputs.from_normals(rng.standard_normal((DRAWS, len(inputs.names))))[0]
-        kept = np.concatenate([kept, points[inputs.allowed(points)]])
-    found = dict(zip(inputs.names, kept[:DRAWS].T, strict=True))
+    found = dict(zip(inputs.names, admissible(inputs, rng, DRAWS).T, strict=True))
     return found if factor is None else found | {NOISE: factor.from_normal(rng.standard_normal(DRAWS))[0]}

@@ -186,10 +186,6 @@ class StudyKind(Settings):
         """Add to results what all evaluations say."""
         return dataset
 
-    def summary(self, job: Job) -> dict[str, Any]:
-        """Return the part of summary.json that is specific to this kind."""
-        return job.told
-
     @property
     def beside(self) -> Mapping[str, bytes]:
         """Files that are kept beside study.toml, by name."""
