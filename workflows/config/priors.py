@@ -142,16 +142,20 @@ def mistakes_of_priors(
     parameters: Mapping[str, Distribution],
     correlations: Sequence[Correlation],
     inputs: Callable[[], Inputs],
+    draws: Draws | None = None,
 ) -> Iterator[Mistake]:
-    """Find priors, by paths, that do not fit a model or each other; `inputs` makes the random parameters of them."""
+    """Find priors, by paths, or draws that do not fit a model or each other; `inputs` makes the random parameters."""
     materials = spec.materials(parameters)
     constants = () if materials is None else materials.names
     yield from mistakes_of_parameters(spec.scalars, parameters, constants, spec.unavailable)
+    if draws is not None:
+        yield from mistakes_of_draws(spec.scalars, draws, constants, spec.unavailable)
     try:
         found = inputs()
     except ValueError as error:
         yield ("correlations",), str(error), [c.model_dump() for c in correlations]
     else:
+        materials = spec.materials(found.names)
         if materials is not None:
             yield from mistakes_of_materials(found.within(materials), materials)
 

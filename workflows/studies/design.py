@@ -17,7 +17,7 @@ from inverse.methods.design import Design
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
-from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_draws, mistakes_of_priors, ranges
+from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_priors, ranges
 from workflows.config.source import AVERAGED, READER, Sourced
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.design_job import job, job_of_models
@@ -158,9 +158,7 @@ class DesignStudy(Sourced, StudyKind):
             yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
         yield from self.model.mistakes_of_mesh()
         yield from self.mistakes_of_ranks(self.spec)
-        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
-        if self.draws is not None:
-            yield from mistakes_of_draws(self.model.scalars, self.draws, (), self.model.unavailable)
+        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs, self.draws)
         yield from mistakes_of_values(self.method, self.model)
 
 

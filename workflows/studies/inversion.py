@@ -328,10 +328,12 @@ class Inversion(StudyKind):
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
         if self.specimen is not None:
-            yield from self._of_specimen(self.specimen)
+            yield from self._of_specimen()
         else:
             yield from self._of_outputs()
             yield from cast("MeasuredOutputs", self.data).mistakes(self.model)
+        if self.method.reduced is not None:
+            yield from self._of_reduced(self.method.reduced)
         if self.method.chains is not None:
             yield from not_installed("chains", self.method.chains, NEEDED[self.method.chains])
         if self.method.chains == "hmc" and self.method.reduced is not None:
@@ -346,7 +348,7 @@ class Inversion(StudyKind):
         if self.predict is not None:
             yield from named("workflows.studies.predicted:mistakes")(self)
 
-    def _of_specimen(self, specimen: Specimen) -> Iterator[Mistake]:
+    def _of_specimen(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of displacements."""
         nodal = [i for i, field in enumerate(self.model.fields) if field.basis == "nodes"]
         if nodal and (len(self.model.fields) > 1 or self.parameters):
@@ -364,8 +366,6 @@ class Inversion(StudyKind):
         if self.method.expansion is not None:
             message = "data sets of a specimen are observed at places of their own, expected outputs of another model"
             yield ("method", "expansion"), message, self.method.expansion
-        if self.method.reduced is not None:
-            yield from self._of_reduced_cases(self.method.reduced, specimen)
 
     def _of_outputs(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of outputs."""
@@ -375,51 +375,45 @@ class Inversion(StudyKind):
                 message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
                 yield ("model", "fields", i, "basis"), message, field.basis
         yield from self.mistakes_of_ranks(self.spec)
-        if self.method.reduced is not None:
-            yield from self._of_reduced(self.method.reduced)
         if not self.parameters and not self.model.coefficients:
             yield ("parameters",), "nothing is unknown, expected at least one prior", {}
 
-    def _of_reduced_cases(self, given: ByReduced, specimen: Specimen) -> Iterator[Mistake]:
+    def _of_reduced(self, given: ByReduced) -> Iterator[Mistake]:
+        """Find mistakes about reduced models: one of a body, one for each load case of a specimen."""
+        place = ("method", "reduced")
         if self.field:
             message = "a field of nodal values has no reduced model, expected few parameters, or the modes of a field"
-            yield ("method", "reduced"), message, given.files
+            yield place, message, given.files
             return
-        if not isinstance(given.file, dict) or set(given.file) != set(self.parts):
-            example = ", ".join(f'{name} = "FILE"' for name in self.parts)
-            message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
-            yield ("method", "reduced", "file"), message, given.file
-            return
+        if self.specimen is not None:
+            if not isinstance(given.file, dict) or set(given.file) != set(self.parts):
+                example = ", ".join(f'{name} = "FILE"' for name in self.parts)
+                message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
+                yield (*place, "file"), message, given.file
+                return
+            bodies = {case.name: self.specimen.loaded(case) for case in self.specimen.cases}
+        else:
+            if self.method.expansion is not None:
+                message = "stands for the body in place of a reduced model, expected one of both"
+                yield ("method", "expansion"), message, self.method.expansion
+            if not isinstance(given.file, str):
+                yield (*place, "file"), "a body has one reduced model, expected a file", given.files
+                return
+            if self.model.kind != "hyperelastic":
+                message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
+                yield place, message, given.file
+                return
+            bodies = {"": cast("Hyperelastic", self.spec)}
         try:
             found = self.reduced
         except ValidationError as error:
-            yield ("method", "reduced"), str(error.errors()[0]["msg"]), given.files
+            yield place, str(error.errors()[0]["msg"]), given.files
             return
-        object.__setattr__(given, "digest", {name: one.digest for name, one in found.items()})
-        unknown = (*self.parameters, *self.model.coefficients)
-        for case in specimen.cases:
-            body = specimen.loaded(case)
+        digests = {name: one.digest for name, one in found.items()}
+        object.__setattr__(given, "digest", digests.get("", digests))
+        for name, body in bodies.items():
             known = {*body.scalars, *body.coefficients}
-            for said in found[case.name].differences(body, [path for path in unknown if path in known]):
-                yield ("method", "reduced", "file", case.name), said, given.file[case.name]
-
-    def _of_reduced(self, reduced: ByReduced) -> Iterator[Mistake]:
-        if self.method.expansion is not None:
-            message = "stands for the body in place of a reduced model, expected one of both"
-            yield ("method", "expansion"), message, self.method.expansion
-        if not isinstance(reduced.file, str):
-            yield ("method", "reduced", "file"), "a body has one reduced model, expected a file", reduced.files
-            return
-        if self.model.kind != "hyperelastic":
-            message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
-            yield ("method", "reduced"), message, reduced.file
-            return
-        unknown = (*self.parameters, *self.model.coefficients)
-        try:
-            found = self.reduced[""]
-        except ValidationError as error:
-            yield ("method", "reduced"), str(error.errors()[0]["msg"]), reduced.file
-            return
-        object.__setattr__(reduced, "digest", found.digest)
-        for said in found.differences(cast("Hyperelastic", self.spec), unknown):
-            yield ("method", "reduced"), said, reduced.file
+            acting = [path for path in (*self.parameters, *self.model.coefficients) if path in known]
+            for said in found[name].differences(body, acting):
+                where, file = (("file", name), given.file[name]) if isinstance(given.file, dict) else ((), given.file)
+                yield (*place, *where), said, file

@@ -50,17 +50,12 @@ def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Vertices | 
     each = [one.dataset for one in outcomes]
     record = stacked(each, usual_sizes(study.method, field=study.field) | {"case": len(study.parts)})
     held: dict[str, Any] = dict(record)
-    held["why"] = (
-        "data_set",
-        [one.reason if one.dataset is None else str(one.dataset["why"].item()) for one in outcomes],
-    )
-    if "mesh_checked" in held:
-        held["mesh_why"] = ("data_set", ["" if one is None else str(one["mesh_why"].item()) for one in each])
-    if "prediction_why" in (next(one for one in each if one is not None)):
-        held["prediction_why"] = (
-            "data_set",
-            ["" if one is None else str(one["prediction_why"].item()) for one in each],
-        )
+    first = next(one for one in each if one is not None)
+    for name in ("why", "mesh_why", "prediction_why"):
+        if name in first:
+            lost = [one.reason if name == "why" else "" for one in outcomes]
+            words = [no if one is None else str(one[name].item()) for one, no in zip(each, lost, strict=True)]
+            held[name] = ("data_set", words)
     held["ok"] = ("data_set", [one is not None for one in each])
     found = list(study.measurements)
     count = len(found)

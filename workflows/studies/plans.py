@@ -158,13 +158,14 @@ def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compil
 
 def of_inversion(study: Inversion) -> list[str]:
     """Say what is inverted, and how long that will take."""
-    return _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
+    lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
+    refused = (f"warning     {one.refused}" for one in study.data.sets if one.refused)
+    return [f"method      {study.method.kind}", *lines, *refused]
 
 
 def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
     from workflows.studies.inversion import SOLVES_OF_FIELD
 
-    sets = study.data.sets
     usable = [m for m in study.measurements if m is not None]
     counts = [len(m) for m in usable]
     moved = [int((m.moves > 0).sum()) for m in usable]
@@ -182,7 +183,6 @@ def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
     once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
     seconds += once + _seconds_of_predictions(study) + _own_seconds(study, max(counts))
     return [
-        f"method      {study.method.kind}",
         f"unknown     {unknown}",
         *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
@@ -194,7 +194,6 @@ def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
         f"mesh check  {checked}",
         *_predicted(study),
         f"time        about {duration(seconds)} for each on 1 core (rough)",
-        *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
 
 
@@ -239,10 +238,9 @@ def _moved(count: int, usable: list[Measurements]) -> str:
 def _of_outputs(study: Inversion) -> list[str]:
     from inverse.methods.invert import derivable
 
-    spec, sets, method = study.spec, study.data.sets, study.method
+    spec, method = study.spec, study.method
     counts = [len(found) for found in study.measurements if found is not None]
     lines = [
-        f"method      {method.kind}",
         *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
         *(f"by          {one.description}" for one in study.reduced.values()),
         f"unknown     {len(study.names)}: {', '.join(study.names)}",
@@ -255,16 +253,9 @@ def _of_outputs(study: Inversion) -> list[str]:
     if cost is None:
         derivable(study.spec.build(None, study.inputs.names), spec.kind)
         each = f"up to about {duration(own)} for each, " if own else ""
-        lines.append(f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take")
-    else:
-        d = len(study.inputs.names)
-        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
-        seconds += own
-        if method.treatment is not None:
-            once, checked = mesh_check(spec)
-            seconds += once
-            lines.append(f"mesh check  {checked}")
-        else:
-            lines.append(f"mesh check  {NOT_ASKED}")
-        lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")
-    return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]
+        return [*lines, f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take"]
+    once, checked = mesh_check(spec) if method.treatment is not None else (0.0, NOT_ASKED)
+    d = len(study.inputs.names)
+    seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
+    each = duration(seconds + own + once)
+    return [*lines, f"mesh check  {checked}", f"time        about {each} for each on 1 core (rough)"]

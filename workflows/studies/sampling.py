@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -24,9 +25,7 @@ from workflows.config.blocks import Accuracy, Correlation
 from workflows.config.priors import (
     findings_of_draws,
     inputs_of,
-    mistakes_of_draws,
-    mistakes_of_materials,
-    mistakes_of_parameters,
+    mistakes_of_priors,
     ranges,
 )
 from workflows.config.source import AVERAGED, READER, STACKED, Sourced
@@ -270,21 +269,18 @@ class Study(Sourced, StudyKind):
         yield from unfit
         if not unfit:
             yield from self._mistakes_of_models()
-        yield from self._mistakes_of_parameters()
+        if not self.given and not self.model.coefficients:
+            or_field = ", or one of model.fields" if self.spec.meshed else ""
+            yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
+        yield from mistakes_of_priors(self.spec, self.parameters, self.correlations, lambda: self.inputs, self.draws)
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
             yield from named(f"{OF_TOLERANCE}:mistakes")(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
         yield from self.mistakes_of_ranks(self.spec)
         inputs = inputs_of(self.parameters, (), self.model.coefficients)
-        try:
+        with suppress(ValueError):  # correlations, which are reported above
             inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            materials = self.spec.materials(inputs.names)
-            if materials is not None:
-                yield from mistakes_of_materials(inputs.within(materials), materials)
         if not not_sampled:
             yield from self.method.mistakes(inputs, self.spec)
 
@@ -296,14 +292,3 @@ class Study(Sourced, StudyKind):
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
         except ModelError as error:
             yield ("method", "kind"), str(error), self.method.kind
-
-    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
-        spec = self.spec
-        if not self.given and not self.model.coefficients:
-            or_field = ", or one of model.fields" if spec.meshed else ""
-            yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
-        materials = spec.materials(self.parameters)
-        constants = () if materials is None else materials.names
-        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
-        if self.draws is not None:
-            yield from mistakes_of_draws(spec.scalars, self.draws, constants, spec.unavailable)
