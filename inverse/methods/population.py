@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -98,9 +98,7 @@ class Population(Settings):
         scale = Scale.of(self.distribution, posteriors)
         columns = Columns.of(self.covariates, list(posteriors))
         x, at = (columns.values, columns.row(self.new)) if self.covariates else (None, None)
-        reached = self._reached(
-            _Known(posteriors, dict.fromkeys(posteriors, prior)), scale, scale.of_prior(prior), x, again
-        )
+        reached = self._reached(posteriors, prior, scale, x, again)
         fit, estimates = reached.fit, reached.estimates
         new = scale.back(fit.predictive(self.seed, at))
         own = np.array([np.array(_moments(one)) for one in posteriors.values()])
@@ -151,50 +149,29 @@ class Population(Settings):
         return found
 
     def _reached(
-        self, known: _Known, scale: Scale, hyperprior: Hyperprior, x: FloatArray | None, again: Again | None
+        self, posteriors: Mapping[str, Draws], prior: Inputs, scale: Scale, x: FloatArray | None, again: Again | None
     ) -> _Reached:
         """Fit the population, and draw those specimens again of which few draws lie there, until there are none."""
-        names = list(known.draws)
+        names, parameters, hyperprior = list(posteriors), prior_names(posteriors), scale.of_prior(prior)
+        specimens = [scale.specimen(one, prior) for one in posteriors.values()]
         times: dict[str, int] = {}
         refused: dict[str, str] = {}
         for left in reversed(range(ROUNDS)):
-            fit = fitted(known.specimens(scale), hyperprior, self.draws, self.seed, covariates=x)
+            fit = fitted(specimens, hyperprior, self.draws, self.seed, covariates=x)
             estimates = [fit.estimates(i, self.seed) for i in range(len(names))]
             low = [i for i, (_, size) in enumerate(estimates) if size < LEAST and names[i] not in refused]
             if again is None or not low or not left:
                 break
             for i in low:
-                wider = scale.inputs(known.names, fit.predictive(self.seed, None if x is None else x[i]), hyperprior)
+                wider = scale.inputs(parameters, fit.predictive(self.seed, None if x is None else x[i]), hyperprior)
                 found = again(names[i], wider)
                 if isinstance(found, str):
                     refused[names[i]] = found
                     continue
-                known = known.replaced(names[i], found, wider)
+                order = [found.names.index(name) for name in parameters]
+                specimens[i] = scale.specimen(replace(found, names=parameters, values=found.values[:, order]), wider)
                 times[names[i]] = times.get(names[i], 0) + 1
         return _Reached(fit, estimates, times, refused)
-
-
-@dataclass(frozen=True)
-class _Known:
-    """Draws of each specimen, and the priors under which they were drawn."""
-
-    draws: Mapping[str, Draws]
-    priors: Mapping[str, Inputs]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return prior_names(self.draws)
-
-    def replaced(self, specimen: str, draws: Draws, prior: Inputs) -> _Known:
-        """Return the same with other draws of a specimen, with columns in the same order."""
-        order = [draws.names.index(name) for name in self.names]
-        found = Draws(self.names, draws.values[:, order], draws.weights, draws.effective)
-        return _Known({**self.draws, specimen: found}, {**self.priors, specimen: prior})
-
-    def specimens(self, scale: Scale) -> list[Specimen]:
-        """Return the specimens on the scale of the population."""
-        return [scale.specimen(one, self.priors[name]) for name, one in self.draws.items()]
 
 
 @dataclass(frozen=True)

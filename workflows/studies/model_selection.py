@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
@@ -29,7 +29,7 @@ from workflows.studies.measured import as_block, data_as
 from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
 from workflows.studies.selection import Comparison, Selection
 from workflows.studies.solves import of_answers
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -119,7 +119,7 @@ class ModelSelection(OfCandidates, Comparison):
     @property
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
-        return _bytes(self.of_candidates.values()) + max((_bytes(several) for several in self._finer), default=0.0)
+        return bytes_of(self.of_candidates.values()) + max((bytes_of(several) for several in self._finer), default=0.0)
 
     @property
     def _finer(self) -> list[tuple[Any, ...]]:
@@ -246,10 +246,3 @@ class ModelSelection(OfCandidates, Comparison):
 def block_of(model: Any) -> type[ListedDisplacements | ListedOutputs]:
     """Return the block of the data of a model."""
     return ListedDisplacements if usual_kind(model) == SPECIMEN else ListedOutputs
-
-
-def _bytes(specs: Iterable[Any]) -> float:
-    found = 0.0
-    for cost in (one.cost() for one in specs):
-        found += 0.0 if cost is None else cost.bytes
-    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -130,7 +130,7 @@ class StudyKind(Settings):
 
         A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen one.
         """
-        return sum(cost.bytes for cost in (spec.cost() for spec in self.specs) if cost is not None)
+        return bytes_of(self.specs)
 
     @property
     def growth(self) -> tuple[float, str]:
@@ -195,6 +195,11 @@ class StudyKind(Settings):
         """Return everything that evaluations depend on, as a table."""
         blocks = self.model_dump(mode="json", exclude_none=True)
         return {key: value for key, value in blocks.items() if key not in WITHOUT_EFFECT}
+
+
+def bytes_of(specs: Iterable[ModelSpec]) -> float:
+    """Memory (bytes) of models that are in memory together; 0 where there are no finite elements."""
+    return sum(cost.bytes for cost in (spec.cost() for spec in specs) if cost is not None)
 
 
 def _objection(found: Any) -> str | None:
