@@ -73,7 +73,7 @@ body = done(
 body[["mean", "std", "within", "between"]].to_dataframe()
 
 # %%
-plots.parts_of_variance(body)
+plots.selection.parts_of_variance(body)
 
 # %% [markdown]
 # ## Which test next?

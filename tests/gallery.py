@@ -15,7 +15,7 @@ from PIL import Image
 
 from tests.browser import Page, browser
 from workflows.report import plots
-from workflows.report.plots import inversion, population, selection
+from workflows.report.plots import inversion, posterior, selection
 from workflows.results.directory import read_dataset
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def _pictures(directory: Path) -> None:
         one = of.isel(data_set=0)
         drawn = {"pairs": inversion.correlations(one, dict.fromkeys(PLACES, "m"))}
     elif directory.name == "brain-population":
-        drawn = {"population": population.specimens(of, "mu1", "Pa")}
+        drawn = {"population": posterior.specimens(of, "mu1", "Pa")}
     elif directory.name == "stiffness-field":
         one = of.isel(data_set=0)
         drawn = {"slices": inversion.slices(one, inversion.Cut.of(one)), "spectrum": inversion.spectrum(one)}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
 
 from workflows.report import plots
 from workflows.report.plots.figure import png_of
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Row = TypeVar("Row")
 HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 
@@ -49,6 +50,11 @@ class Pairs(Block):
     macro = "pairs"
     items: Sequence[tuple[str, Sequence[str]]]
 
+    @classmethod
+    def of(cls, *said: tuple[str, str]) -> Pairs:
+        """Explain each word in one line."""
+        return cls([(word, [line]) for word, line in said])
+
 
 @dataclass(frozen=True)
 class Table(Block):
@@ -60,6 +66,18 @@ class Table(Block):
     text: frozenset[int] = frozenset({0})
     long: frozenset[int] = frozenset()
     strong: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        rows: Iterable[Row],
+        columns: Mapping[str, Callable[[Row], str]],
+        text: Collection[int] = (0,),
+        long: Collection[int] = (),
+    ) -> Table:
+        """Write rows of anything by what each column says of one."""
+        cells = [[cell(row) for cell in columns.values()] for row in rows]
+        return cls(tuple(columns), cells, frozenset(text), frozenset(long))
 
 
 @dataclass(frozen=True)
@@ -95,6 +113,11 @@ class Pictures(Block):
     macro = "pictures"
     items: Sequence[Picture]
     small: bool = False
+
+    @classmethod
+    def of(cls, *drawn: tuple[Axes, str], small: bool = False) -> Pictures:
+        """Show the figures of axes, each with its caption."""
+        return cls([Picture.drawn(ax, caption) for ax, caption in drawn], small)
 
 
 @dataclass(frozen=True)

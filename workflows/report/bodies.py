@@ -10,7 +10,7 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import scale
 from workflows.report.plots.figure import DARK
-from workflows.report.plots.view import looking
+from workflows.report.plots.places import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends, forward_scene, up_of
 from workflows.report.scene.skin import TRIANGLES, outer, skin
 from workflows.results.directory import TETRAHEDRON, mesh_grid

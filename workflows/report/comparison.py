@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from forward.readable import size
 from forward.words import NONE, duration
 from workflows.report import plots
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.section import Results
 
 
@@ -25,32 +25,27 @@ def content(studies: Mapping[str, Results]) -> Iterator[Block]:
         yield estimates(studies, output)
         datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
         if datasets:
-            captions: dict[plots.Estimated, str] = {
-                "mean": f"Mean of {output}, with 95 % confidence intervals.",
-                "std": f"Standard deviation of {output}, likewise.",
-            }
-            yield Pictures(
-                [
-                    Picture.drawn(plots.comparison(datasets, output, estimated), caption)
-                    for estimated, caption in captions.items()
-                ]
+            yield Pictures.of(
+                (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
+                (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
             )
 
 
 def costs(studies: Mapping[str, Results]) -> Table:
     """Methods and costs of several studies."""
-    rows = [
-        (
-            name,
-            results.summary["method"],
-            f"{results.summary['evaluations']:,}",
-            f"{results.summary['failed']:,}",
-            duration(results.summary["cpu_seconds"]),
-            duration(results.summary["wall_seconds"]),
-        )
-        for name, results in studies.items()
-    ]
-    return Table(("study", "method", "solves", "failed", "CPU time", "wall time"), rows, text=frozenset({0, 1}))
+    told = {name: results.summary for name, results in studies.items()}
+    return Table.of(
+        told,
+        {
+            "study": str,
+            "method": lambda name: str(told[name]["method"]),
+            "solves": lambda name: f"{told[name]['evaluations']:,}",
+            "failed": lambda name: f"{told[name]['failed']:,}",
+            "CPU time": lambda name: duration(told[name]["cpu_seconds"]),
+            "wall time": lambda name: duration(told[name]["wall_seconds"]),
+        },
+        text={0, 1},
+    )
 
 
 def estimates(studies: Mapping[str, Results], output: str) -> Table:

@@ -8,7 +8,7 @@ from an installed package, by an entry point ``section.NAME`` of the group ``tis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,14 +24,15 @@ from forward.words import NONE, with_error
 from uq.estimators.estimate import holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
+from workflows.report.blocks import Block, Table
 from workflows.report.words import solves
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from workflows.config.blocks import Report
-    from workflows.report.blocks import Block
 
+Content = Callable[["Results"], Iterator[Block]]
 ROWS = 40  # parameters from which on a table is in the order of their effects
 
 
@@ -106,6 +107,11 @@ class Results:
             return f"{size(value, unit, DIGITS)} (sampling ± {margin(error, unit, like=value)}, {NOT_KNOWN})"
         return f"{and_error(value, error, unit)} ({NOT_KNOWN})"
 
+    def estimates(self, words: Mapping[str, str]) -> Table:
+        """Write estimates of all outputs, a column of each by what it is called."""
+        rows = [(output, *(self.estimate(output, name) for name in words)) for output in self.outputs]
+        return Table(("output", *words.values()), rows)
+
     def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
         """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""
         if not holds(self.dataset, name, "corrected"):
@@ -156,60 +162,73 @@ class Section(ABC):
         """Headings, sentences, tables and pictures, from top to bottom."""
 
 
+def section(*needs: str, when: Callable[[Results], bool] | None = None) -> Callable[[Content], type[Section]]:
+    """Make a section of a function from results to blocks: of what it needs, and when it applies if that says less."""
+
+    def made(content: Content) -> type[Section]:
+        members: dict[str, Any] = {"__doc__": content.__doc__, "__module__": content.__module__, "needs": needs}
+        members["content"] = lambda _, results: content(results)
+        if when is not None:
+            members["applies"] = lambda self, results: Section.applies(self, results) and when(results)
+        return type(content.__name__, (Section,), members)
+
+    return made
+
+
 _HERE = "workflows.report.sections"
 SECTIONS = Kinds(
     "section",
     {
-        "header": f"{_HERE}.frame:Header",
-        "answer": f"{_HERE}.answer:AnswerFirst",
-        "findings": f"{_HERE}.frame:Findings",
-        "body": f"{_HERE}.bodies:Body",
-        "tolerance": f"{_HERE}.errors:Tolerance",
-        "error-budget": f"{_HERE}.errors:ErrorBudget",
-        "synthetic-data": f"{_HERE}.inversions:SyntheticData",
-        "design": f"{_HERE}.inversions:ChosenObservations",
-        "reduced": f"{_HERE}.reduced:ReducedModelOfBody",
-        "evidences": f"{_HERE}.selection:Evidences",
-        "path": f"{_HERE}.bodies:Curve",
-        "error-against-cost": f"{_HERE}.cost:ErrorAgainstCost",
-        "distribution": f"{_HERE}.estimates:Distribution",
-        "density": f"{_HERE}.estimates:Density",
-        "sobol": f"{_HERE}.sensitivity:SobolIndices",
-        "shapley": f"{_HERE}.sensitivity:ShapleyEffects",
-        "sobol-field": f"{_HERE}.sensitivity:SobolField",
-        "derivative-based": f"{_HERE}.sensitivity:DerivativeBased",
-        "contact": f"{_HERE}.bodies:Contact",
-        "local-sensitivities": f"{_HERE}.sensitivity:LocalSensitivities",
-        "local-field": f"{_HERE}.sensitivity:LocalField",
-        "batch": f"{_HERE}.inversions:Batch",
-        "predictions": f"{_HERE}.inversions:Predictions",
-        "posterior": f"{_HERE}.posterior:Posterior",
-        "posterior-field": f"{_HERE}.posterior:FieldPosterior",
-        "places": f"{_HERE}.bodies:Places",
-        "finer-meshes": f"{_HERE}.errors:FinerMeshes",
-        "dependence": f"{_HERE}.selection:Dependence",
-        "criticism": f"{_HERE}.fits:Criticism",
-        "held-out": f"{_HERE}.fits:HeldOut",
-        "curves": f"{_HERE}.fits:Curves",
-        "averages": f"{_HERE}.selection:Averages",
-        "constants": f"{_HERE}.fits:Constants",
-        "population": f"{_HERE}.inversions:PopulationOfSpecimens",
-        "candidates": f"{_HERE}.selection:AveragedCandidates",
-        "moments": f"{_HERE}.estimates:Moments",
-        "control-variate": f"{_HERE}.estimates:ControlVariate",
-        "total-errors": f"{_HERE}.estimates:TotalErrors",
-        "quantiles": f"{_HERE}.estimates:Quantiles",
-        "nominal": f"{_HERE}.estimates:Nominal",
-        "meshes": f"{_HERE}.errors:Meshes",
-        "fidelities": f"{_HERE}.cost:Fidelities",
-        "expansion": f"{_HERE}.estimates:Expansion",
-        "levels": f"{_HERE}.cost:Levels",
-        "adapted-mesh": f"{_HERE}.errors:AdaptedMesh",
-        "model": f"{_HERE}.frame:Model",
-        "priors": f"{_HERE}.frame:Priors",
-        "failures": f"{_HERE}.frame:Failures",
-        "run-time": f"{_HERE}.frame:RunTime",
-        "provenance": f"{_HERE}.frame:Provenance",
+        "header": f"{_HERE}.frame:header",
+        "answer": f"{_HERE}.answer:answer_first",
+        "findings": f"{_HERE}.frame:findings",
+        "body": f"{_HERE}.bodies:body",
+        "tolerance": f"{_HERE}.errors:tolerance",
+        "error-budget": f"{_HERE}.errors:error_budget",
+        "synthetic-data": f"{_HERE}.inversions:synthetic_data",
+        "design": f"{_HERE}.inversions:chosen_observations",
+        "reduced": f"{_HERE}.reduced:reduced_model_of_body",
+        "evidences": f"{_HERE}.selection:evidences",
+        "path": f"{_HERE}.bodies:curve",
+        "error-against-cost": f"{_HERE}.cost:error_against_cost",
+        "distribution": f"{_HERE}.estimates:distribution",
+        "density": f"{_HERE}.estimates:density",
+        "sobol": f"{_HERE}.sensitivity:sobol_indices",
+        "shapley": f"{_HERE}.sensitivity:shapley_effects",
+        "sobol-field": f"{_HERE}.sensitivity:sobol_field",
+        "derivative-based": f"{_HERE}.sensitivity:derivative_based",
+        "contact": f"{_HERE}.bodies:contact",
+        "local-sensitivities": f"{_HERE}.sensitivity:local_sensitivities",
+        "local-field": f"{_HERE}.sensitivity:local_field",
+        "batch": f"{_HERE}.inversions:batch",
+        "predictions": f"{_HERE}.inversions:predictions",
+        "posterior": f"{_HERE}.posterior:posterior",
+        "posterior-field": f"{_HERE}.posterior:field_posterior",
+        "places": f"{_HERE}.bodies:places",
+        "finer-meshes": f"{_HERE}.errors:finer_meshes",
+        "dependence": f"{_HERE}.selection:dependence",
+        "criticism": f"{_HERE}.fits:criticism",
+        "held-out": f"{_HERE}.fits:held_out",
+        "curves": f"{_HERE}.fits:curves",
+        "averages": f"{_HERE}.selection:averages",
+        "constants": f"{_HERE}.fits:constants",
+        "population": f"{_HERE}.inversions:population_of_specimens",
+        "candidates": f"{_HERE}.selection:averaged_candidates",
+        "moments": f"{_HERE}.estimates:moments",
+        "control-variate": f"{_HERE}.estimates:control_variate",
+        "total-errors": f"{_HERE}.estimates:total_errors",
+        "quantiles": f"{_HERE}.estimates:quantiles",
+        "nominal": f"{_HERE}.estimates:nominal",
+        "meshes": f"{_HERE}.errors:meshes",
+        "fidelities": f"{_HERE}.cost:fidelities",
+        "expansion": f"{_HERE}.estimates:expansion",
+        "levels": f"{_HERE}.cost:levels",
+        "adapted-mesh": f"{_HERE}.errors:adapted_mesh",
+        "model": f"{_HERE}.frame:model",
+        "priors": f"{_HERE}.frame:priors",
+        "failures": f"{_HERE}.frame:failures",
+        "run-time": f"{_HERE}.frame:run_time",
+        "provenance": f"{_HERE}.frame:provenance",
     },
     Section,
 )

@@ -27,7 +27,8 @@ from uq.inputs.distributions import LogNormal
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
-from workflows.report.sections.errors import finer_mesh_table as meshes
+from workflows.report.section import Results
+from workflows.report.sections.errors import finer_meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies.model_selection import ModelSelection
@@ -313,7 +314,7 @@ def test_a_study_says_what_its_meshes_do(study, monkeypatch, capsys):
         text.startswith("Finer meshes move ln Z by: right ") for text in (f["text"] for f in summary["findings"])
     )
     found = xr.load_dataset(out / "results.nc")
-    table = meshes(found)
+    *_, table = finer_meshes().content(Results(found, {}, None))
     assert [row[0] for row in table.rows] == ["right", "stiff"]
     blind = study.parent / "blind"
     assert main(["run", str(study), "--out", str(blind), "--set", "method.mesh_check=false"]) == 0

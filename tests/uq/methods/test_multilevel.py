@@ -23,7 +23,7 @@ from uq.methods.multilevel_meshes import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.report import plots
-from workflows.report.plots.multilevel import _sampling
+from workflows.report.plots.accuracy import _sampling
 from workflows.run.plan import plan
 
 INPUTS = Inputs({"a": Uniform(lower=0.5, upper=1.5), "b": Uniform(lower=0.0, upper=1.0)})

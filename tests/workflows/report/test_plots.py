@@ -6,7 +6,7 @@ import xarray as xr
 from scipy.stats import gaussian_kde, multivariate_normal
 
 from workflows.report import plots
-from workflows.report.plots import pairs, residuals
+from workflows.report.plots import places, posterior
 from workflows.report.plots.figure import in_fitting_units, quantity
 from workflows.report.scene.scene import spread_over
 
@@ -22,14 +22,14 @@ def test_densities_are_those_of_scipy(d):
     # SciPy's covariance is that of a sample: divided by one minus the sum of squared shares.
     slight = 1 - (shares**2).sum()
     known.set_bandwidth(known.factor * np.sqrt(slight))
-    np.testing.assert_allclose(pairs.density(draws, shares, at), known(at.T), rtol=1e-6)
+    np.testing.assert_allclose(posterior.density(draws, shares, at), known(at.T), rtol=1e-6)
 
 
 def test_contours_hold_what_they_say():
     x = np.linspace(-6, 6, 241)
     lattice = np.stack(np.meshgrid(x, x), axis=-1)
     density = multivariate_normal([0, 0], [[1, 0.6], [0.6, 1]]).pdf(lattice)
-    outer, inner = pairs.levels(density)
+    outer, inner = posterior.levels(density)
     # A Gaussian in two dimensions has the share p where it is above (1 - p) times its top.
     assert outer == pytest.approx(0.1 * density.max(), rel=0.02)
     assert inner == pytest.approx(0.5 * density.max(), rel=0.02)
@@ -38,9 +38,9 @@ def test_contours_hold_what_they_say():
 def test_draws_that_are_worth_few_are_smoothed():
     draws = np.repeat([[0.0], [1.0]], 200, axis=0)
     shares, at = np.full(400, 1 / 400), np.array([[0.0], [0.5]])
-    peak, middle = pairs.density(draws, shares, at)
+    peak, middle = posterior.density(draws, shares, at)
     assert middle < 0.2 * peak
-    peak, middle = pairs.density(draws, shares, at, 2.0)
+    peak, middle = posterior.density(draws, shares, at, 2.0)
     assert middle > 0.8 * peak
 
 
@@ -122,7 +122,7 @@ def test_measured_displacements_are_drawn_over_predicted_ones_in_one_unit():
         },
         coords={"case": ["shear", "press", "unseen"]},
     )
-    ax = residuals.agreement(one)
+    ax = places.agreement(one)
     shear, press, line = (np.array(drawn.get_xydata()) for drawn in ax.lines)
     np.testing.assert_allclose(shear, [[1, 1.1], [2, 2.1]])
     np.testing.assert_allclose(press, [[-3, -2.9]])

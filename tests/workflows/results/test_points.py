@@ -6,7 +6,7 @@ import xarray as xr
 
 from inverse.data.rigid import turned
 from workflows.report.plots.figure import png
-from workflows.report.plots.residuals import distances, residuals
+from workflows.report.plots.places import distances, residuals
 from workflows.results.points import measured_points, points_grid
 
 R = turned((0.0, 0.0, 5.0))  # its columns are the axes of the scanner in the body

@@ -1,14 +1,23 @@
 """Pictures of results: one function each, from the dataset of `read_dataset` to labelled axes.
 
 Functions with an argument `ax` draw there, or on a new figure that needs no display: in a notebook,
-``plots.histogram(dataset, "uy_max").figure``. Those of inversions and of comparisons of models are in `inversion` and
-`selection`; bodies are drawn by `workflows.report.bodies`.
+``plots.histogram(dataset, "uy_max").figure``. Those of inversions, of posteriors, of comparisons of models and of what
+is where on a body are in the modules `inversion`, `posterior`, `selection` and `places`; bodies are drawn by
+`workflows.report.bodies`.
 """
 
-from workflows.report.plots import inversion, selection
-from workflows.report.plots.against_cost import Cost, errors
-from workflows.report.plots.averaged import parts_of_variance
-from workflows.report.plots.budget import error_budget
+from workflows.report.plots import inversion, places, posterior, selection
+from workflows.report.plots.accuracy import (
+    error_budget,
+    errors,
+    levels,
+    mesh_cost,
+    mesh_mean,
+    mesh_samples,
+    mesh_variance,
+    refinement,
+    tolerance_bars,
+)
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span, svg
 from workflows.report.plots.indices import (
     BARS,
@@ -19,16 +28,7 @@ from workflows.report.plots.indices import (
     spectrum,
     tornado,
 )
-from workflows.report.plots.moments import (
-    Estimated,
-    comparison,
-    convergence,
-    histogram,
-    running_estimates,
-    standard_error,
-)
-from workflows.report.plots.multilevel import levels, mesh_cost, mesh_mean, mesh_samples, mesh_variance, refinement
-from workflows.report.plots.tolerance import tolerance_bars
+from workflows.report.plots.moments import comparison, convergence, histogram, running_estimates, standard_error
 
 __all__ = [
     "BARS",
@@ -38,8 +38,6 @@ __all__ = [
     "HIGH",
     "LOW",
     "PLAIN",
-    "Cost",
-    "Estimated",
     "active_summary",
     "axes",
     "comparison",
@@ -57,8 +55,9 @@ __all__ = [
     "mesh_mean",
     "mesh_samples",
     "mesh_variance",
-    "parts_of_variance",
+    "places",
     "png",
+    "posterior",
     "refinement",
     "running_estimates",
     "selection",

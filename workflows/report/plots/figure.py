@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.model import FloatArray
 from forward.readable import SIZES, is_path, scale, spoken
-from forward.words import number, power_of_ten
+from forward.words import named, number, power_of_ten
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -199,10 +201,40 @@ def grid(
     return [figure.add_axes((x / whole[0], y / whole[1], *extent)) for x, y in places]
 
 
+def finished(ax: Axes, x: str = "", y: str = "", *, above: int = 0, **legend: Any) -> Axes:
+    """Write what axes show, and a legend of what has labels: beside the data, or in so many columns `above` it."""
+    if x:
+        ax.set_xlabel(x)
+    if y:
+        ax.set_ylabel(y)
+    if ax.get_legend_handles_labels()[0]:
+        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.02, 1), "ncols": above} if above else {}
+        ax.legend(**{"fontsize": "small", "frameon": False} | place | legend)
+    return ax
+
+
+def rows(ax: Axes, names: Sequence[str]) -> NDArray[np.int64]:
+    """Give each name a row, from top to bottom, and return where (n,) these are."""
+    places = np.arange(len(names))[::-1]
+    ax.set_yticks(places, [text_of(name) for name in names])
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    return places
+
+
+def stacked(
+    ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], colours: Sequence[str], **look: Any
+) -> FloatArray:
+    """Draw a bar for each name from parts (n,) that follow each other, and return where (n,) the bars end."""
+    places, left = rows(ax, names), np.zeros(len(names))
+    for (label, widths), colour in zip(parts.items(), colours, strict=True):
+        ax.barh(places, widths, left=left, color=colour, label=label, **{"height": 0.6} | look)
+        left = left + widths
+    return left
+
+
 def quantity(dataset: xr.Dataset, output: str) -> str:
     """Name and unit of an output."""
-    unit = str(dataset["unit"].sel(output=output).item())
-    return text_of(output) + ("" if unit == "1" else f" ({unit})")
+    return named(text_of(output), str(dataset["unit"].sel(output=output).item()))
 
 
 def text_of(name: str) -> str:

@@ -8,52 +8,59 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uq.estimators.moments import half_width
-from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, count_axis, quantity, text_of
+from workflows.report.plots.figure import (
+    CONTROLLED,
+    DARK,
+    HIGH,
+    LOW,
+    axes,
+    count_axis,
+    finished,
+    quantity,
+    rows,
+    stacked,
+    text_of,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+
 BARS = 15  # parameters that a tornado chart shows
+PALE = "#c4cbd2"  # of what no parameter has alone
 SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 
 def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw how much an output changes, to first order, with each parameter one standard deviation from its mean."""
     effects = dataset["derivative_per_std"].sel(output=output).to_numpy()
-    order = np.argsort(np.abs(effects))[-BARS:]
+    order = np.argsort(-np.abs(effects))[:BARS]
     ax = ax or axes(height=1.3 + 0.42 * len(order))
+    places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
     for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
-        ax.barh(np.arange(len(order)), sign * effects[order], height=0.6, color=colour, label=label)
+        ax.barh(places, sign * effects[order], height=0.6, color=colour, label=label)
     ax.axvline(0, color=DARK, linewidth=0.8)
-    ax.set_yticks(np.arange(len(order)), [text_of(str(name)) for name in dataset["parameter"].to_numpy()[order]])
-    ax.set_ylim(-0.6, len(order) - 0.4)
     ax.locator_params(axis="x", nbins=6)
-    ax.set_xlabel(f"change of {quantity(dataset, output)}")
-    ax.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=2, frameon=False, fontsize="small")
-    return ax
+    return finished(ax, f"change of {quantity(dataset, output)}", above=2)
 
 
 def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the Sobol' indices of an output with 95 % confidence intervals, the parameter with the largest on top."""
     totals = dataset["sobol_total"].sel(output=output).to_numpy()
-    order = np.argsort(totals)[-BARS:]
+    order = np.argsort(-totals)[:BARS]
     ax = ax or axes(height=1.3 + 0.5 * len(order))
+    places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
     for which, colour, side in (("first", CONTROLLED, 0.19), ("total", HIGH, -0.19)):
         values, errors = (dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error"))
         label = "first order" if which == "first" else "total"
-        places = np.arange(len(order)) + side
         reach = half_width(dataset) * errors
-        ax.barh(places, values, xerr=reach, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label)
+        ax.barh(places + side, values, xerr=reach, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label)
     if "total_bound" in dataset:
         limits = dataset["total_bound"].sel(output=output).to_numpy()[order]
-        ax.plot(limits, np.arange(len(order)), "|", color=DARK, markersize=16, label="bound from derivatives")
+        ax.plot(limits, places, "|", color=DARK, markersize=16, label="bound from derivatives")
     ax.axvline(0, color=DARK, linewidth=0.8)
-    ax.set_yticks(np.arange(len(order)), [text_of(str(name)) for name in dataset["parameter"].to_numpy()[order]])
-    ax.set_ylim(-0.6, len(order) - 0.4)
-    ax.set_xlabel(f"Sobol' index of {text_of(output)}, 95 % interval")
-    ax.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=3, frameon=False, fontsize="small")
-    return ax
+    return finished(ax, f"Sobol' index of {text_of(output)}, 95 % interval", above=3)
 
 
 def index_shares(dataset: xr.Dataset, outputs: Sequence[str] | None = None, ax: Axes | None = None) -> Axes:
@@ -64,20 +71,12 @@ def index_shares(dataset: xr.Dataset, outputs: Sequence[str] | None = None, ax: 
         first = np.vstack([first, dataset["field_sobol_first"].to_numpy()])
         names.append("displacement field")
     order = np.argsort(-first.mean(axis=0))
-    places = np.arange(len(names))[::-1]
     ax = ax or axes(height=1.7 + 0.42 * len(names))
-    left = np.zeros(len(names))
-    for rank, i in enumerate(order[:SHARES]):
-        width = np.clip(first[:, i], 0, 1)
-        name = text_of(str(dataset["parameter"].to_numpy()[i]))
-        ax.barh(places, width, left=left, height=0.6, color=f"C{rank}", label=name)
-        left = left + width
-    rest = np.clip(1 - left, 0, None)
-    ax.barh(places, rest, left=left, height=0.6, color=PLAIN, alpha=0.5, label="interactions and the rest")
-    ax.set_yticks(places, [text_of(name) for name in names])
-    ax.set_xlabel("share of the variance")
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, fontsize="small")
-    return ax
+    own = {text_of(str(dataset["parameter"].values[i])): np.clip(first[:, i], 0, 1) for i in order[:SHARES]}
+    rest = np.clip(1 - sum(own.values(), np.zeros(len(names))), 0, None)
+    colours = [*(f"C{rank}" for rank in range(len(own))), PALE]
+    stacked(ax, names, own | {"interactions and the rest": rest}, colours)
+    return finished(ax, "share of the variance", above=2)
 
 
 def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -96,9 +95,7 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
             ax.plot(counts, mean, style, color=colour, label=name if which == "total" else None)
     ax.set_ylim(-0.1, 1.1)
     count_axis(ax, int(counts[0]), int(counts[-1]))
-    ax.set_ylabel(f"indices of {text_of(output)}")
-    ax.legend(title="total; dashed: first order", fontsize="small")
-    return ax
+    return finished(ax, y=f"indices of {text_of(output)}", title="total; dashed: first order")
 
 
 def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -111,15 +108,11 @@ def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
     ax.scatter(
         along, dataset["values"].sel(output=output).to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0
     )
-    ax.set_xlabel("leading direction (standard deviations)")
-    ax.set_ylabel(quantity(dataset, output))
-    return ax
+    return finished(ax, "leading direction (standard deviations)", quantity(dataset, output))
 
 
 def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the eigenvalues of the active subspace of an output with their 95 % ranges."""
-    from matplotlib.ticker import MaxNLocator
-
     ax = ax or axes()
     of_output = dataset.sel(output=output)
     values, lower, upper = (of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper"))
@@ -128,7 +121,5 @@ def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     ax.errorbar(places, values, yerr=reach, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
     if (values > 0).any():
         ax.set_yscale("log")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("number")
-    ax.set_ylabel(f"eigenvalue for {text_of(output)}")
-    return ax
+    ax.locator_params(axis="x", integer=True)
+    return finished(ax, "number", f"eigenvalue for {text_of(output)}")

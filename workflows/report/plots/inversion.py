@@ -12,8 +12,22 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.readable import size
 from forward.words import named, number
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LEGEND, PLAIN, axes, grid, span, text_of
-from workflows.report.plots.pairs import pairs
+from workflows.report.plots.figure import (
+    COLOURS,
+    CONTROLLED,
+    DARK,
+    HIGH,
+    LEGEND,
+    PLAIN,
+    axes,
+    finished,
+    grid,
+    rows,
+    span,
+    text_of,
+)
+from workflows.report.plots.posterior import density as density_of
+from workflows.report.plots.posterior import pairs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -176,27 +190,23 @@ def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, limi
 def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw λ of all load cases and of each alone."""
     from matplotlib import colormaps
-    from matplotlib.ticker import MaxNLocator
 
     ax = ax or axes()
-    rows = {"all together": one["eigenvalue"].to_numpy()}
-    rows |= {str(case): one["alone_eigenvalue"].sel(case=case).to_numpy() for case in one.case.values}
-    for i, (name, row) in enumerate(rows.items()):
-        values = row[np.isfinite(row) & (row > 1e-6 * rows["all together"][0])]
-        many = len(rows) - 1 > len(COLOURS)  # the first and the last are named, as of the steps of a path
-        shade = colormaps["viridis"]((i - 1) / max(len(rows) - 2, 1)) if many else COLOURS[i - 1]
-        label = None if many and 1 < i < len(rows) - 1 else name
+    found = {"all together": one["eigenvalue"].to_numpy()}
+    found |= {str(case): one["alone_eigenvalue"].sel(case=case).to_numpy() for case in one.case.values}
+    for i, (name, row) in enumerate(found.items()):
+        values = row[np.isfinite(row) & (row > 1e-6 * found["all together"][0])]
+        many = len(found) - 1 > len(COLOURS)  # the first and the last are named, as of the steps of a path
+        shade = colormaps["viridis"]((i - 1) / max(len(found) - 2, 1)) if many else COLOURS[i - 1]
+        label = None if many and 1 < i < len(found) - 1 else name
         colour = DARK if i == 0 else shade
         ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=label, linewidth=1, markersize=4)
     ax.axhline(SEEN, color=PLAIN, linestyle="--", linewidth=1)
     ax.set_yscale("log")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if len(rows["all together"]) == 1:
+    ax.locator_params(axis="x", integer=True)
+    if len(found["all together"]) == 1:
         ax.set_xlim(0, 2)
-    ax.set_xlabel("direction")
-    ax.set_ylabel("λ")
-    ax.legend(fontsize="small", frameon=False)
-    return ax
+    return finished(ax, "direction", "λ")
 
 
 def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:
@@ -218,7 +228,8 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
         every = slice(None, None, max(1, len(before[name][0]) // PRIOR))
         values, density = (one_[every] for one_ in before[name])
         x = np.linspace(*_cut(low, high, np.append(draws, mean), values[[0, -1]]), CURVE)
-        posterior = _smooth(draws, float(of["std"]), _worth(one), x)
+        shares = np.full(len(draws), 1 / max(len(draws), 1))
+        posterior = density_of(draws[:, None], shares, x[:, None], min(_worth(one), len(draws)))
         close.fill_between(x, posterior, **_FILLED)
         close.plot(x, _bell(x, mean, std), color=DARK, linewidth=1, label="Laplace")
         close.plot(x, np.interp(x, values, density, left=0.0, right=0.0), color=PLAIN, linestyle="--", label="prior")
@@ -285,13 +296,6 @@ def _worth(one: xr.Dataset) -> float:
     return float(one["chain_effective"] if int(one["chains"]) else one["effective"])
 
 
-def _smooth(draws: FloatArray, std: float, worth: float, x: FloatArray) -> FloatArray:
-    """Density at x of draws with an effective sample size, by normal kernels (Silverman's width)."""
-    width = max(std, 1e-300) * (4 / (3 * max(min(worth, len(draws)), 2.0))) ** 0.2
-    z = (x[:, None] - draws) / width
-    return np.asarray(np.exp(-(z**2) / 2).mean(axis=1) / (width * np.sqrt(2 * np.pi)))
-
-
 def _finish(ax: Axes, label: str, x: FloatArray) -> None:
     from matplotlib.ticker import MaxNLocator
 
@@ -341,18 +345,15 @@ def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw errors of the parameters whose true values are known, over their standard deviations."""
     names = [str(name) for name in one.parameter.values if np.isfinite(one["true"].sel(parameter=name))]
     ax = ax or axes(height=1.2 + 0.35 * len(names))
+    places = rows(ax, names)
     known = one.sel(parameter=names)
     z = ((known["mean"] - known["true"]) / known["std"]).to_numpy()
-    places = np.arange(len(names))[::-1]
     ax.axvspan(-1.96, 1.96, color=DARK, alpha=0.08, linewidth=0)
     ax.errorbar(z, places, xerr=1, fmt="o", color=CONTROLLED, capsize=4)
     ax.axvline(0, color=HIGH, linewidth=1)
-    ax.set_yticks(places, [text_of(name) for name in names])
-    ax.set_ylim(-0.6, len(names) - 0.4)
     farthest = max(3.0, 1.05 * float(np.abs(z).max()) + 1.3)
     ax.set_xlim(-farthest, farthest)
-    ax.set_xlabel("(mean − truth)/standard deviation")
-    return ax
+    return finished(ax, "(mean − truth)/standard deviation")
 
 
 def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -367,8 +368,7 @@ def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
         places, degrees, yerr=[np.minimum(reach, degrees), reach], fmt="_", color=DARK, markersize=18, capsize=5
     )
     ax.set_xticks(places, names, rotation=45 if len(names) > len(COLOURS) else 0)
-    ax.set_ylabel("|r|²")
-    return ax
+    return finished(ax, y="|r|²")
 
 
 def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -382,6 +382,6 @@ def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=DARK)
     for end in (-2, 2):
         ax.axvline(end, color=PLAIN, linestyle="--", linewidth=1)
-    ax.set_xlabel(f"error/standard deviation; {100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2")
-    ax.set_ylabel("density")
-    return ax
+    return finished(
+        ax, f"error/standard deviation; {100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2", "density"
+    )

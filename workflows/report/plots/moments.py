@@ -1,24 +1,41 @@
-"""Densities and moments of outputs against the number of samples."""
+"""Densities and moments of outputs, against the number of samples and over the steps of a path."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uq.estimators.estimate import estimate_of, single
+from forward.model import FloatArray
+from forward.words import named
+from uq.estimators.estimate import estimate_of, holds, single
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
 from uq.estimators.tails import skewed
-from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, count_axis, quantity, text_of
+from workflows.report.plots.figure import (
+    CONTROLLED,
+    DARK,
+    HIGH,
+    PLAIN,
+    axes,
+    count_axis,
+    finished,
+    quantity,
+    rows,
+    text_of,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+    from inverse.data.curves import Steps
+
+
 Estimated = Literal["mean", "std"]
+WORDS: dict[Estimated, str] = {"mean": "mean", "std": "standard deviation"}
 FIRST_SHOWN = 8  # estimates from fewer samples are meaningless
 MOST_BINS = 200
 WIDEST = 40  # characters of a name beside a plot
@@ -71,9 +88,7 @@ def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axe
         ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
         ax.plot(counts, mean, color=colour, label=label)
     count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
-    ax.set_ylabel(f"running mean of {quantity(dataset, output)}")
-    ax.legend(title="mean, 95 % band")
-    return ax
+    return finished(ax, y=f"running mean of {quantity(dataset, output)}", title="mean, 95 % band")
 
 
 def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -92,9 +107,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
         ax.yaxis.set_minor_locator(NullLocator())
-    ax.set_ylabel(f"standard error of {quantity(dataset, output)}")
-    ax.legend()
-    return ax
+    return finished(ax, y=f"standard error of {quantity(dataset, output)}")
 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -129,9 +142,13 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
         )
     ax.set_xlabel(quantity(dataset, output))
     unit = str(dataset["unit"].sel(output=output).item())
-    ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
-    ax.legend(fontsize="small", frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
-    return ax
+    return finished(
+        ax,
+        y="density" if unit == "1" else f"density (1/{unit})",
+        ncols=4,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.06),
+    )
 
 
 def _corrected_density(dataset: xr.Dataset, output: str, ax: Axes) -> None:
@@ -171,18 +188,14 @@ def comparison(
     """
     shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
     ax = ax or axes(height=1.2 + 0.42 * len(shown))
-    places = np.arange(len(shown))[::-1]
+    short = [name if len(name) <= WIDEST else f"…{name[1 - WIDEST :]}" for name in shown]  # a long path leaves no room
+    places = rows(ax, short)
     values = [float(d[estimated]) for d in shown.values()]
     errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
-    short = [name if len(name) <= WIDEST else f"…{name[1 - WIDEST :]}" for name in shown]  # a long path leaves no room
-    ax.set_yticks(places, [text_of(name) for name in short])
-    ax.set_ylim(-0.6, len(shown) - 0.4)
     ax.locator_params(axis="x", nbins=6)
-    word = {"mean": "mean", "std": "standard deviation"}[estimated]
     quantities = {quantity(datasets[name], output) for name in shown}
-    ax.set_xlabel(f"{word} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
-    return ax
+    return finished(ax, f"{WORDS[estimated]} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
 
 
 def _series(
@@ -208,3 +221,97 @@ def _series(
 def _first(n: int) -> int:
     """Return the number of samples where running estimates of n samples begin."""
     return max(2, min(FIRST_SHOWN, n // 2))
+
+
+NAMED = 8  # parameters that have a colour of their own
+
+
+def over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw the mean of an output over a path with the band of its quantiles and the error of the mean."""
+    ax = ax or axes()
+    there = _steps(dataset, output)
+    x = there[along].to_numpy()
+    if "quantiles" in there:
+        levels = there["quantile"].to_numpy()
+        low, high = (there["quantiles"].isel(quantile=int(i)).to_numpy() for i in (levels.argmin(), levels.argmax()))
+        label = f"{100 * levels.min():g} to {100 * levels.max():g} % of the values"
+        ax.fill_between(x, low, high, color=CONTROLLED, alpha=0.22, linewidth=0, label=label)
+    elif "std" in there:
+        mean, reach = there["mean"].to_numpy(), 2 * there["std"].to_numpy()
+        ax.fill_between(x, mean - reach, mean + reach, color=CONTROLLED, alpha=0.22, linewidth=0, label="2 deviations")
+    if "mean" in there:
+        error = half_width(dataset) * there["mean_error"].to_numpy()
+        ax.errorbar(x, there["mean"].to_numpy(), error, color=CONTROLLED, marker="o", ms=4, capsize=3, label="mean")
+    else:
+        ax.plot(x, there["nominal"].to_numpy(), color=CONTROLLED, marker="o", ms=4, label="at the mean parameters")
+    if holds(there, "mean", "corrected"):
+        ax.plot(
+            x, estimate_of(there, "mean").corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added"
+        )
+    return _along(ax, along, unit, named(text_of(output), str(there["unit"].to_numpy()[0])))
+
+
+def shares_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw the total Sobol' index of each parameter over a path with its 95 % interval."""
+    ax = ax or axes()
+    there = _steps(dataset, output)
+    values = there["sobol_total"].transpose("parameter", "output").to_numpy()
+    errors = half_width(dataset) * there["sobol_total_error"].transpose("parameter", "output").to_numpy()
+    _by_parameter(ax, dataset, there[along].to_numpy(), values, errors)
+    return _along(ax, along, unit, f"total Sobol' index of {text_of(output)}")
+
+
+def slopes_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw what one standard deviation of each parameter does to an output, to first order, over a path."""
+    ax = ax or axes()
+    there = _steps(dataset, output)
+    values = there["derivative_per_std"].transpose("parameter", "output").to_numpy()
+    _by_parameter(ax, dataset, there[along].to_numpy(), values, np.zeros_like(values))
+    changed = named(text_of(output), str(there["unit"].to_numpy()[0]))
+    return _along(ax, along, unit, f"change of {changed}", title="by one standard deviation of")
+
+
+def measured_over_path(one: xr.Dataset, output: str, steps: Steps, ax: Axes | None = None) -> Axes:
+    """Draw a measured curve of a data set with the prediction of its most probable parameters."""
+    ax = ax or axes()
+    along, (unit, values) = next(iter(steps.numbers.items()))
+    names = {f"{output}.{k}": value for k, value in enumerate(values, 1)}
+    known = np.isfinite(one["measured"].to_numpy())
+    parts = [
+        str(one.case.values[int(part)]) if ok else "" for part, ok in zip(one["datum_case"].values, known, strict=True)
+    ]
+    here = one.isel(datum=[k for k, part in enumerate(parts) if part in names])
+    x = np.array([names[part] for part in parts if part in names])
+    order = np.argsort(x, kind="stable")
+    mean, reach = (here[name].to_numpy()[order] for name in ("predicted", "predicted_std"))
+    ax.fill_between(x[order], mean - 1.96 * reach, mean + 1.96 * reach, color=CONTROLLED, alpha=0.22, linewidth=0)
+    ax.plot(x[order], mean, color=CONTROLLED, label="predicted, 95 % band of the parameters")
+    error = 1.96 * here["sigma"].to_numpy()
+    label = "measured, 95 % of its errors"
+    ax.errorbar(x, here["measured"].to_numpy(), error, color=DARK, fmt="o", ms=4, capsize=3, label=label)
+    return _along(ax, along, unit, named(text_of(output), steps.units[output]))
+
+
+def _by_parameter(ax: Axes, dataset: xr.Dataset, x: FloatArray, values: FloatArray, errors: FloatArray) -> None:
+    """Draw values (d, steps) of each parameter with their errors: the largest in colours, with names."""
+    order = np.argsort(-np.abs(values).max(axis=1))
+    for rank, i in enumerate(order):
+        if rank < NAMED:
+            name = text_of(str(dataset["parameter"].to_numpy()[i]))
+            error = errors[i] if errors[i].any() else None
+            ax.errorbar(x, values[i], error, color=f"C{rank}", marker="o", ms=4, capsize=3, label=name)
+        else:
+            ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
+    ax.axhline(0, color=DARK, linewidth=0.8)
+
+
+def _steps(dataset: xr.Dataset, output: str) -> xr.Dataset:
+    """Return the results of an output at every step, in their order."""
+    here = dataset.isel(output=np.flatnonzero(dataset["output_of"].to_numpy() == output))
+    return here.sortby("step")
+
+
+def _along(ax: Axes, path: str, unit: str, y: str, **legend: Any) -> Axes:
+    """Label the axes, the first of which is the number that has steps."""
+    ax.locator_params(axis="x", nbins=5)
+    return finished(ax, named(text_of(path), unit), y, **legend)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,8 +10,17 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import percent
 from forward.words import named, with_error
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, text_of
-from workflows.report.plots.pairs import pairs
+from workflows.report.plots.figure import (
+    COLOURS,
+    CONTROLLED,
+    DARK,
+    HIGH,
+    axes,
+    finished,
+    stacked,
+    text_of,
+)
+from workflows.report.plots.posterior import pairs
 from workflows.studies.selection_results import by_probability, ranking
 
 if TYPE_CHECKING:
@@ -35,21 +44,15 @@ def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     labels = [f"{model}\n{with_error(float(z), float(e))}" for model, z, e in zip(order, below, errors, strict=True)]
     ax.set_yticks(places, labels, fontsize="small")
     ax.set_xlim(1.15 * min(below.min(), -1.0), 0.05 * abs(below.min()) + 3 * errors.max())
-    ax.set_xlabel("ln Z − ln Z of the most probable")
-    return ax
+    return finished(ax, "ln Z − ln Z of the most probable")
 
 
 def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw the probabilities of the models side by side, a bar for each variant."""
-    names = [str(variant) for variant in dataset.variant.values]
+    names, of = [str(variant) for variant in dataset.variant.values], colours(dataset)
     ax = ax or axes(height=1.6 + 0.36 * len(names))
-    places = np.arange(len(names))[::-1]
-    left = np.zeros(len(names))
-    for model, colour in colours(dataset).items():
-        share = dataset["variant_probability"].sel(model=model).values
-        ax.barh(places, share, left=left, color=colour, label=model, height=0.6)
-        left = left + share
-    ax.set_yticks(places, names)
+    shares = {model: dataset["variant_probability"].sel(model=model).values for model in of}
+    stacked(ax, names, shares, list(of.values()))
     ax.set_xlim(0, 1)
     ax.set_xlabel("probability")
     ax.figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
@@ -84,8 +87,6 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = 
 
     `of` says what was measured, with its unit.
     """
-    from matplotlib.ticker import MaxNLocator
-
     ax = ax or axes(height=3.4)
     one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
     measured = one["measured"].values
@@ -93,11 +94,8 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = 
         left = (measured - one["prediction_mean"].sel(model=model).values) / one["sigma"].values
         ax.plot(measured, left, ".", markersize=4, color=style["color"], zorder=style["zorder"], label=label)
     ax.axhspan(-2, 2, color=DARK, alpha=0.08, linewidth=0)
-    ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.set_xlabel(f"measured {of}")
-    ax.set_ylabel("residual / σ")
-    ax.legend(fontsize="small", frameon=False)
-    return ax
+    ax.locator_params(axis="x", nbins=5)
+    return finished(ax, f"measured {of}", "residual / σ")
 
 
 def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -> Axes:
@@ -138,10 +136,7 @@ def _over(dataset: xr.Dataset, one: xr.Dataset, at: FloatArray, over: str, of: s
     error = one["sigma"].values
     ax.errorbar(at, one["measured"].values, yerr=error, fmt=".", color=DARK, label="measured", zorder=4)
     ax.locator_params(axis="x", nbins=6)
-    ax.set_xlabel(over)
-    ax.set_ylabel(of)
-    ax.legend(fontsize="small", frameon=False)
-    return ax
+    return finished(ax, over, of)
 
 
 def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
@@ -156,3 +151,39 @@ def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
         )
         for rank, model in enumerate(order)
     ]
+
+
+SHOWN = 12  # outputs that have bars
+PARTS = ("within", "between")
+
+
+def within_and_between(predictions: Mapping[str, xr.Dataset], ax: Axes | None = None) -> Axes:
+    """Draw a bar for each averaged prediction: the shares of its variance within the models and between them."""
+    names = list(predictions)[:SHOWN]
+    of = {part: np.array([float(predictions[name][f"average_{part}"]) for name in names]) for part in PARTS}
+    return _bars(names, {"within the models": of["within"]}, "between them", of["between"], ax)
+
+
+def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw a bar for each output: the share of its variance within each candidate, and that between them."""
+    outputs = [str(name) for name in dataset["output"].values][:SHOWN]
+    some = dataset.sel(output=outputs)
+    within = {}
+    for name in dataset["candidate"].values:
+        one = some.sel(candidate=name)
+        share = float(one["candidate_probability"]) * one["candidate_std"] ** 2
+        within[f"within {text_of(str(name))}"] = share.to_numpy()
+    return _bars(outputs, within, "between", some["between"].to_numpy(), ax)
+
+
+def _bars(
+    names: Sequence[str], within: Mapping[str, FloatArray], label: str, between: FloatArray, ax: Axes | None
+) -> Axes:
+    """Draw a bar for each of some names: shares of parts (n,) within candidates, and of that between them."""
+    ax = ax or axes(height=1.3 + 0.35 * len(names), width=7.0)
+    parts = {**within, label: between}
+    whole = sum(parts.values(), np.zeros(len(names)))
+    shares = {said: np.divide(part, whole, out=np.zeros(len(names)), where=whole > 0) for said, part in parts.items()}
+    stacked(ax, names, shares, [*(COLOURS[i % len(COLOURS)] for i in range(len(within))), DARK])
+    ax.set_xlim(0, 1)
+    return finished(ax, "share of the variance", above=3)

@@ -13,7 +13,7 @@ from forward.words import duration, number, power_of_ten, with_error
 from uq.estimators.estimate import single
 from uq.findings import DIGITS, NOT_KNOWN
 from workflows.report.blocks import Answer, Block, Card, Text
-from workflows.report.section import Results, Section
+from workflows.report.section import Results, section
 from workflows.report.sections.errors import counting, parts_of
 from workflows.report.sections.frame import gravest
 from workflows.report.sections.inversions import design_card as design
@@ -41,29 +41,27 @@ GOALS = 4  # predictions on the card
 LAPLACE = 0  # value of `source`, see docs/results.md
 
 
-class AnswerFirst(Section):
+@section()
+def answer_first(results: Results) -> Iterator[Block]:
     """What was asked and found, for every kind of study."""
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One card."""
-        dataset = results.dataset
-        for has, card in (
-            ("probability", selection),
-            ("alone_eigenvalue", inversion),
-            ("population_draw", population),
-            ("estimator", compared),
-            ("clean", made),
-            ("chosen", design),
-            ("mode_energy", reduced),
-            ("nominal", forward),
-            ("candidate_mean", forward),
-        ):
-            if has in dataset or has in dataset.dims:
-                found = card(results)
-                yield Card(found.question, found.answers[:TILES], gravest(results))
-                if len(found.answers) > TILES:
-                    yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
-                return
+    dataset = results.dataset
+    for has, card in (
+        ("probability", selection),
+        ("alone_eigenvalue", inversion),
+        ("population_draw", population),
+        ("estimator", compared),
+        ("clean", made),
+        ("chosen", design),
+        ("mode_energy", reduced),
+        ("nominal", forward),
+        ("candidate_mean", forward),
+    ):
+        if has in dataset or has in dataset.dims:
+            found = card(results)
+            yield Card(found.question, found.answers[:TILES], gravest(results))
+            if len(found.answers) > TILES:
+                yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
+            return
 
 
 def forward(results: Results) -> Card:

@@ -15,10 +15,9 @@ from forward.readable import and_error, size, spoken
 from forward.specimen import Specimen
 from forward.words import named, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
-from workflows.report.plots import path as path_plots
-from workflows.report.plots import places as place_plots
-from workflows.report.plots.contact import pressure_map
-from workflows.report.section import Results, Section
+from workflows.report.plots import moments
+from workflows.report.plots import places as maps
+from workflows.report.section import Results, section
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,46 +30,45 @@ DRAWN = 8  # data sets that have more than a row in the table
 STILLS = 2  # pictures for paper
 
 
-class Body(Section):
+def _body_applies(results: Results) -> bool:
+    """Whether one body was deformed, with or without a stored displacement, or specimens were inverted."""
+    if "stiffness_mean" in results.dataset:
+        return bool(results.dataset["ok"].any()) and "cell_nodes" in results.dataset
+    if _file(results) is not None:
+        return True
+    if "estimator" in results.dataset.dims:  # a comparison of methods, which is not about the body
+        return False
+    return "nominal" in results.dataset and (bool(results.study.spec.meshed) or "cell_nodes" in results.dataset)
+
+
+@section(when=_body_applies)
+def body(results: Results) -> Iterator[Block]:
     """A body to turn: coloured by its displacement, or by the stiffness that was found in it."""
+    from workflows.report.scene.scene import forward_scene
 
-    def applies(self, results: Results) -> bool:
-        """Whether one body was deformed, with or without a stored displacement, or specimens were inverted."""
-        if "stiffness_mean" in results.dataset:
-            return bool(results.dataset["ok"].any()) and "cell_nodes" in results.dataset
-        if _file(results) is not None:
-            return True
-        if "estimator" in results.dataset.dims:  # a comparison of methods, which is not about the body
-            return False
-        return "nominal" in results.dataset and (bool(results.study.spec.meshed) or "cell_nodes" in results.dataset)
+    dataset = results.dataset
+    if "stiffness_mean" in dataset:
+        one = dataset.sel(data_set=dataset.data_set.values[dataset["ok"]][0])
+        yield Heading("What is inside" + (f" {one.data_set.item()}" if dataset.sizes["data_set"] > 1 else ""))
+        yield specimen(one, results)
+        return
+    yield Heading("The deformed body")
+    reduced = _file(results)
+    if reduced is not None:
+        from workflows.report.scene.of_reduced import expanded
 
-    def content(self, results: Results) -> Iterator[Block]:
-        """The body, or why there is none."""
-        from workflows.report.scene.scene import forward_scene
-
-        dataset = results.dataset
-        if "stiffness_mean" in dataset:
-            one = dataset.sel(data_set=dataset.data_set.values[dataset["ok"]][0])
-            yield Heading("What is inside" + (f" {one.data_set.item()}" if dataset.sizes["data_set"] > 1 else ""))
-            yield specimen(one, results)
+        try:
+            dataset = expanded(reduced, results.study).assign_attrs(config=dataset.attrs["config"])
+        except SolveError as error:
+            yield Text(f"The reduced model has no answer: {error}.", "warning")
             return
-        yield Heading("The deformed body")
-        reduced = _file(results)
-        if reduced is not None:
-            from workflows.report.scene.of_reduced import expanded
-
-            try:
-                dataset = expanded(reduced, results.study).assign_attrs(config=dataset.attrs["config"])
-            except SolveError as error:
-                yield Text(f"The reduced model has no answer: {error}.", "warning")
-                return
-        if "cell_nodes" not in dataset:
-            yield Text("This study stores no displacement field.")
-            return
-        scene = forward_scene(dataset, results.study)
-        by = f"{scene.motion_name}, {largest(dataset)}" + (", by the reduced model" if reduced is not None else "")
-        yield turning(scene, f"The body, deformed by {scene.motion_name}", largest(dataset))
-        yield Text(f"Deformed by {by}, to scale. Drag to turn it.")
+    if "cell_nodes" not in dataset:
+        yield Text("This study stores no displacement field.")
+        return
+    scene = forward_scene(dataset, results.study)
+    by = f"{scene.motion_name}, {largest(dataset)}" + (", by the reduced model" if reduced is not None else "")
+    yield turning(scene, f"The body, deformed by {scene.motion_name}", largest(dataset))
+    yield Text(f"Deformed by {by}, to scale. Drag to turn it.")
 
 
 def _file(results: Results) -> Path | None:
@@ -115,88 +113,81 @@ def largest(dataset: xr.Dataset) -> str:
     return f"at most {size(float(np.linalg.norm(field, axis=1).max()), 'm', 4)}"
 
 
-class Contact(Section):
+@section(
+    when=lambda results: "contact_pressure" in results.dataset and bool((results.dataset["contact_pressure"] > 0).any())
+)
+def contact(results: Results) -> Iterator[Block]:
     """A map of the pressure of each tool."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether points under tools are known, and some are pressed."""
-        return "contact_pressure" in results.dataset and bool((results.dataset["contact_pressure"] > 0).any())
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A map for each tool that touches the body."""
-        dataset = results.dataset
-        directions = {load.label: load.direction for load in results.study.spec.loads if load.contact}
-        yield Heading("Pressure under the tool")
-        drawn = []
-        for tool, direction in directions.items():
-            pressure = dataset["contact_pressure"].to_numpy()[dataset["contact_tool"].to_numpy() == tool]
-            if not (pressure > 0).any():
-                continue
-            last = " at the last step" if "step" in dataset.coords else ""
-            caption = (
-                f"Pressure of {tool} at the mean of the inputs{last}, at most {number(float(pressure.max()))} Pa, on "
-                "the undeformed boundary, per area of it; dots are the vertices of the mesh, between which it is drawn "
-                "linearly."
-            )
-            drawn.append(Picture.drawn(pressure_map(dataset, tool, direction), caption))
-        yield Pictures(drawn)
+    dataset = results.dataset
+    directions = {load.label: load.direction for load in results.study.spec.loads if load.contact}
+    yield Heading("Pressure under the tool")
+    drawn = []
+    last = " at the last step" if "step" in dataset.coords else ""
+    for tool, direction in directions.items():
+        pressure = dataset["contact_pressure"].to_numpy()[dataset["contact_tool"].to_numpy() == tool]
+        if not (pressure > 0).any():
+            continue
+        caption = (
+            f"Pressure of {tool} at the mean of the inputs{last}, at most {number(float(pressure.max()))} Pa, on "
+            "the undeformed boundary, per area of it; dots are the vertices of the mesh, between which it is drawn "
+            "linearly."
+        )
+        drawn.append((maps.pressure_map(dataset, tool, direction), caption))
+    yield Pictures.of(*drawn)
 
 
-class Curve(Section):
+def _curve_applies(results: Results) -> bool:
+    """Whether there are steps."""
+    drawn = {"mean", "nominal"} & set(results.dataset.variables)
+    return "output_of" in results.dataset.coords and bool(drawn) and isinstance(results.study.model, PathOfLoads)
+
+
+@section(when=_curve_applies)
+def curve(results: Results) -> Iterator[Block]:
     """Curves with bands, and which parameters matter at which step."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether there are steps."""
-        drawn = {"mean", "nominal"} & set(results.dataset.variables)
-        return "output_of" in results.dataset.coords and bool(drawn) and isinstance(results.study.model, PathOfLoads)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """For each output a curve and, where they were computed, indices or derivatives."""
-        dataset, spec = results.dataset, results.study.model
-        along = spec.leading
-        unit = spec.unit_of(along)
-        yield Heading("Over the path")
-        yield Text(f"{spoken(along)}: {spec.in_words(along)}; every step is solved from the one before.")
-        drawn = []
-        for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
-            caption = f"Over the path: {output}."
-            drawn.append(Picture.drawn(path_plots.curve(dataset, output, along, unit), caption))
-            if "sobol_total" in dataset:
-                caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
-                drawn.append(Picture.drawn(path_plots.shares(dataset, output, along, unit), caption))
-            elif "derivative_per_std" in dataset:
-                caption = f"What moves {output}, step by step."
-                drawn.append(Picture.drawn(path_plots.slopes(dataset, output, along, unit), caption))
-        yield Pictures(drawn)
+    dataset, spec = results.dataset, results.study.model
+    along = spec.leading
+    unit = spec.unit_of(along)
+    yield Heading("Over the path")
+    yield Text(f"{spoken(along)}: {spec.in_words(along)}; every step is solved from the one before.")
+    drawn = []
+    for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
+        drawn.append((moments.over_path(dataset, output, along, unit), f"Over the path: {output}."))
+        if "sobol_total" in dataset:
+            caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
+            drawn.append((moments.shares_over_path(dataset, output, along, unit), caption))
+        elif "derivative_per_std" in dataset:
+            caption = f"What moves {output}, step by step."
+            drawn.append((moments.slopes_over_path(dataset, output, along, unit), caption))
+    yield Pictures.of(*drawn)
 
 
 LEAST = 3  # places that make a map
 
 
-class Places(Section):
+def _places_applies(results: Results) -> bool:
+    """Whether outputs of load cases of a specimen were inverted."""
+    there = results.dataset.get("datum_axis")
+    return there is not None and isinstance(results.study.model, Specimen) and bool((there >= len(AXES)).any())
+
+
+@section(when=_places_applies)
+def places(results: Results) -> Iterator[Block]:
     """Measured and predicted forces, and a map of what each place tells."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether outputs of load cases of a specimen were inverted."""
-        there = results.dataset.get("datum_axis")
-        return there is not None and isinstance(results.study.model, Specimen) and bool((there >= len(AXES)).any())
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """For each of the first data sets pictures and a table."""
-        model: Specimen = results.study.model
-        yield Heading("Forces")
-        several = results.dataset.sizes["data_set"] > 1
-        for one in first(results):
-            drawn = [Picture.drawn(ax, words) for ax, words in _measured(one, model)]
-            tools = places_of(model)
-            if len(tools) >= LEAST and "draw" in one:
-                lump = next((item.label for item in model.inclusions), "")
-                ax = place_plots.told(one, tools, model.body.bounds, lump)
-                drawn.append(Picture.drawn(ax, "What the force at each place tells, in nat, by the model at the mode."))
-            if several:
-                yield Text(str(one.data_set.item()))
-            yield Pictures(drawn)
-            yield _table(one, model, tools)
+    model: Specimen = results.study.model
+    yield Heading("Forces")
+    several = results.dataset.sizes["data_set"] > 1
+    for one in first(results):
+        drawn = list(_measured(one, model))
+        tools = places_of(model)
+        if len(tools) >= LEAST and "draw" in one:
+            lump = next((item.label for item in model.inclusions), "")
+            ax = maps.told(one, tools, model.body.bounds, lump)
+            drawn.append((ax, "What the force at each place tells, in nat, by the model at the mode."))
+        if several:
+            yield Text(str(one.data_set.item()))
+        yield Pictures.of(*drawn)
+        yield _table(one, model, tools)
 
 
 def places_of(model: Specimen) -> dict[str, FloatArray]:
@@ -222,13 +213,13 @@ def _measured(one: xr.Dataset, model: Specimen) -> Iterator[tuple[Axes, str]]:
     found = list(_outputs(one, model))
     for name, unit in dict.fromkeys((name, unit) for *_, name, unit in found):
         mine = [(k, case) for k, case, *kind in found if tuple(kind) == (name, unit)]
-        ax = place_plots.forces(one, [k for k, _ in mine], [case for _, case in mine], named(name, unit))
+        ax = maps.forces(one, [k for k, _ in mine], [case for _, case in mine], named(name, unit))
         yield ax, f"{name} by load case, measured and predicted with the most probable parameters."
 
 
 def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Table:
     """Measured and predicted values, and what each load case tells alone."""
-    alone = dict(zip(tools, place_plots.information(one, tools), strict=True)) if tools and "draw" in one else {}
+    alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
     rows = []
     for k, case, name, unit in _outputs(one, model):
         of = one.isel(datum=k)

@@ -2,54 +2,52 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from forward.readable import size
 from forward.words import NONE, duration, number, with_unit
 from uq.estimators.scores import gains, plain_samples
 from workflows.report import plots
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section, written
+from workflows.report.blocks import Block, Heading, Pictures, Table, Text
+from workflows.report.plots.accuracy import Cost
+from workflows.report.plots.moments import WORDS
+from workflows.report.section import Results, section, written
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
-class ErrorAgainstCost(Section):
+@section("row_method")
+def error_against_cost(results: Results) -> Iterator[Block]:
     """Errors of several methods against their cost."""
-
-    needs = ("row_method",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """The reference, and pictures and a table for each estimate of each output."""
-        yield Heading("Error against cost")
-        yield Text(
-            "The reference, with its own standard errors; the error due to the tolerance of the solver (against the "
-            "textbook solver, on some draws); the error of the mesh, by estimate or (method.mesh_error) by a "
-            "mesh of twice the cells in each direction at the mean parameters."
-        )
-        yield references(results)
-        yield Text(
-            "RMSE is the root mean square error of the repeats against the reference, “claimed” the standard error "
-            "that the method itself gives, coverage the share of its 95\u00a0% intervals that contain the reference. "
-            "Errors below twice that of the reference are not resolved. A gain is the cost of plain Monte Carlo at "
-            "equal error (by its exact rate) over the cost of the method, with its set-up: in solves, in processor "
-            "time, and in processor time if plain Monte Carlo uses the textbook solver. The rate is the slope of "
-            "ln RMSE over ln solves. Rows with the textbook solver are derived from the solves of plain Monte Carlo."
-        )
-        costs: dict[str, plots.Cost] = {"the number of solves": "solves", "processor time": "cpu_seconds"}
-        words: dict[str, plots.Estimated] = {"mean": "mean", "standard deviation": "std"}
-        for output in results.outputs:
-            for word, estimated in words.items():
-                yield Heading(f"{output}: {word}", level=3)
-                yield Pictures(
-                    [
-                        Picture.drawn(
-                            plots.errors(results.dataset, output, estimated, against),
-                            f"Error of the {word} of {output} against {cost}.",
-                        )
-                        for cost, against in costs.items()
-                    ]
-                )
-                yield errors(results, output, estimated)
+    yield Heading("Error against cost")
+    yield Text(
+        "The reference, with its own standard errors; the error due to the tolerance of the solver (against the "
+        "textbook solver, on some draws); the error of the mesh, by estimate or (method.mesh_error) by a "
+        "mesh of twice the cells in each direction at the mean parameters."
+    )
+    yield references(results)
+    yield Text(
+        "RMSE is the root mean square error of the repeats against the reference, “claimed” the standard error "
+        "that the method itself gives, coverage the share of its 95\u00a0% intervals that contain the reference. "
+        "Errors below twice that of the reference are not resolved. A gain is the cost of plain Monte Carlo at "
+        "equal error (by its exact rate) over the cost of the method, with its set-up: in solves, in processor "
+        "time, and in processor time if plain Monte Carlo uses the textbook solver. The rate is the slope of "
+        "ln RMSE over ln solves. Rows with the textbook solver are derived from the solves of plain Monte Carlo."
+    )
+    costs: dict[Cost, str] = {"solves": "the number of solves", "cpu_seconds": "processor time"}
+    for output in results.outputs:
+        for estimated, word in WORDS.items():
+            yield Heading(f"{output}: {word}", level=3)
+            drawn = {against: plots.errors(results.dataset, output, estimated, against) for against in costs}
+            yield Pictures.of(
+                *((ax, f"Error of the {word} of {output} against {costs[a]}.") for a, ax in drawn.items())
+            )
+            yield errors(results, output, estimated)
 
 
 def references(results: Results) -> Table:
@@ -66,52 +64,39 @@ def errors(results: Results, output: str, estimated: str) -> Table:
     """Error and cost of each method at each budget, for one estimate of an output."""
     dataset = results.of(output)
     scale = abs(float(dataset[estimated]))
-    plain, gained = plain_samples(dataset, estimated).to_numpy(), gains(dataset, estimated)
     methods = dataset["row_method"].to_numpy().tolist()
-    rates = {}
-    for name in dataset["estimator"].to_numpy().tolist():
-        of_method = dataset.sel(estimator=name)
-        rates[name] = written(of_method, f"{estimated}_rate")
-    rows = []
-    for i, name in enumerate(methods):
-        row = dataset.isel(row=i)
-        rmse, resolved = float(row[f"{estimated}_rmse"]), bool(row[f"{estimated}_resolved"])
-        coverage = NONE
-        if resolved:
-            coverage = f"{100 * float(row[f'{estimated}_coverage']):.0f} %"
-            coverage += " (understated)" if bool(row[f"{estimated}_understated"]) else ""
-        bound = "" if resolved else "≥ "
-        ratios = [plain[i], *(float(gain[i]) for gain in gained.values())]
-        rows.append(
-            (
-                name,
-                f"{int(row['budget']):,}",
-                f"{int(row['solves']):,}",
-                duration(float(row["cpu_seconds"])),
-                number(rmse, 2) + ("" if resolved else " (not resolved)"),
-                number(rmse / scale if scale else float("nan"), 2),
-                number(float(row[f"{estimated}_claimed"]), 2),
-                coverage,
-                *(NONE if math.isnan(ratio) else bound + number(ratio, 2) for ratio in ratios),
-                rates[name] if name not in methods[i + 1 :] else "",
-            )
-        )
-    head = (
-        "method",
-        "samples",
-        "solves",
-        "CPU time",
-        with_unit("RMSE", f"({results.unit(output)})"),
-        "relative",
-        "claimed",
-        "coverage",
-        "plain samples for this error",
-        "gain in solves",
-        "gain in CPU time",
-        "gain over the textbook",
-        "rate",
+    last = {name: i for i, name in enumerate(methods)}
+    of = [dataset.isel(row=i) for i in range(len(methods))]
+    rmse, resolved = dataset[f"{estimated}_rmse"].to_numpy(), dataset[f"{estimated}_resolved"].to_numpy()
+    ratios = [plain_samples(dataset, estimated), *gains(dataset, estimated).values()]
+    words = ("plain samples for this error", "gain in solves", "gain in CPU time", "gain over the textbook")
+
+    def coverage(i: int) -> str:
+        understated = " (understated)" if bool(of[i][f"{estimated}_understated"]) else ""
+        return f"{100 * float(of[i][f'{estimated}_coverage']):.0f} %{understated}" if resolved[i] else NONE
+
+    def ratio(i: int, found: xr.DataArray) -> str:
+        return NONE if np.isnan(found[i]) else ("" if resolved[i] else "≥ ") + number(float(found[i]), 2)
+
+    return Table.of(
+        range(len(methods)),
+        {
+            "method": lambda i: methods[i],
+            "samples": lambda i: f"{int(of[i]['budget']):,}",
+            "solves": lambda i: f"{int(of[i]['solves']):,}",
+            "CPU time": lambda i: duration(float(of[i]["cpu_seconds"])),
+            with_unit("RMSE", f"({results.unit(output)})"): lambda i: (
+                number(float(rmse[i]), 2) + ("" if resolved[i] else " (not resolved)")
+            ),
+            "relative": lambda i: number(float(rmse[i] / scale if scale else np.nan), 2),
+            "claimed": lambda i: number(float(of[i][f"{estimated}_claimed"]), 2),
+            "coverage": coverage,
+            **{word: partial(ratio, found=found) for word, found in zip(words, ratios, strict=True)},
+            "rate": lambda i: (
+                written(dataset.sel(estimator=methods[i]), f"{estimated}_rate") if last[methods[i]] == i else ""
+            ),
+        },
     )
-    return Table(head, rows)
 
 
 EVENLY = (
@@ -126,22 +111,18 @@ CHOSEN = (
 )
 
 
-class Fidelities(Section):
+@section("fidelity_cost")
+def fidelities(results: Results) -> Iterator[Block]:
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
-
-    needs = ("fidelity_cost",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table of models, one of groups, and one of gains."""
-        yield Heading("Models")
-        yield models(results)
-        yield Text(
-            "A correlation is that with the outputs of the model of the study, in the pilot; in brackets, that of what "
-            "the tangents leave. It is what a cheap model can explain."
-        )
-        yield groups(results)
-        yield Text(CHOSEN if results.dataset["group_chosen"].values.any() else EVENLY)
-        yield worth(results)
+    yield Heading("Models")
+    yield models(results)
+    yield Text(
+        "A correlation is that with the outputs of the model of the study, in the pilot; in brackets, that of what "
+        "the tangents leave. It is what a cheap model can explain."
+    )
+    yield groups(results)
+    yield Text(CHOSEN if results.dataset["group_chosen"].values.any() else EVENLY)
+    yield worth(results)
 
 
 def models(results: Results) -> Table:
@@ -195,57 +176,37 @@ def worth(results: Results) -> Table:
     return Table((*head, *(f"{words[name]}, predicted" for name in others)), rows)
 
 
-class Levels(Section):
+@section("level_change")
+def levels(results: Results) -> Iterator[Block]:
     """Costs and accuracy of the levels of multilevel chaos."""
-
-    needs = ("level_change",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table, a picture, and the moments by control variates."""
-        yield Heading("Levels")
-        yield Text(
-            "Every level starts its samples from the expansion of the previous level. Residuals are relative to the "
-            "loads."
-        )
-        yield levels(results)
-        caption = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
-        yield Pictures([Picture.drawn(plots.levels(results.dataset), caption)])
-        yield Text(
-            "Moments from the samples of the last level, with the expansion of the previous level, which does not "
-            "depend on them, as control variate; the distance between these and the moments of the expansion is part "
-            "of the errors of the latter."
-        )
-        yield controlled(results)
-
-
-def levels(results: Results) -> Table:
-    """Costs and accuracy of the levels of multilevel chaos."""
-    rows = []
-    for k in results.dataset["level"].to_numpy():
-        level = results.dataset.sel(level=k)
-        work = {str(name): int(level["level_work"].sel(operation=name)) for name in level["operation"].to_numpy()}
-        iterations = int(level["level_iterations"])
-        rows.append(
-            (
-                f"{k}",
-                f"{iterations}" if iterations else "to the tolerance",
-                f"{int(level['level_solves'])}",
-                f"{int(level['level_converged'])}",
-                number(float(level["level_residual"]), 2),
-                number(float(level["level_residual_median"]), 2),
-                number(float(level["level_change"]), 2),
-                *(f"{work[name]:,}" for name in ("residuals", "back_substitutions", "factorisations")),
-            )
-        )
-    head = (
-        *("level", "iterations", "samples", "at equilibrium", "largest residual", "median residual"),
-        *("change of the moments", "residuals", "back-substitutions", "factorisations"),
+    yield Heading("Levels")
+    yield Text(
+        "Every level starts its samples from the expansion of the previous level. Residuals are relative to the loads."
     )
-    return Table(head, rows)
+    dataset = results.dataset
+    work = {"residuals": "residuals", "back_substitutions": "back-substitutions", "factorisations": "factorisations"}
+    yield Table.of(
+        [dataset.sel(level=k) for k in dataset["level"].to_numpy()],
+        {
+            "level": lambda one: f"{one['level'].item()}",
+            "iterations": lambda one: f"{int(one['level_iterations']) or 'to the tolerance'}",
+            "samples": lambda one: f"{int(one['level_solves'])}",
+            "at equilibrium": lambda one: f"{int(one['level_converged'])}",
+            "largest residual": lambda one: number(float(one["level_residual"]), 2),
+            "median residual": lambda one: number(float(one["level_residual_median"]), 2),
+            "change of the moments": lambda one: number(float(one["level_change"]), 2),
+            **{word: partial(_work, name=name) for name, word in work.items()},
+        },
+    )
+    caption = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
+    yield Pictures.of((plots.levels(results.dataset), caption))
+    yield Text(
+        "Moments from the samples of the last level, with the expansion of the previous level, which does not "
+        "depend on them, as control variate; the distance between these and the moments of the expansion is part "
+        "of the errors of the latter."
+    )
+    yield results.estimates({f"control_{name}": word for name, word in WORDS.items()})
 
 
-def controlled(results: Results) -> Table:
-    """Moments from the samples of the last level, with the expansion of the previous level as control variate."""
-    names = ("control_mean", "control_std")
-    rows = [(output, *(results.estimate(output, name) for name in names)) for output in results.outputs]
-    return Table(("output", "mean", "standard deviation"), rows)
+def _work(one: xr.Dataset, name: str) -> str:
+    return f"{int(one['level_work'].sel(operation=name)):,}"

@@ -15,10 +15,10 @@ from uq.estimators.estimate import estimate_of, holds, single
 from uq.findings import DIGITS, NOT_KNOWN, only_rounding
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section, written
+from workflows.report.section import Results, section, written
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 MANY = 10.0  # times a value: percentages beyond say nothing
 LISTED = 8  # outputs that the sentence names
@@ -26,39 +26,30 @@ BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
 ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at the mean parameters"}
 
 
-class ErrorBudget(Section):
+@section(when=lambda results: "nominal" in results.dataset and bool(results.study.spec.meshed))
+def error_budget(results: Results) -> Iterator[Block]:
     """The errors of sampling, the mesh and the solver in each estimate."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether outputs of one body were estimated."""
-        return "nominal" in results.dataset and bool(results.study.spec.meshed)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A sentence, a picture and a table."""
-        shown = [name for name in ESTIMATES if name in results.dataset]
-        shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
-        yield Heading("Error budget")
-        yield Text(sentence(results, shown[0]))
-        counts = counting(results) & np.isin(results.outputs, results.drawn)
-        outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
-        budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
-        if budgets and outputs:
-            yield Pictures(
-                [
-                    Picture.drawn(
-                        plots.error_budget(outputs, {by: e[counts] for by, e in found.items()}, ESTIMATES[name]),
-                        f"Errors of the {ESTIMATES[name]} by source.",
-                    )
-                    for name, found in budgets.items()
-                ]
-            )
-        if any(holds(results.dataset, name, "corrected") for name in shown):
-            yield Text(
-                "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
-                "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
-                "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
-            )
-            yield table(results, shown)
+    shown = [name for name in ESTIMATES if name in results.dataset]
+    shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
+    yield Heading("Error budget")
+    yield Text(sentence(results, shown[0]))
+    counts = counting(results) & np.isin(results.outputs, results.drawn)
+    outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
+    budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
+    if budgets and outputs:
+        drawn = {
+            word: plots.error_budget(outputs, {by: e[counts] for by, e in budgets[name].items()}, word)
+            for name, word in ESTIMATES.items()
+            if name in budgets
+        }
+        yield Pictures.of(*((ax, f"Errors of the {word} by source.") for word, ax in drawn.items()))
+    if any(holds(results.dataset, name, "corrected") for name in shown):
+        yield Text(
+            "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
+            "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
+            "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
+        )
+        yield table(results, shown)
 
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
@@ -145,137 +136,92 @@ def table(results: Results, names: list[str]) -> Table:
     return Table(head, rows)
 
 
-WORDS = {"mean": "mean", "std": "standard deviation"}
-
-
-class Tolerance(Section):
+@section(when=lambda results: "accuracy" in results.summary)
+def tolerance(results: Results) -> Iterator[Block]:
     """The budget of a tolerance."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether one was asked for."""
-        return "accuracy" in results.summary
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A sentence, bars, the reasons, and the values that the tolerance is held by."""
-        told = results.summary["accuracy"]
-        worst = f"the {told['worst']['of']} of {told['worst']['output']}"
-        yield Heading("Tolerance")
-        asked, reached = number(100 * told["tolerance"]), number(100 * told["reached"], 2)
-        yield Text(
-            f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
-            f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
-            tone="lead" if told["kept"] else "warning",
-        )
-        for name, share in told.get("unmet", {}).items():
-            yield Text(
-                f"All samples of {name} are the same: what happens in up to {number(100 * share, 2)} % of all cases "
-                "may be missed.",
-                tone="warning",
-            )
-        if told["mesh"] is not None and not told["mesh"]["estimated"]:
-            yield Text("The error of the mesh is not known, and not counted.", tone="warning")
-        yield Pictures([Picture.drawn(plots.tolerance_bars(told), "What each error takes of the tolerance.")])
-        seconds = results.summary.get("accuracy_seconds", {})
-        costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
-        yield Pairs([("why", told["reasons"]), *([("what it took", costs)] if costs else [])])
-        yield Table(
-            ("estimate", "value ± 95 %", "mesh", "sampling", "in all"),
-            [
-                (
-                    f"{WORDS[estimate]} of {name}",
-                    and_error(of["value"], of["error"], results.unit(name)),
-                    *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
-                )
-                for name, estimates in told["outputs"].items()
-                for estimate, of in estimates.items()
-            ],
-        )
-        if told["mesh"] is not None:
-            yield Text("Values are corrected by the estimated error of the mesh. Shares are of the tolerance.")
-
-
-class Meshes(Section):
-    """The meshes of a multilevel method, and the contribution of each."""
-
-    needs = ("mesh_samples",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table of meshes, and rates, differences and pictures of each output."""
-        yield Heading("Meshes")
-        yield mesh_table(results)
-        for output in results.outputs:
-            yield Heading(output, level=3)
-            yield Text(rates(results, output))
-            yield differences(results, output)
-            yield Pictures(
-                [
-                    Picture.drawn(
-                        plots.mesh_variance(results.dataset, output),
-                        f"Variance of {output} and of its difference between meshes.",
-                    ),
-                    Picture.drawn(
-                        plots.mesh_mean(results.dataset, output),
-                        f"Mean of {output} and of its difference between meshes.",
-                    ),
-                    Picture.drawn(
-                        plots.mesh_samples(results.dataset, output),
-                        "Samples on every mesh: taken, and optimal for other errors.",
-                    ),
-                    Picture.drawn(
-                        plots.mesh_cost(results.dataset, output), "Predicted time of sampling, without linearisations."
-                    ),
-                ]
-            )
-
-
-def mesh_table(results: Results) -> Table:
-    """The meshes, and what was solved on them."""
-    dataset, rows = results.dataset, []
-    for level, found in zip(dataset["level"].to_numpy(), results.summary["meshes"], strict=True):
-        here = dataset.sel(level=level)
-        seconds = found["cpu_seconds"] / max(found["solves"], 1)
-        samples, failed = f"{int(here['mesh_samples']):,}", f"{int(here['mesh_failed']):,}"
-        cost = f"{float(here['mesh_cost']):.2g} s"
-        rows.append(
-            (f"{level}", f"{found['unknowns']:,}", samples, failed, f"{found['solves']:,}", cost, duration(seconds))
-        )
-    head = (
-        "level",
-        "unknowns",
-        "samples",
-        "failed",
-        "solves",
-        "a solve, predicted",
-        "a solve, measured (with the linearisation)",
+    told = results.summary["accuracy"]
+    worst = f"the {told['worst']['of']} of {told['worst']['output']}"
+    yield Heading("Tolerance")
+    asked, reached = number(100 * told["tolerance"]), number(100 * told["reached"], 2)
+    yield Text(
+        f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
+        f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
+        tone="lead" if told["kept"] else "warning",
     )
-    return Table(head, rows)
+    for name, share in told.get("unmet", {}).items():
+        yield Text(
+            f"All samples of {name} are the same: what happens in up to {number(100 * share, 2)} % of all cases "
+            "may be missed.",
+            tone="warning",
+        )
+    if told["mesh"] is not None and not told["mesh"]["estimated"]:
+        yield Text("The error of the mesh is not known, and not counted.", tone="warning")
+    yield Pictures.of((plots.tolerance_bars(told), "What each error takes of the tolerance."))
+    seconds = results.summary.get("accuracy_seconds", {})
+    costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
+    yield Pairs([("why", told["reasons"]), *([("what it took", costs)] if costs else [])])
+    yield Table(
+        ("estimate", "value ± 95 %", "mesh", "sampling", "in all"),
+        [
+            (
+                f"{ESTIMATES[estimate]} of {name}",
+                and_error(of["value"], of["error"], results.unit(name)),
+                *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
+            )
+            for name, estimates in told["outputs"].items()
+            for estimate, of in estimates.items()
+        ],
+    )
+    if told["mesh"] is not None:
+        yield Text("Values are corrected by the estimated error of the mesh. Shares are of the tolerance.")
+
+
+@section("mesh_samples")
+def meshes(results: Results) -> Iterator[Block]:
+    """The meshes of a multilevel method, and the contribution of each."""
+    yield Heading("Meshes")
+    dataset, told = results.dataset, results.summary["meshes"]
+    yield Table.of(
+        range(len(told)),
+        {
+            "level": lambda i: f"{dataset['level'].values[i]}",
+            "unknowns": lambda i: f"{told[i]['unknowns']:,}",
+            "samples": lambda i: f"{int(dataset['mesh_samples'][i]):,}",
+            "failed": lambda i: f"{int(dataset['mesh_failed'][i]):,}",
+            "solves": lambda i: f"{told[i]['solves']:,}",
+            "a solve, predicted": lambda i: f"{float(dataset['mesh_cost'][i]):.2g} s",
+            "a solve, measured (with the linearisation)": lambda i: duration(
+                told[i]["cpu_seconds"] / max(told[i]["solves"], 1)
+            ),
+        },
+    )
+    for output in results.outputs:
+        yield Heading(output, level=3)
+        yield Text(rates(results, output))
+        yield differences(results, output)
+        yield Pictures.of(
+            (plots.mesh_variance(dataset, output), f"Variance of {output} and of its difference between meshes."),
+            (plots.mesh_mean(dataset, output), f"Mean of {output} and of its difference between meshes."),
+            (plots.mesh_samples(dataset, output), "Samples on every mesh: taken, and optimal for other errors."),
+            (plots.mesh_cost(dataset, output), "Predicted time of sampling, without linearisations."),
+        )
 
 
 def differences(results: Results, output: str) -> Table:
     """The contribution of every mesh to the mean of an output, and whether it can be trusted."""
+    rest = {
+        "variance": "mesh_variance",
+        "variance of the difference": "difference_variance",
+        "÷ by the control": "difference_variance_ratio",
+        "kurtosis": "difference_kurtosis",
+        "consistency": "consistency",
+    }
     rows = []
     for level in results.dataset["level"].to_numpy():
         here = results.dataset.sel(output=output, level=level)
-        unit = results.unit(output)
-        text = written(here, "difference_mean", unit)
-        rest = (
-            "mesh_variance",
-            "difference_variance",
-            "difference_variance_ratio",
-            "difference_kurtosis",
-            "consistency",
-        )
-        rows.append((f"{level}", text, *(number(float(here[n]), 3) for n in rest)))
-    head = (
-        "level",
-        "mean of the difference",
-        "variance",
-        "variance of the difference",
-        "÷ by the control",
-        "kurtosis",
-        "consistency",
-    )
-    return Table(head, rows)
+        text = written(here, "difference_mean", results.unit(output))
+        rows.append((f"{level}", text, *(number(float(here[name]), 3) for name in rest.values())))
+    return Table(("level", "mean of the difference", *rest), rows)
 
 
 def rates(results: Results, output: str) -> str:
@@ -289,26 +235,18 @@ def rates(results: Results, output: str) -> str:
     )
 
 
-class FinerMeshes(Section):
-    """The effect of a finer mesh on each candidate."""
-
-    needs = ("probability", "mesh_checked")
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One table."""
-        yield Heading("Effect of a finer mesh", level=3)
-        yield Text(
-            "Solves of each candidate at its mode on finer meshes, with thinner cells at the faces that are held: the "
-            "error of its mesh, and what correcting it does. Where a candidate is corrected, evidence and unknowns "
-            "above are those of the corrected one; elsewhere it is what correcting it would do, to first order."
-        )
-        yield finer_mesh_table(results.dataset)
-
-
-def finer_mesh_table(dataset: xr.Dataset) -> Table:
+@section("probability", "mesh_checked")
+def finer_meshes(results: Results) -> Iterator[Block]:
     """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
     from inverse.criticism.doubts_of_meshes import change_in_words
 
+    dataset = results.dataset
+    yield Heading("Effect of a finer mesh", level=3)
+    yield Text(
+        "Solves of each candidate at its mode on finer meshes, with thinner cells at the faces that are held: the "
+        "error of its mesh, and what correcting it does. Where a candidate is corrected, evidence and unknowns "
+        "above are those of the corrected one; elsewhere it is what correcting it would do, to first order."
+    )
     rows = []
     for model in dataset.model.values:
         one = dataset.sel(model=model).isel(group=0)
@@ -322,44 +260,32 @@ def finer_mesh_table(dataset: xr.Dataset) -> Table:
         moved = change_in_words(float(one["mesh_log_evidence"]), float(abs(shift).max()))
         corrected = "yes" if bool(one["mesh_corrected"]) else "no"
         rows.append((str(model), corrected, moved, size, most, ", ".join(listed)))
-    head = (
-        "model",
-        "corrected",
-        "ln Z",
-        "data, over the errors",
-        "at most",
-        "unknowns, in deviations of the posterior",
-    )
-    return Table(head, rows, text=frozenset({0, 1, 5}), long=frozenset({5}))
+    unknowns = "unknowns, in deviations of the posterior"
+    head = ("model", "corrected", "ln Z", "data, over the errors", "at most", unknowns)
+    yield Table(head, rows, text=frozenset({0, 1, 5}), long=frozenset({5}))
 
 
-class AdaptedMesh(Section):
+@section("mesh_indicator")
+def adapted_mesh(results: Results) -> Iterator[Block]:
     """How the mesh was refined, what errors are left, and where they come from."""
+    from workflows.report.bodies import refined
 
-    needs = ("mesh_indicator",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table of meshes, a picture of their errors, and the last one."""
-        from workflows.report.bodies import refined
-
-        dataset, adapt = results.dataset, results.study.model.adapt
-        yield Heading("The mesh")
-        by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
-        yield Text(
-            "Solved at the mean of the parameters, and refined where cells have most of the estimated error, by "
-            f"{by}. An error is the exact minus the discrete value, estimated with elements of one degree higher; it "
-            "is not a bound. It does not include the part of a curved body that a coarse mesh cuts off."
-        )
-        yield cycles(results)
-        named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
-        yield Pictures(
-            [Picture.drawn(plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh.")]
-        )
-        captions = {
-            False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
-            True: "What is behind the cell that contributes most.",
-        }
-        yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])
+    dataset, adapt = results.dataset, results.study.model.adapt
+    yield Heading("The mesh")
+    by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
+    yield Text(
+        "Solved at the mean of the parameters, and refined where cells have most of the estimated error, by "
+        f"{by}. An error is the exact minus the discrete value, estimated with elements of one degree higher; it "
+        "is not a bound. It does not include the part of a curved body that a coarse mesh cuts off."
+    )
+    yield cycles(results)
+    named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
+    yield Pictures.of((plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh."))
+    captions = {
+        False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
+        True: "What is behind the cell that contributes most.",
+    }
+    yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])
 
 
 def cycles(results: Results) -> Table:
@@ -369,14 +295,9 @@ def cycles(results: Results) -> Table:
         found = []
         for output in results.outputs:
             here = dataset.isel(cycle=k).sel(output=output)
-            at = single(here, "cycle_value")
-            value, error = at.value, at.mesh
-            unit = results.unit(output)
-            sign = "+" if error > 0 else ""
-            estimated = NONE if np.isnan(error) else sign + size(error, unit, like=value)
-            found += [size(value, unit, 4), estimated]
+            at, unit = single(here, "cycle_value"), results.unit(output)
+            sign = "+" if at.mesh > 0 else ""
+            found += [size(at.value, unit, 4), NONE if np.isnan(at.mesh) else sign + size(at.mesh, unit, like=at.value)]
         rows.append((f"{told['cells']:,}", f"{told['unknowns']:,}", duration(told["cpu_seconds"]), *found))
-    head = ["cells", "unknowns", "processor time"]
-    for output in results.outputs:
-        head += [output, "error"]
-    return Table(head, rows, text=frozenset())
+    head = ("cells", "unknowns", "processor time")
+    return Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=frozenset())

@@ -11,10 +11,10 @@ from forward.readable import and_error, interval, percent, place, quantity, scal
 from forward.specimen import Specimen
 from forward.words import NONE, named, number, with_error
 from uq.estimators.estimate import single
-from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
-from workflows.report.plots import design as design_plots
-from workflows.report.plots import population as population_plots
-from workflows.report.section import Results, Section
+from workflows.report.blocks import Answer, Block, Card, Heading, Pictures, Table, Text
+from workflows.report.plots import places as maps
+from workflows.report.plots import posterior as plots
+from workflows.report.section import Results, section
 from workflows.report.small_density import CURVE, curve_of, smooth
 from workflows.results.summary import against_random
 
@@ -26,24 +26,18 @@ if TYPE_CHECKING:
 TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
 
 
-class Batch(Section):
+@section(when=lambda results: "alone_eigenvalue" in results.dataset and results.dataset.sizes["data_set"] > 1)
+def batch(results: Results) -> Iterator[Block]:
     """All data sets that were inverted, one row each."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether several data sets were inverted."""
-        return "alone_eigenvalue" in results.dataset and results.dataset.sizes["data_set"] > 1
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One table."""
-        yield Heading("All data sets")
-        yield Text(
-            "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
-            "inverted follow one by one."
-        )
-        yield batch(results)
+    yield Heading("All data sets")
+    yield Text(
+        "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
+        "inverted follow one by one."
+    )
+    yield _batch(results)
 
 
-def batch(results: Results) -> Table:
+def _batch(results: Results) -> Table:
     """A row for each data set."""
     dataset = results.dataset
     names = [str(name) for name in dataset.parameter.values]
@@ -81,118 +75,83 @@ SHOWN = 24  # rows of the table of a data set
 SETS = 12  # data sets that have a table
 
 
-class Predictions(Section):
+@section("prediction_share")
+def predictions(results: Results) -> Iterator[Block]:
     """What is predicted from each data set, and what its data added."""
-
-    needs = ("prediction_share",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table and a picture for each data set."""
-        from workflows.report.plots.predictions import bands
-
-        of = results.dataset
-        yield Heading("Predictions")
-        yield Text(
-            "Outputs that were not measured, by the posterior: mean ± standard deviation, and the interval that holds "
-            "95 %. Beside it what was known before the data, and the share of the variance that the data have removed. "
-            "The error of the mesh is what is to be added to the mean; intervals do not hold it."
-        )
-        done = [str(name) for name, ok in zip(of["data_set"].values, of["ok"].values, strict=True) if bool(ok)]
-        for name in done[:SETS]:
-            one = of.sel(data_set=name)
-            if len(done) > 1:
-                yield Heading(name, level=3)
-            yield table(one)
-            if np.isfinite(one["prediction_std"]).any():
-                caption = "95 % intervals before and after the data, each relative to the one before."
-                yield Pictures([Picture.drawn(bands(one), caption)])
-        if len(done) > SETS:
-            yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
+    of = results.dataset
+    yield Heading("Predictions")
+    yield Text(
+        "Outputs that were not measured, by the posterior: mean ± standard deviation, and the interval that holds "
+        "95 %. Beside it what was known before the data, and the share of the variance that the data have removed. "
+        "The error of the mesh is what is to be added to the mean; intervals do not hold it."
+    )
+    done = [str(name) for name, ok in zip(of["data_set"].values, of["ok"].values, strict=True) if bool(ok)]
+    for name in done[:SETS]:
+        one = of.sel(data_set=name)
+        if len(done) > 1:
+            yield Heading(name, level=3)
+        yield _predicted(one)
+        if np.isfinite(one["prediction_std"]).any():
+            caption = "95 % intervals before and after the data, each relative to the one before."
+            yield Pictures.of((plots.bands(one), caption))
+    if len(done) > SETS:
+        yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
 
 
-def table(one: xr.Dataset) -> Table:
+def _predicted(one: xr.Dataset) -> Table:
     """What is predicted from a data set."""
     rows = []
     for goal in one["goal"].values[:SHOWN]:
         at = one.sel(goal=goal)
-        unit = str(at["goal_unit"].item())
-        lower, upper, share = (float(at[f"prediction_{name}"]) for name in ("lower", "upper", "share"))
-        mesh = single(at, "prediction_mean").mesh
-        rows.append(
-            (
-                str(goal),
-                and_error(float(at["prediction_mean"]), float(at["prediction_std"]), unit),
-                interval(lower, upper, unit, float(at["prediction_mean"])),
-                and_error(float(at["prediction_prior_mean"]), float(at["prediction_prior_std"]), unit),
-                NONE if np.isnan(share) else percent(share) if share >= 0 else "none",
-                size(mesh, unit) if np.isfinite(mesh) else "not estimated",
-            )
-        )
+        unit, mesh = str(at["goal_unit"].item()), single(at, "prediction_mean").mesh
+        names = ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "share")
+        mean, std, lower, upper, before, wide, share = (float(at[f"prediction_{name}"]) for name in names)
+        told = and_error(mean, std, unit), interval(lower, upper, unit, mean), and_error(before, wide, unit)
+        removed = NONE if np.isnan(share) else percent(share) if share >= 0 else "none"
+        rows.append((str(goal), *told, removed, size(mesh, unit) if np.isfinite(mesh) else "not estimated"))
     head = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
     return Table(head, rows)
 
 
-class PopulationOfSpecimens(Section):
+@section("population_draw")
+def population_of_specimens(results: Results) -> Iterator[Block]:
     """Tables of the population and of its specimens."""
-
-    needs = ("population_draw",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """The population, then the specimens."""
-        of = results.dataset
-        yield Heading("The population")
-        logarithmic = bool(int(of["logarithmic"]))
-        what = (
-            "ln |parameter|, whose standard deviation is given, is normal" if logarithmic else "parameters are normal"
-        )
-        yield Text(
-            f"Over specimens, {what}. Intervals hold 95 %: that of the typical specimen is what is not known of it, "
-            "that of a new one has the spread of the population too."
-        )
-        rows = [
-            (
-                name,
-                *(
-                    _interval(
-                        of[f"{which}_quantiles"].sel(parameter=name),
-                        "1" if logarithmic and which == "scale" else results.parameter_unit(name),
-                    )
-                    for which in ("typical", "scale", "new")
-                ),
-            )
+    of = results.dataset
+    yield Heading("The population")
+    logarithmic = bool(int(of["logarithmic"]))
+    what = "ln |parameter|, whose standard deviation is given, is normal" if logarithmic else "parameters are normal"
+    yield Text(
+        f"Over specimens, {what}. Intervals hold 95 %: that of the typical specimen is what is not known of it, "
+        "that of a new one has the spread of the population too."
+    )
+    rows = []
+    for name in results.parameters:
+        unit = results.parameter_unit(name)
+        kinds = {"typical": unit, "scale": "1" if logarithmic else unit, "new": unit}
+        rows.append((name, *(_interval(of[f"{k}_quantiles"].sel(parameter=name), u) for k, u in kinds.items())))
+    yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
+    pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
+    if pairs:
+        correlations = of["correlation_quantiles"]
+        pairwise = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
+        yield Table(("parameter", "with", "correlation"), pairwise, text=frozenset({0, 1}))
+    if "slope_quantiles" in of:
+        yield Text("How means change with what specimens differ in, by one unit of it:")
+        slopes = of["slope_quantiles"]
+        changes = [
+            (str(by), name, _interval(slopes.sel(covariate=by, parameter=name)))
+            for by in of["covariate"].values
             for name in results.parameters
         ]
-        yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
-        pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
-        if pairs:
-            correlations = of["correlation_quantiles"]
-            cells = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
-            yield Table(("parameter", "with", "correlation"), cells, text=frozenset({0, 1}))
-        if "slope_quantiles" in of:
-            yield Text("How means change with what specimens differ in, by one unit of it:")
-            slopes = of["slope_quantiles"]
-            changes = [
-                (str(by), name, _interval(slopes.sel(covariate=by, parameter=name)))
-                for by in of["covariate"].values
-                for name in results.parameters
-            ]
-            yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
-        yield Heading("Its specimens")
-        caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
-        units = {name: results.parameter_unit(name) for name in results.parameters}
-        yield Pictures(
-            [Picture.drawn(population_plots.specimens(of, name, units[name]), caption) for name in results.parameters]
-        )
-        yield Text(
-            "By its own data alone, and with what the others say on what specimens are like. The last column is how "
-            "many of its draws lie where the population is."
-        )
-        yield specimens(results)
-
-
-def specimens(results: Results) -> Table:
-    """A line for each specimen."""
-    of = results.dataset
+        yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
+    yield Heading("Its specimens")
+    caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
+    drawn = [plots.specimens(of, name, results.parameter_unit(name)) for name in results.parameters]
+    yield Pictures.of(*((ax, caption) for ax in drawn))
+    yield Text(
+        "By its own data alone, and with what the others say on what specimens are like. The last column is how "
+        "many of its draws lie where the population is."
+    )
     sizes = {
         name: scale(float(of["typical_quantiles"].sel(parameter=name)[1]), results.parameter_unit(name))
         for name in results.parameters
@@ -211,7 +170,7 @@ def specimens(results: Results) -> Table:
         for name, (_, unit) in sizes.items()
         for who in ("by itself", "of the population")
     ]
-    return Table(("specimen", *heads, "effective"), lines)
+    yield Table(("specimen", *heads, "effective"), lines)
 
 
 def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
@@ -273,58 +232,47 @@ WORTH = {
 FIRST = 5  # observations on the card
 
 
-class ChosenObservations(Section):
+@section("chosen")
+def chosen_observations(results: Results) -> Iterator[Block]:
     """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
-
-    needs = ("chosen",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """How many random ones they are worth, where they are, and each of them."""
-        found, design = results.dataset, results.summary["design"]
-        against = against_random(design)
-        yield Heading("Which observations tell most")
-        method, known = results.study.method, number(float(found["information"][-1]))
-        tell = (
-            f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
-            if method.criterion == "models"
-            else f"Together they tell {known} nat on average over the draws of what is not known"
-        )
-        yield Text(
-            f"{against[0].upper()}{against[1:]}. {tell}. They are in design.csv in their order.",
-            "lead",
-        )
-        ax = design_plots.against_number(found, WORTH[method.criterion])
-        drawn = [Picture.drawn(ax, "Chosen observations, and the band of 90 % of random ones.")]
-        if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
-            bounds = results.study.specs[0].body.bounds
-            drawn.append(
-                Picture.drawn(design_plots.on_body(found, bounds), "Candidates and chosen points, in their order.")
-            )
-        yield Pictures(drawn)
-        yield _table(results)
-        if "log_bayes_factor" in found:
-            names = [str(name) for name in found["model"].values]
-            cells = found["log_bayes_factor"].to_numpy()
-            rows = [(name, *(number(float(x)) for x in row)) for name, row in zip(names, cells, strict=True)]
-            yield Text("Expected ln Bayes factor (nat) of a model that is true against each other one:")
-            yield Table(("true", *names), rows)
-        if "field_variance_told" in found:
-            share = number(100 * float(found["field_variance_told"][-1]), 3)
-            yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
-        if "posterior_std" in found:
-            rows = [
-                (
-                    name,
-                    *(
-                        size(float(one[f"{which}_std"]), unit, 3, like=float(one["prior_std"]))
-                        for which in ("prior", "posterior")
-                    ),
-                )
-                for name in results.leading(found["posterior_std"] / found["prior_std"])
-                for one, unit in [(found.sel(parameter=name), results.parameter_unit(name))]
-            ]
-            yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
-            yield Table(("parameter", "before", "after"), rows)
+    found, design = results.dataset, results.summary["design"]
+    against = against_random(design)
+    yield Heading("Which observations tell most")
+    method, known = results.study.method, number(float(found["information"][-1]))
+    tell = (
+        f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
+        if method.criterion == "models"
+        else f"Together they tell {known} nat on average over the draws of what is not known"
+    )
+    yield Text(f"{against[0].upper()}{against[1:]}. {tell}. They are in design.csv in their order.", "lead")
+    ax = maps.against_number(found, WORTH[method.criterion])
+    drawn = [(ax, "Chosen observations, and the band of 90 % of random ones.")]
+    if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
+        bounds = results.study.specs[0].body.bounds
+        drawn.append((maps.on_body(found, bounds), "Candidates and chosen points, in their order."))
+    yield Pictures.of(*drawn)
+    rows = []
+    for k, one in enumerate(design["chosen"], start=1):
+        where = NONE if None in one["place"] else place(one["place"])
+        cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
+        rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
+    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
+    yield Table(head, rows, text=frozenset({1, 2, 3, 4}))
+    if "log_bayes_factor" in found:
+        names, factors = [str(name) for name in found["model"].values], found["log_bayes_factor"].to_numpy()
+        rows = [(name, *(number(float(x)) for x in row)) for name, row in zip(names, factors, strict=True)]
+        yield Text("Expected ln Bayes factor (nat) of a model that is true against each other one:")
+        yield Table(("true", *names), rows)
+    if "field_variance_told" in found:
+        share = number(100 * float(found["field_variance_told"][-1]), 3)
+        yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
+    if "posterior_std" in found:
+        rows = []
+        for name in results.leading(found["posterior_std"] / found["prior_std"]):
+            stds = [float(found[f"{which}_std"].sel(parameter=name)) for which in ("prior", "posterior")]
+            rows.append((name, *(size(std, results.parameter_unit(name), 3, like=stds[0]) for std in stds)))
+        yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
+        yield Table(("parameter", "before", "after"), rows)
 
 
 def design_card(results: Results) -> Card:
@@ -344,37 +292,23 @@ def design_card(results: Results) -> Card:
     return Card("Which observations tell most of what is not known?", answers)
 
 
-def _table(results: Results) -> Table:
-    rows = []
-    for k, one in enumerate(results.summary["design"]["chosen"], start=1):
-        where = NONE if None in one["place"] else place(one["place"])
-        cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
-        rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
-    head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
-    return Table(head, rows, text=frozenset({1, 2, 3, 4}))
-
-
-class SyntheticData(Section):
+@section("clean")
+def synthetic_data(results: Results) -> Iterator[Block]:
     """How many data were made, how large they are, and their errors."""
-
-    needs = ("clean",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table: what was measured in each load case, or of each output over a path."""
-        of = results.dataset
-        parts = np.array([str(name).partition(".")[0] for name in of["output"].values])
-        units = units_of(results.study.model)
-        values, sigma = (of[name].to_numpy() for name in ("values", "sigma"))
-        rows = []
-        for part in dict.fromkeys(parts.tolist()):
-            for unit in dict.fromkeys(units.get(name, "m") for name in np.array(results.outputs)[parts == part]):
-                here = (parts == part) & np.array([units.get(name, "m") == unit for name in results.outputs])
-                made = np.isfinite(values[:, here])
-                if made.any():
-                    largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
-                    rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
-        yield Heading("The data")
-        yield Table(("of", "data", "largest", "largest standard error"), rows)
+    of = results.dataset
+    parts = np.array([str(name).partition(".")[0] for name in of["output"].values])
+    units = units_of(results.study.model)
+    values, sigma = (of[name].to_numpy() for name in ("values", "sigma"))
+    rows = []
+    for part in dict.fromkeys(parts.tolist()):
+        for unit in dict.fromkeys(units.get(name, "m") for name in np.array(results.outputs)[parts == part]):
+            here = (parts == part) & np.array([units.get(name, "m") == unit for name in results.outputs])
+            made = np.isfinite(values[:, here])
+            if made.any():
+                largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
+                rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
+    yield Heading("The data")
+    yield Table(("of", "data", "largest", "largest standard error"), rows)
 
 
 def units_of(model: Any) -> dict[str, str]:

@@ -10,12 +10,12 @@ import numpy as np
 from forward.bodies.geometry import AXES
 from forward.readable import and_error, interval, scale, size, spoken
 from forward.words import margin, named, number, rounded, with_error
-from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
+from workflows.report.blocks import Block, Folded, Heading, Pairs, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
-from workflows.report.plots import path as curves
-from workflows.report.plots import residuals
-from workflows.report.plots.told_by_case import told_by_case
-from workflows.report.section import Results, Section
+from workflows.report.plots import places as maps
+from workflows.report.plots.moments import measured_over_path
+from workflows.report.plots.posterior import told_by_case
+from workflows.report.section import Results, section
 from workflows.report.sections.bodies import first, specimen
 from workflows.results.points import has_points
 
@@ -58,38 +58,34 @@ def measured_kind(of: xr.Dataset, study: Any) -> str:
     return other if (axes >= len(AXES)).all() else f"components of displacements and {other}"
 
 
-class Posterior(Section):
+@section("alone_eigenvalue", "draw")
+def posterior(results: Results) -> Iterator[Block]:
     """The posterior of a few parameters for each data set."""
-
-    needs = ("alone_eigenvalue", "draw")
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """The same for each of the first data sets."""
-        before, units = prior_densities(results.study), results.study.units_of("/")
-        for one in first(results):
-            yield from verdict(results, one)
-            yield from again(results, one)
-            yield Pairs([*amounts(one, one.sizes["direction"], results.study)])
-            yield posterior(one, units)
-            if _words(one) is OUTPUTS:
-                yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
-                yield from _curves(one, results.study.model)
-            yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before, units)])
-            names = [str(name) for name in one.parameter.values if name != "noise"]
-            yield from cases(one, *_widths(one, names, units))
-            if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
-                caption = (
-                    f"How many times narrower each {_words(one).part} alone makes what was known of each parameter "
-                    "before the data, with the model linearised at the mode; empty where it tells nothing."
-                )
-                yield Pictures([Picture.drawn(told_by_case(one), caption)])
-            yield Heading("Directions", level=3)
-            yield Text(
-                "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
-                "most, the last what they constrain least."
+    before, units = prior_densities(results.study), results.study.units_of("/")
+    for one in first(results):
+        yield from verdict(results, one)
+        yield from again(results, one)
+        yield Pairs.of(*amounts(one, one.sizes["direction"], results.study))
+        yield parameters(one, units)
+        if _words(one) is OUTPUTS:
+            yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
+            yield from _curves(one, results.study.model)
+        yield Pictures.of(*pictures(one, before, units))
+        names = [str(name) for name in one.parameter.values if name != "noise"]
+        yield from cases(one, *_widths(one, names, units))
+        if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
+            caption = (
+                f"How many times narrower each {_words(one).part} alone makes what was known of each parameter "
+                "before the data, with the model linearised at the mode; empty where it tells nothing."
             )
-            yield directions(one)
-            yield iterations(one)
+            yield Pictures.of((told_by_case(one), caption))
+        yield Heading("Directions", level=3)
+        yield Text(
+            "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
+            "most, the last what they constrain least."
+        )
+        yield directions(one)
+        yield iterations(one)
 
 
 def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tuple[list[str], list[list[str]]]:
@@ -115,19 +111,12 @@ def again(results: Results, one: xr.Dataset) -> Iterator[Block]:
         yield specimen(one, results)
 
 
-def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, list[str]]]:
+def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
     """Amounts of data, information and work, given the total number of directions."""
-    return ((word, [text]) for word, text in _amounts(one, directions, study))
-
-
-def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
     kind = "values of outputs" if _words(one) is OUTPUTS else measured_kind(one, study)
     yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {kind}"
     if "points_moved" in one and (moved := int(one["points_moved"])):
-        yield (
-            "outside the body",
-            f"{moved} points, up to {size(float(one['largest_move']), 'm')}, moved to its surface",
-        )
+        yield "outside the body", f"{moved} points, up to {size(float(one['largest_move']), 'm')}, moved to its surface"
     seen = int((one["eigenvalue"] > plots.SEEN).sum())
     yield "directions about which the data say more than the prior", f"{seen} of {directions:,}"
     yield "directions determined", number(float(one["determined"]), 3)
@@ -139,10 +128,8 @@ def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str
     chance = number(float(one["residual_probability"]), 2)
     yield "residuals", f"|r|² = {square} where {degrees} is expected: probability {chance} of larger ones"
     if np.isfinite(one["agreement_probability"]):
-        yield (
-            "neighbouring residuals",
-            f"probability {number(float(one['agreement_probability']), 2)} that neighbours agree more",
-        )
+        chance = number(float(one["agreement_probability"]), 2)
+        yield "neighbouring residuals", f"probability {chance} that neighbours agree more"
     if np.isfinite(one["effective"]):
         words = f"worth {number(float(one['effective']), 3)}, k̂ = {number(float(one['tail']), 2)}"
         yield "weighted points", words
@@ -160,7 +147,7 @@ def _amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str
         yield "reduced model", f"{solves:,} solves; its draws, solved in full, have weights worth {share:.0f} % of them"
 
 
-def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
+def parameters(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Prior and posterior of every parameter, with the truth if known."""
     known = bool(np.isfinite(one["true"]).any())
     laplace = "laplace_std" in one
@@ -223,14 +210,8 @@ def directions(one: xr.Dataset) -> Table:
     rows = []
     for i, value in enumerate(one["eigenvalue"].to_numpy()):
         vector = one["direction_parameter"].isel(direction=i).to_numpy()[: len(names)]
-        rows.append(
-            (
-                f"{i + 1}",
-                number(value, 3),
-                number((1 + value) ** -0.5, 2),
-                *(f"{x:+.2f}".replace("-", "−") if abs(x) >= LEAST else "0" for x in vector),
-            )
-        )
+        parts = (f"{x:+.2f}".replace("-", "−") if abs(x) >= LEAST else "0" for x in vector)
+        rows.append((f"{i + 1}", number(value, 3), number((1 + value) ** -0.5, 2), *parts))
     return Table(("direction", "λ", "posterior over prior width", *map(spoken, names)), rows)
 
 
@@ -291,8 +272,8 @@ def _curves(one: xr.Dataset, spec: ModelSpec) -> Iterator[Block]:
     seen = {str(case).rpartition(".")[0] for case in one.case.values}
     names = [name for name in steps.units if name in seen] if steps is not None else []
     if steps is not None and names:
-        yield Pictures(
-            [Picture.drawn(curves.measured(one, name, steps), f"{name}, measured and predicted.") for name in names]
+        yield Pictures.of(
+            *((measured_over_path(one, name, steps), f"{name}, measured and predicted.") for name in names)
         )
 
 
@@ -308,16 +289,14 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
         drawn = ", ".join(plots.panels(one))
         yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {drawn}."
     yield of_spectrum(one)
-    words = (
-        "Measured minus predicted displacements at the mode: as arrows, and over their errors, on the box of the body"
-    )
     if not has_points(one):
         return
-    words_ = "Measured against predicted displacements, component by component; on the line both are equal."
-    yield residuals.agreement(one), words_
-    yield residuals.residuals(one), f"{words}; fields/points-{one.data_set.item()}.vtu for ParaView."
+    words = "Measured against predicted displacements, component by component; on the line both are equal."
+    yield maps.agreement(one), words
+    words = "Measured minus predicted displacements at the mode: as arrows, and over their errors"
+    yield maps.residuals(one), f"{words}, on the box of the body; fields/points-{one.data_set.item()}.vtu for ParaView."
     if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
-        yield residuals.distances(one), "How far points were from the body before they were moved onto it."
+        yield maps.distances(one), "How far points were from the body before they were moved onto it."
 
 
 def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
@@ -332,10 +311,10 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
         yield of_spectrum(one)
     else:
         yield from on_a_plane(one, plots.Cut.of(one))
-    yield (
-        plots.marginals(one, before, units),
-        "Prior and posterior of each parameter, beside it the whole prior; Laplace's Gaussian, and the truth if known.",
+    words = (
+        "Prior and posterior of each parameter, beside it the whole prior; Laplace's Gaussian, and the truth if known."
     )
+    yield plots.marginals(one, before, units), words
     if one.sizes["parameter"] > 1 and np.isfinite(one["draw"].to_numpy()).all(axis=1).sum() >= PAIRABLE:
         words = "Posterior of the parameters in pairs: contours hold 50 and 90 %; lines are at the most probable values"
         known = " and the truth" if np.isfinite(one["true"]).any() else ""
@@ -345,31 +324,27 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
         yield plots.errors(one), "Mean minus truth over the posterior standard deviation; 95 % lie in the grey band."
 
 
-class FieldPosterior(Section):
+@section("alone_stiffness_std")
+def field_posterior(results: Results) -> Iterator[Block]:
     """The posterior of a field for each data set."""
-
-    needs = ("alone_stiffness_std",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """The same for each of the first data sets."""
-        for one in first(results):
-            yield from verdict(results, one)
-            yield from again(results, one)
-            yield Pairs([*amounts(one, one.sizes["node"], results.study), *more_amounts(one)])
-            yield posterior(one, results.study.units_of("/"))
-            yield Pictures([Picture.drawn(ax, caption) for ax, caption in field_pictures(one)])
-            alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
-            widths = [[number(float(width), 3)] for width in (*alone, one["stiffness_std"].mean())]
-            yield from cases(one, ["mean ± of ln stiffness"], widths)
-            yield iterations(one)
+    for one in first(results):
+        yield from verdict(results, one)
+        yield from again(results, one)
+        yield Pairs.of(*amounts(one, one.sizes["node"], results.study), *more_amounts(one))
+        yield parameters(one, results.study.units_of("/"))
+        yield Pictures.of(*field_pictures(one))
+        alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
+        widths = [[number(float(width), 3)] for width in (*alone, one["stiffness_std"].mean())]
+        yield from cases(one, ["mean ± of ln stiffness"], widths)
+        yield iterations(one)
 
 
-def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
+def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
     """The cost of the search, and how often the interval contains the truth, if known."""
-    yield "Hessian products", [f"{int(one['products']):,}"]
+    yield "Hessian products", f"{int(one['products']):,}"
     if np.isfinite(one["stiffness_true"]).all():
         inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
-        yield "true ln stiffness within two standard deviations", [f"at {100 * inside:.0f} % of the nodes"]
+        yield "true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"
 
 
 def field_pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
@@ -385,7 +360,5 @@ def field_pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
     yield plots.node_marginals(one), f"{words}; the truth if known."
     yield of_misfits(one)
     if np.isfinite(one["stiffness_true"]).all():
-        yield (
-            plots.coverage(one),
-            "Error at the nodes over the posterior standard deviation, and the standard normal density.",
-        )
+        words = "Error at the nodes over the posterior standard deviation, and the standard normal density."
+        yield plots.coverage(one), words

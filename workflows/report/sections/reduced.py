@@ -8,57 +8,37 @@ from typing import Any
 
 from forward.readable import percent, size
 from forward.words import duration, number
-from workflows.report.blocks import Answer, Block, Card, Heading, Pairs, Picture, Pictures, Table, Text
-from workflows.report.plots import reduced as plots
-from workflows.report.section import Results, Section
+from workflows.report.blocks import Answer, Block, Card, Heading, Pairs, Pictures, Table, Text
+from workflows.report.plots import accuracy as plots
+from workflows.report.section import Results, section
 
 
-class ReducedModelOfBody(Section):
+@section(when=lambda results: "reduced" in results.summary)
+def reduced_model_of_body(results: Results) -> Iterator[Block]:
     """Errors on unseen samples, and how the model is made."""
-
-    def applies(self, results: Results) -> bool:
-        """Whether one was made."""
-        return "reduced" in results.summary
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """A table and pictures of the errors, then sizes."""
-        told, found = results.summary["reduced"], results.dataset
-        drawn = []
-        if told.get("errors"):
-            yield from _errors(told)
-            if told["unseen"] > 1:
-                caption = (
-                    "Estimated against true errors at the unseen samples, over the root mean square of each output."
-                )
-                drawn.append(Picture.drawn(plots.estimates(found), caption))
-        else:
-            yield Text("Nobody has measured how well it follows the body, with no unseen samples (method.unseen).")
-        drawn.append(
-            Picture.drawn(
-                plots.energies(found, told["modes"]), "The part of the snapshots that so many modes leave out."
-            )
-        )
-        yield Pictures(drawn)
-        yield Heading("What it is made of")
-        file, seconds = told["file"], told["seconds"]
-        yield Pairs(
-            [
-                ("snapshots", [f"{told['snapshots']:,} solves of the body, {told['unknowns']:,} unknowns"]),
-                ("modes", [f"{told['modes']}; {told['modes of the larger model']} of the model that tells the errors"]),
-                ("points of the material", [f"{told['points']:,}"]),
-                (
-                    "made in",
-                    [duration(seconds["snapshots"] + seconds["reduction"]) + " of processor time"],
-                ),
-                (
-                    "use it",
-                    [
-                        f"tissuq live {file}: a page with sliders",
-                        f"model = {{ kind = 'reduced', file = '{file}' }} in any study",
-                    ],
-                ),
-            ]
-        )
+    told, found = results.summary["reduced"], results.dataset
+    drawn = []
+    if told.get("errors"):
+        yield from _errors(told)
+        if told["unseen"] > 1:
+            caption = "Estimated against true errors at the unseen samples, over the root mean square of each output."
+            drawn.append((plots.estimates(found), caption))
+    else:
+        yield Text("Nobody has measured how well it follows the body, with no unseen samples (method.unseen).")
+    drawn.append((plots.energies(found, told["modes"]), "The part of the snapshots that so many modes leave out."))
+    yield Pictures.of(*drawn)
+    yield Heading("What it is made of")
+    file, seconds = told["file"], told["seconds"]
+    use = f"model = {{ kind = 'reduced', file = '{file}' }} in any study"
+    yield Pairs(
+        [
+            ("snapshots", [f"{told['snapshots']:,} solves of the body, {told['unknowns']:,} unknowns"]),
+            ("modes", [f"{told['modes']}; {told['modes of the larger model']} of the model that tells the errors"]),
+            ("points of the material", [f"{told['points']:,}"]),
+            ("made in", [duration(seconds["snapshots"] + seconds["reduction"]) + " of processor time"]),
+            ("use it", [f"tissuq live {file}: a page with sliders", use]),
+        ]
+    )
 
 
 def _errors(told: Mapping[str, Any]) -> Iterator[Block]:

@@ -9,28 +9,24 @@ from forward.readable import percent, size
 from forward.words import NONE, number, per, with_unit
 from uq.estimators.estimate import holds, part
 from workflows.report import plots
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
-from workflows.report.section import Results, Section, written
+from workflows.report.blocks import Block, Heading, Pictures, Table, Text
+from workflows.report.section import Results, section, written
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-class LocalSensitivities(Section):
+@section("derivative")
+def local_sensitivities(results: Results) -> Iterator[Block]:
     """Effects of parameters, to first order."""
-
-    needs = ("derivative",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """Tables of each output, and tornado charts."""
-        dataset = results.dataset
-        yield Heading("Local sensitivities")
-        yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
-        for output in results.drawn:
-            yield Heading(output, level=3)
-            yield sensitivities(results, output)
-        captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.drawn}
-        yield Pictures([Picture.drawn(plots.tornado(dataset, o), caption) for o, caption in captions.items()])
+    dataset = results.dataset
+    yield Heading("Local sensitivities")
+    yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
+    for output in results.drawn:
+        yield Heading(output, level=3)
+        yield sensitivities(results, output)
+    drawn = {output: plots.tornado(dataset, output) for output in results.drawn}
+    yield Pictures.of(*((ax, f"Change of {o}, to first order{largest_of(dataset)}.") for o, ax in drawn.items()))
 
 
 def sensitivities(results: Results, output: str) -> Table:
@@ -54,23 +50,13 @@ def largest_of(dataset: xr.Dataset) -> str:
     return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
 
 
-class LocalField(Section):
+@section("field_derivative_rms")
+def local_field(results: Results) -> Iterator[Block]:
     """Effects of parameters on the displacement field, to first order."""
-
-    needs = ("field_derivative_rms",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One table."""
-        yield Heading("Displacement field", level=3)
-        yield Text(
-            "Root mean square of the derivative of the displacement over the body: its L² norm over the root of the "
-            "volume."
-        )
-        yield field_norms(results)
-
-
-def field_norms(results: Results) -> Table:
-    """Root mean squares over the body of the derivatives of the displacement field."""
+    yield Heading("Displacement field", level=3)
+    yield Text(
+        "Root mean square of the derivative of the displacement over the body: its L² norm over the root of the volume."
+    )
     dataset = results.dataset
     rows = []
     for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
@@ -80,32 +66,28 @@ def field_norms(results: Results) -> Table:
         )
         slope = with_unit(number(rms, 5), per("m", results.parameter_unit(name)))
         rows.append((name, slope, size(rms * std, "m", 4), size(rms * wide, "m", 4)))
-    return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
+    yield Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
 
 
-class SobolIndices(Section):
+@section("sobol_first")
+def sobol_indices(results: Results) -> Iterator[Block]:
     """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
-
-    needs = ("sobol_first",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """Tables and pictures of each output, then of all and of the field."""
-        dataset = results.dataset
-        yield Heading("Sobol' indices")
-        yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
-        for output in results.drawn:
-            yield Heading(output, level=3)
-            yield sobol(results, output)
-            if "sobol_second" in dataset:
-                yield second_order(results, output)
-            caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
-            pictures = [Picture.drawn(plots.index_bars(dataset, output), caption)]
-            if dataset.sizes.get("index_round", 0) > 1:
-                caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
-                pictures.append(Picture.drawn(plots.index_convergence(dataset, output), caption))
-            yield Pictures(pictures)
-        caption = "Shares of the variance: parameters alone, and the rest."
-        yield Pictures([Picture.drawn(plots.index_shares(dataset, results.drawn), caption)])
+    dataset = results.dataset
+    yield Heading("Sobol' indices")
+    yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
+    for output in results.drawn:
+        yield Heading(output, level=3)
+        yield sobol(results, output)
+        if "sobol_second" in dataset:
+            yield second_order(results, output)
+        caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
+        pictures = [(plots.index_bars(dataset, output), caption)]
+        if dataset.sizes.get("index_round", 0) > 1:
+            caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
+            pictures.append((plots.index_convergence(dataset, output), caption))
+        yield Pictures.of(*pictures)
+    caption = "Shares of the variance: parameters alone, and the rest."
+    yield Pictures.of((plots.index_shares(dataset, results.drawn), caption))
 
 
 def sobol(results: Results, output: str) -> Table:
@@ -145,80 +127,64 @@ def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
             yield f"{word}, corrected"
 
 
-class SobolField(Section):
+@section("field_sobol_first")
+def sobol_field(results: Results) -> Iterator[Block]:
     """Generalised Sobol' indices of the displacement field."""
-
-    needs = ("field_sobol_first",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One table."""
-        yield Heading("Displacement field", level=3)
-        yield Text("Generalised indices: the variances of all nodes and components together.")
-        yield field_sobol(results)
-
-
-def field_sobol(results: Results) -> Table:
-    """Generalised Sobol' indices of the displacement field."""
+    yield Heading("Displacement field", level=3)
+    yield Text("Generalised indices: the variances of all nodes and components together.")
     rows = []
     for name in results.parameters:
         of = results.dataset.sel(parameter=name)
         rows.append((name, *(written(of, f"field_sobol_{which}") for which in ("first", "total"))))
-    return Table(("parameter", "first order", "total"), rows)
+    yield Table(("parameter", "first order", "total"), rows)
 
 
-class ShapleyEffects(Section):
+@section("shapley")
+def shapley_effects(results: Results) -> Iterator[Block]:
     """Shares of the variance that parameters are responsible for, a column for each output."""
-
-    needs = ("shapley",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """One table."""
-        outputs, of = results.drawn, results.dataset
-        yield Heading("Shapley effects")
-        yield Text(
-            "The share of the variance that a parameter is responsible for, with what it shares with others split "
-            "evenly: parameters that are given by the same draws depend on each other, and have no Sobol' indices."
-        )
-        rows = [
-            (name, *(written(of.sel(output=output, parameter=name), "shapley") for output in outputs))
-            for name in results.parameters
-        ]
-        yield Table(("parameter", *outputs), rows)
+    outputs, of = results.drawn, results.dataset
+    yield Heading("Shapley effects")
+    yield Text(
+        "The share of the variance that a parameter is responsible for, with what it shares with others split "
+        "evenly: parameters that are given by the same draws depend on each other, and have no Sobol' indices."
+    )
+    rows = [
+        (name, *(written(of.sel(output=output, parameter=name), "shapley") for output in outputs))
+        for name in results.parameters
+    ]
+    yield Table(("parameter", *outputs), rows)
 
 
-class DerivativeBased(Section):
+@section("total_bound")
+def derivative_based(results: Results) -> Iterator[Block]:
     """Bounds on total indices, and active subspaces."""
-
-    needs = ("total_bound",)
-
-    def content(self, results: Results) -> Iterator[Block]:
-        """Tables and pictures of each output."""
-        dataset = results.dataset
-        yield Heading("Sensitivity from derivatives")
-        yield Text(
-            "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
-            "distribution over the variance of the output. The active subspace is spanned by the directions along "
-            "which the output changes most, in parameters over their standard deviations."
+    dataset = results.dataset
+    yield Heading("Sensitivity from derivatives")
+    yield Text(
+        "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
+        "distribution over the variance of the output. The active subspace is spanned by the directions along "
+        "which the output changes most, in parameters over their standard deviations."
+    )
+    for output in results.drawn:
+        yield Heading(output, level=3)
+        yield bounds(results, output)
+        of = results.of(output)
+        rows = [(name, written(of.sel(parameter=name), "active_direction")) for name in results.parameters]
+        yield Table(("parameter", "leading direction"), rows)
+        values = zip(*(of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")), strict=True)
+        whole = max(float(of["active_eigenvalue"].sum()), 1e-300)
+        spectrum = [
+            (str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole))
+            for i, (value, lower, upper) in enumerate(values, start=1)
+        ]
+        yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), spectrum)
+        yield Pictures.of(
+            (
+                plots.active_summary(dataset, output),
+                f"{output} against its leading direction: a curve if only that direction matters.",
+            ),
+            (plots.spectrum(dataset, output), f"Eigenvalues of the active subspace of {output} with 95 % ranges."),
         )
-        for output in results.drawn:
-            yield Heading(output, level=3)
-            yield bounds(results, output)
-            yield leading_direction(results, output)
-            yield eigenvalues(results, output)
-            summary = f"{output} against its leading direction: a curve if only that direction matters."
-            spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
-            yield Pictures(
-                [
-                    Picture.drawn(plots.active_summary(dataset, output), summary),
-                    Picture.drawn(plots.spectrum(dataset, output), spectrum),
-                ]
-            )
-
-
-def slope_unit(results: Results, output: str, name: str) -> str:
-    """Unit of a squared derivative."""
-    unit = per(results.unit(output), results.parameter_unit(name))
-    return unit if unit == "1" else f"({unit})²"
 
 
 def bounds(results: Results, output: str) -> Table:
@@ -227,7 +193,8 @@ def bounds(results: Results, output: str) -> Table:
     rows = []
     for name in results.parameters:
         of = of_output.sel(parameter=name)
-        squared = with_unit(written(of, "dgsm"), slope_unit(results, output, name))
+        slope = per(results.unit(output), results.parameter_unit(name))
+        squared = with_unit(written(of, "dgsm"), slope if slope == "1" else f"({slope})²")
         total = written(of, "sobol_total") if "sobol_total" in of else NONE
         corrected = results.corrected("total_bound", {"output": output, "parameter": name})
         share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
@@ -242,22 +209,3 @@ def bounds(results: Results, output: str) -> Table:
         *(("is at most, corrected",) if holds(results.dataset, "total_bound", "corrected") else ()),
     )
     return Table(head, rows)
-
-
-def leading_direction(results: Results, output: str) -> Table:
-    """Components of the direction along which an output changes most, in parameters over their deviations."""
-    of_output = results.of(output)
-    rows = [(name, written(of_output.sel(parameter=name), "active_direction")) for name in results.parameters]
-    return Table(("parameter", "leading direction"), rows)
-
-
-def eigenvalues(results: Results, output: str) -> Table:
-    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, each with its share of their sum."""
-    of_output = results.of(output)
-    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
-    whole = max(float(values[0].sum()), 1e-300)
-    rows = [
-        (str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole))
-        for i, (value, lower, upper) in enumerate(zip(*values, strict=True), start=1)
-    ]
-    return Table(("direction", "eigenvalue", "95 % range", "share of their sum"), rows)

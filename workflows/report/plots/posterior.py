@@ -1,4 +1,4 @@
-"""Parameters in pairs: contours of their joint density, each alone on the diagonal."""
+"""What data say of parameters and predictions: joint densities, load cases, populations."""
 
 from __future__ import annotations
 
@@ -8,10 +8,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray
-from workflows.report.plots.figure import DARK, HIGH, axes, span
+from forward.words import named, number
+from workflows.report.plots.figure import (
+    COLOURS,
+    CONTROLLED,
+    DARK,
+    HIGH,
+    PLAIN,
+    axes,
+    finished,
+    rows,
+    span,
+    text_of,
+)
 
 if TYPE_CHECKING:
+    import xarray as xr
     from matplotlib.axes import Axes
+
 
 HELD = (0.9, 0.5)  # of the probability: within the contours
 LATTICE = 40  # points along an axis at which densities are computed
@@ -145,3 +159,91 @@ def _wide(ends: tuple[float, float], truth: float) -> tuple[float, float]:
     if low - wide < truth < high + wide:
         return min(low, truth - 0.05 * wide), max(high, truth + 0.05 * wide)
     return ends
+
+
+PALE = 0.55  # shades above it are written on in white
+SAID = 1.05  # times narrower from which it is written
+LEAST = 4.0  # times narrower that the darkest shade stands for, at least
+
+
+def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw how many times narrower each load case alone makes each parameter, and all together.
+
+    With the model linearised at the mode: σ before / σ after; 1 where that is wider than the prior.
+    """
+    names = [str(name) for name in one.parameter.values if name != "noise"]
+    before = one["prior_std"].sel(parameter=names).to_numpy()
+    widths = np.vstack([one["alone_std"].sel(parameter=names), one["together_std"].sel(parameter=names).values[None]])
+    factors = np.maximum(before / widths, 1.0)
+    shades = np.log(factors) / max(np.log(factors.max()), np.log(LEAST))
+    parts = [*(str(case) for case in one.case.values), "all together"]
+    ax = ax or axes(height=1.6 + 0.32 * len(parts), width=max(5.4, 1.6 + 0.85 * len(names)))
+    ax.imshow(shades, cmap="Blues", vmin=0, vmax=1.1, aspect="auto")
+    for (i, j), factor in np.ndenumerate(factors):
+        colour = "white" if shades[i, j] > PALE else "black"
+        text = f"{number(float(factor), 2)} ×" if factor >= SAID else ""
+        ax.annotate(text, (j, i), ha="center", va="center", fontsize="small", color=colour)
+    ax.set_xticks(range(len(names)), [text_of(name) for name in names], rotation=25, ha="right")
+    ax.set_yticks(range(len(parts)), [text_of(part) for part in parts])
+    ax.spines[["left", "bottom"]].set_visible(False)
+    ax.tick_params(length=0)
+    return ax
+
+
+OUTPUTS = 12  # that have intervals
+
+
+def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw the interval of each output by the prior and by the posterior; 0 and 1 are the ends of that by the prior.
+
+    Where nothing is known of the prior, those of the posterior are 0 and 1.
+    """
+    outputs = [str(name) for name in one["goal"].values][:OUTPUTS]
+    ax = ax or axes(height=1.3 + 0.4 * len(outputs), width=7.0)
+    some = one.sel(goal=outputs)
+    after = np.array([some[f"prediction_{end}"] for end in ("lower", "mean", "upper")])
+    before = np.array([some[f"prediction_prior_{end}"] for end in ("lower", "mean", "upper")])
+    frame = np.where(np.isfinite(before), before, after)
+    size = frame[2] - frame[0]
+    known = size > 0
+    places = rows(ax, outputs)
+    for values, colour, height, label in (
+        (before, COLOURS[1], 0.7, "before the data"),
+        (after, COLOURS[0], 0.35, "after"),
+    ):
+        lower, middle, upper = (values[:, known] - frame[0, known]) / size[known]
+        ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
+        ax.plot(middle, places[known], "|", color=colour, markersize=14, markeredgewidth=2)
+    return finished(ax, "from the lower to the upper end of the interval before the data", above=2)
+
+
+SPECIMENS = 40  # that have a row
+RATIO = 30.0  # of the ends of an axis above which it is logarithmic
+
+
+def specimens(of: xr.Dataset, name: str, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw a parameter of each specimen, by its own data and as one of the population, over what new ones are like."""
+    names = [str(specimen) for specimen in of["specimen"].values][:SPECIMENS]
+    ax = ax or axes(height=1.6 + 0.32 * len(names))
+    here = of.sel(parameter=name)
+    places = rows(ax, names)
+    lower, _, upper = here["new_quantiles"].to_numpy()
+    ax.axvspan(lower, upper, color=PLAIN, alpha=0.15, linewidth=0, label="new specimens, 95 %")
+    low, _, high = here["typical_quantiles"].to_numpy()
+    ax.axvspan(low, high, color=PLAIN, alpha=0.3, linewidth=0, label="the typical specimen, 95 %")
+    one = here.sel(specimen=names)
+    own = one["own_mean"].to_numpy(), 1.96 * one["own_std"].to_numpy()
+    ax.errorbar(own[0], places + 0.14, xerr=own[1], fmt="o", ms=4, color=CONTROLLED, capsize=3, label="by its own data")
+    ends = one["specimen_mean"].to_numpy(), one["specimen_lower"].to_numpy(), one["specimen_upper"].to_numpy()
+    reach = np.maximum([ends[0] - ends[1], ends[2] - ends[0]], 0.0)
+    ax.errorbar(ends[0], places - 0.14, xerr=reach, fmt="s", ms=4, color=HIGH, capsize=3, label="of the population")
+    left, right = ax.get_xlim()
+    if lower > 0 and RATIO * lower < upper:
+        ax.set_xscale("log")
+    else:
+        wide = upper - lower
+        ax.set_xlim(max(left, min(lower, float(ends[1].min())) - 0.3 * wide), right)
+        ax.locator_params(axis="x", nbins=5)
+    ax.set_xlabel(named(text_of(name), unit))
+    ax.figure.legend(loc="outside lower center", ncols=2, fontsize="small", frameon=False)
+    return ax
