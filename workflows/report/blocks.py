@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
 
 from workflows.report import plots
 from workflows.report.plots.figure import png_of
+from workflows.report.small_density import Curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,11 +134,7 @@ class Answer:
     lines
         What belongs to it: an interval, its errors, what drives it.
     curve
-        Its distribution: heights (n,) at equal distances over a range, of any scale; empty if it has none.
-    inside
-        Ends of its 95 % interval as parts of that range.
-    ends
-        Words at both ends of the range.
+        Its distribution, if it has one.
     leads
         Whether it is the first of several candidates.
     """
@@ -145,18 +142,8 @@ class Answer:
     name: str
     value: str
     lines: Sequence[str] = ()
-    curve: Sequence[float] = ()
-    inside: tuple[float, float] = (0.0, 1.0)
-    ends: tuple[str, str] = ("", "")
+    curve: Curve | None = None
     leads: bool = False
-
-    @property
-    def path(self) -> str:
-        """The curve as a path of SVG, 100 wide and 20 high."""
-        top = max(self.curve, default=0.0) or 1.0
-        step = 100 / max(len(self.curve) - 1, 1)
-        points = "L".join(f"{step * k:.2f} {20 - 19 * y / top:.2f}" for k, y in enumerate(self.curve))
-        return f"M0 20L{points}L100 20Z"
 
 
 @dataclass(frozen=True)

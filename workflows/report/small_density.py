@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,19 +16,33 @@ CURVE = 48  # points
 ALIKE = 1e-12  # standard deviation over the mean up to which values are the same
 
 
-def curve_of(
-    at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str, value: float
-) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
-    """Return heights of a density at places (m,), the ends of an interval as parts of its range, and these in words."""
+@dataclass(frozen=True)
+class Curve:
+    """A density: heights (n,) at equal distances, the ends of an interval as parts of its range, its ends in words."""
+
+    heights: list[float]
+    inside: tuple[float, float]
+    ends: tuple[str, str]
+
+    @property
+    def path(self) -> str:
+        """The curve as a path of SVG, 100 wide and 20 high."""
+        top = max(self.heights, default=0.0) or 1.0
+        step = 100 / max(len(self.heights) - 1, 1)
+        points = "L".join(f"{step * k:.2f} {20 - 19 * y / top:.2f}" for k, y in enumerate(self.heights))
+        return f"M0 20L{points}L100 20Z"
+
+
+def curve_of(at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str, value: float) -> Curve:
+    """Return a density at places (m,) with the 95 % interval of a value."""
     low, high = min(float(at[0]), inside[0]), max(float(at[-1]), inside[1])
     if (low, high) != (float(at[0]), float(at[-1])):  # draws of weighted points may reach less far than their interval
         lattice = np.linspace(low, high, CURVE)
         at, curve = lattice, np.interp(lattice, at, curve, left=0.0, right=0.0)
     a, b = (float(np.clip((x - low) / ((high - low) or 1.0), 0, 1)) for x in inside)
     words = interval(low, high, unit, value)
-    cut = " to " if " to " in words else "–"
-    left, _, right = words.partition(cut)
-    return [float(y) for y in curve], (a, b), (left, right)
+    left, _, right = words.partition(" to " if " to " in words else "–")
+    return Curve([float(y) for y in curve], (a, b), (left, right))
 
 
 def smooth(values: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:

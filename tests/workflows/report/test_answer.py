@@ -87,7 +87,7 @@ def test_intervals_of_an_expansion_are_those_of_its_density():
     rng = np.random.default_rng(0)
     normal = rng.normal(3e5, 2e4, 400_000)
     exact = np.quantile(0.1 * (rng.uniform(600, 900, 400_000) / 750) ** 2 / (normal / 3e5), (0.025, 0.975))
-    np.testing.assert_allclose(answer.middle(one)[:2], exact, rtol=0.01)
+    np.testing.assert_allclose(answer.distribution(one).inside, exact, rtol=0.01)
 
 
 def test_small_densities_are_densities():
@@ -110,17 +110,18 @@ def test_small_densities_of_one_sign_end_at_zero():
 def test_a_small_density_of_one_value_is_drawn(value):
     """One point copied, the last digit of whose mean is rounding; and a lattice without length."""
     at, curve = small_density.smooth(np.full(400, value))
-    _, inside, _ = small_density.curve_of(at, curve, (value, value), "m", value)
+    found = small_density.curve_of(at, curve, (value, value), "m", value)
     assert np.isfinite(curve).all()
-    assert inside == pytest.approx((0.5, 0.5))
-    assert small_density.curve_of(np.full(48, value), curve, (value, value), "m", value)[1] == (0.0, 0.0)
+    assert found.inside == pytest.approx((0.5, 0.5))
+    assert small_density.curve_of(np.full(48, value), curve, (value, value), "m", value).inside == (0.0, 0.0)
 
 
 def test_a_small_density_holds_an_interval_that_reaches_beyond_its_samples():
     at, curve = np.linspace(2.0, 4.0, 5), np.array([0.0, 1.0, 2.0, 1.0, 0.0])
-    drawn, inside, ends = small_density.curve_of(at, curve, (1.0, 3.5), "m", 3.0)
-    assert inside == pytest.approx((0.0, 2.5 / 3))
-    assert ends == ("1.0", "4.0\N{NO-BREAK SPACE}m")
+    found = small_density.curve_of(at, curve, (1.0, 3.5), "m", 3.0)
+    drawn = found.heights
+    assert found.inside == pytest.approx((0.0, 2.5 / 3))
+    assert found.ends == ("1.0", "4.0\N{NO-BREAK SPACE}m")
     assert drawn[0] == 0
     assert np.argmax(drawn) / (len(drawn) - 1) == pytest.approx(2 / 3, abs=0.02)
 

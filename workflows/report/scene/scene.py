@@ -6,6 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -131,18 +132,15 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
     insides = []
     box = points.min(axis=0), points.max(axis=0)
     for inclusion in inclusions:
-        of = _numbers(inclusion, names, one["mean"].to_numpy())
-        insides.append(_ball(f"{inclusion.label}, posterior mean", inclusion, of, box, "inside"))
+        ball = partial(_ball, inclusion, names, box)
+        insides.append(ball(f"{inclusion.label}, posterior mean", one["mean"].to_numpy(), "inside"))
         if np.isfinite(one["true"]).any():
-            values = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
-            truth = _numbers(inclusion, names, values)
-            insides.append(_ball(f"{inclusion.label}, truth", inclusion, truth, box, "truth", 0.45, shown=False))
+            truth = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
+            insides.append(ball(f"{inclusion.label}, truth", truth, "truth", 0.45, shown=False))
         if "draw" in one:
             draws = one["draw"].to_numpy()
-            parts = [
-                _ball("", inclusion, _numbers(inclusion, names, draw), box, "draw")
-                for draw in draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]
-            ]
+            some = draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]
+            parts = [ball("", draw, "draw") for draw in some]
             insides.append(_joined(f"{inclusion.label}, {len(parts)} posterior draws", parts, "draw", 0.2))
     return Scene(
         points,
@@ -226,9 +224,7 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
     factors = np.exp(mean)
     known = np.isfinite(one["stiffness_true"].to_numpy()).all() if "stiffness_true" in one else False
     truth = np.exp(one["stiffness_true"].to_numpy()) if known else factors
-    low, high = (
-        float(f(factors.min(), truth.min()) if f is min else f(factors.max(), truth.max())) for f in (min, max)
-    )
+    low, high = float(min(factors.min(), truth.min())), float(max(factors.max(), truth.max()))
     yield Quantity("Stiffness factor, posterior mean", factors, low=low, high=high)
     yield Quantity("± of ln stiffness, one posterior standard deviation", std, colours="plasma", low=0.0)
     if "stiffness_prior_std" in one:
@@ -320,37 +316,32 @@ def _inclusions_of(of: xr.Dataset, study: Any, points: FloatArray) -> Iterator[I
     names, means = [str(name) for name in of["parameter"].values], of["parameter_mean"].to_numpy()
     box = points.min(axis=0), points.max(axis=0)
     for inclusion in getattr(study.model, "inclusions", ()):
-        yield _ball(inclusion.label, inclusion, _numbers(inclusion, names, means), box, "inside")
-
-
-def _numbers(inclusion: Any, names: Sequence[str], values: FloatArray) -> dict[str, float]:
-    path = f"inclusions.{inclusion.label}"
-    own = inclusion.model_dump(exclude={"kind", "name", "contrast"})
-    return {
-        key: float(values[names.index(f"{path}.{key}")]) if f"{path}.{key}" in names else value
-        for key, value in own.items()
-    }
+        yield _ball(inclusion, names, box, inclusion.label, means, "inside")
 
 
 def _ball(
-    name: str,
     inclusion: Any,
-    numbers: Mapping[str, float],
+    names: Sequence[str],
     box: tuple[FloatArray, FloatArray],
+    label: str,
+    values: FloatArray,
     kind: str,
     opacity: float = 1.0,
     *,
     shown: bool = True,
 ) -> Inside:
-    """The surface where the indicator of an inclusion is ½, within the body."""
+    """The surface where the indicator of an inclusion is ½, within the body, with values of what is not known of it."""
+    of = dict(zip(names, values.tolist(), strict=True))
+    own = inclusion.model_dump(exclude={"kind", "name", "contrast"})
+    numbers = {key: of.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in own.items()}
     radii = [numbers[r] for r in ("radius",) if r in numbers] or [numbers[r] for r in "abc"]
     centre, reach = np.array([numbers[axis] for axis in "xyz"]), 1.15 * max(radii)
     low, high = np.maximum(centre - reach, box[0] - 0.1 * reach), np.minimum(centre + reach, box[1] + 0.1 * reach)
     if (low >= high).any():
-        return Inside(name, np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), kind, opacity, shown)
+        return Inside(label, np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), kind, opacity, shown)
     indicator = INDICATORS[inclusion.kind]
     at, triangles = level(lambda x: 0.5 - indicator(OPS, x.T, **numbers), low, high, 20)
-    return Inside(name, triangles, at, kind, opacity, shown)
+    return Inside(label, triangles, at, kind, opacity, shown)
 
 
 def _joined(name: str, parts: Sequence[Inside], kind: str, opacity: float) -> Inside:
@@ -418,19 +409,8 @@ def packed(scene: Scene) -> tuple[str, str]:
         if not np.isfinite(q.values).any():
             continue
         low, high = ends(q)
-        told["quantities"].append(
-            {
-                "name": q.name,
-                "unit": q.unit,
-                "colours": q.colours,
-                "low": low,
-                "high": high,
-                "still": q.still,
-                "std": q.std,
-                "names": list(q.names),
-                "values": pack.add(q.values[kept]) if q.names else pack.field(q.values[kept], max(fine, 1e-5)),
-            }
-        )
+        values = pack.add(q.values[kept]) if q.names else pack.field(q.values[kept], max(fine, 1e-5))
+        told["quantities"].append(q._asdict() | {"low": low, "high": high, "names": list(q.names), "values": values})
     for inside in scene.insides:
         if not len(inside.triangles):
             continue
@@ -449,14 +429,8 @@ def packed(scene: Scene) -> tuple[str, str]:
             entry["points"] = pack.add(inside.points[mine.nodes], 1e-5 * extent)
         told["insides"].append(entry)
     for name, (places, vectors, sizes) in scene.arrows.items():
-        told["arrows"].append(
-            {
-                "name": name,
-                "places": pack.add(places, 1e-5 * extent),
-                "vectors": pack.field(vectors, 1e-5),
-                "sizes": pack.field(sizes, 1e-4),
-            }
-        )
+        numbers = {"places": pack.add(places, 1e-5 * extent), "vectors": pack.field(vectors, 1e-5)}
+        told["arrows"].append({"name": name, **numbers, "sizes": pack.field(sizes, 1e-4)})
     if scene.sliders is not None:
         told["sliders"] = scene.sliders.packed(pack, kept)
     told["arrays"] = pack.told

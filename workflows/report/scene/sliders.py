@@ -11,10 +11,10 @@ import numpy as np
 
 from forward.model import FloatArray, SolveError
 from forward.readable import spoken
-from forward.registry import named
 from forward.words import named as with_its_unit
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
+from workflows.report.plots.posterior import density as kernels
 from workflows.report.scene.pack import Packer
 from workflows.results.level import IntArray
 
@@ -27,6 +27,7 @@ MOST = 160  # parameters
 MANY = 24  # parameters from which on each is told with fewer numbers
 SAMPLES = 1024  # of dependent parameters
 BYTES = 8_000_000  # of the modes of a field, before they are written as text
+SOLVES = 128  # with derivatives, of a reduced model: some seconds of processor time
 STEPS = (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)  # of the largest displacement, from fine to coarse
 QUANTILES, FEWER = 256, 64  # of each parameter
 CURVE, SHORTER = 61, 31  # points of each density
@@ -140,7 +141,7 @@ class Sliders:
         low, high = min(low, float(self.expansion.lower[i])), max(high, float(self.expansion.upper[i]))
         at = np.linspace(low, high, points)
         density = (
-            _heights(self.samples[:, i], at)
+            kernels(self.samples[:, [i]], np.full(len(self.samples), 1 / len(self.samples)), at[:, None])
             if self.samples is not None
             else np.interp(at, values, np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300), left=0, right=0)
         )
@@ -240,15 +241,37 @@ def of_reduced(study: Any) -> xr.Dataset | None:
     if getattr(spec, "kind", "") != "reduced":
         return None
     try:
-        found: xr.Dataset = named("workflows.report.scene.of_reduced:expanded")(
-            Path(spec.file), study, alone=spec.larger
-        )
+        return expanded(Path(spec.file), study, alone=spec.larger)
     except SolveError:
         return None
-    return found
 
 
-def _heights(values: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the density (m,) at points of samples (n,), by Gaussian kernels; its scale does not matter."""
-    width = 1.06 * max(float(values.std()), 1e-300) * len(values) ** -0.2
-    return np.asarray(np.exp(-0.5 * ((at[:, None] - values) / width) ** 2).sum(axis=1))
+def expanded(file: Path, study: Any, *, alone: bool = False) -> xr.Dataset:
+    """Return the expansion of a reduced model over the inputs of a study, with its mesh, as `chaos` returns one.
+
+    `own_error` (output,) is the root mean square error of the model itself on samples that it was not made of; NaN if
+    none were solved. `alone` takes the larger model.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the means, or at too many samples.
+    """
+    from forward.reduced.data import load
+    from forward.reduced.model import ReducedModel
+    from forward.reduced.spec import Reduced
+    from uq.evaluation.evaluate import SerialEvaluate
+    from uq.methods.chaos import Chaos
+    from workflows.results.directory import label, with_regions
+
+    data, inputs = load(file), study.inputs
+    model = ReducedModel(data, inputs.names, alone=alone, tested=False)
+    found = Chaos(samples=SOLVES, quantiles=()).run(inputs, SerialEvaluate(model))
+    units = {output.name: output.unit for output in data.outputs}
+    found = label(found, units, model.space.coordinates, *model.space.cells())
+    found = with_regions(found, model.spec.body.regions, model.space.regions())
+    own = Reduced(file=str(file)).errors
+    left = data.about.get("error of the state")
+    itself = "" if left is None else f", which itself errs by {100 * left:.2g} % of the displacements"
+    found.attrs["source"] = f"The expansion was fitted to {SOLVES} solves of the reduced model{itself}."
+    return found.assign(own_error=("output", [own.get(str(name), np.nan) for name in found["output"].to_numpy()]))

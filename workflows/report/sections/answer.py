@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -97,16 +97,19 @@ def forward(results: Results) -> Card:
         if itself is not None:
             errors["reduced model"] = itself
         error = whole(errors)
-        lines = [] if not sampled else [spread(one, unit, value)]
+        spread = distribution(one) if sampled else None
+        lines = [] if spread is None else [f"95\u00a0%: {interval(*spread.inside, unit, value)}{spread.by}"]
         unknown = output in results.meshes_unknown
         lines += known(errors, unit, value, mesh=not unknown)
         estimate = single(one, name)
         if np.isfinite(estimate.corrected):
             lines.append(f"corrected for the mesh: {and_error(estimate.corrected, estimate.left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
-        curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
+        curve = None
+        if spread is not None and spread.curve is not None:
+            curve = curve_of(*spread.curve, spread.inside, unit, float(one["mean"]))
         shown = size(value, unit, DIGITS) if results.meshes_unknown.get(output) else quantity(value, error, unit)
-        answers.append(Answer(called(results, output), shown, lines, curve, inside, ends))
+        answers.append(Answer(called(results, output), shown, lines, curve))
     return Card(question, answers)
 
 
@@ -159,44 +162,31 @@ def known(errors: dict[str, float], unit: str, value: float, *, mesh: bool) -> I
         yield NOT_KNOWN
 
 
-def spread(one: xr.Dataset, unit: str, value: float) -> str:
-    """Say where 95 % of the values of an output lie."""
-    lower, upper, by = middle(one)
-    return f"95\u00a0%: {interval(lower, upper, unit, value)}{by}"
+class Distribution(NamedTuple):
+    """The ends of the 95 % interval of an output, where they are from if not from it, and places (m,) and a density."""
+
+    inside: tuple[float, float]
+    by: str = ""
+    curve: tuple[FloatArray, FloatArray] | None = None
 
 
-def middle(one: xr.Dataset) -> tuple[float, float, str]:
-    """Return the ends of the 95 % interval of an output's distribution, and where they are from if not from it."""
+def distribution(one: xr.Dataset) -> Distribution:
+    """Return the distribution of an output: by its expansion, by its samples, or by mean and standard deviation."""
     if "density_edge" in one and np.isfinite(one["density"]).all():
-        edges = one["density_edge"].to_numpy()
-        reached = np.concatenate([[0], np.cumsum(one["density"].to_numpy() * np.diff(edges))])
-        return (*(float(x) for x in np.interp(ENDS, reached / reached[-1], edges)), "")  # type: ignore[return-value]
-    values = samples(one)
-    if len(values) >= LEAST:
-        return (*(float(x) for x in np.quantile(values, ENDS)), "")  # type: ignore[return-value]
-    mean, std = float(one["mean"]), float(one["std"])
-    return mean - 1.96 * std, mean + 1.96 * std, " (mean ± 1.96 standard deviations)"
-
-
-def samples(one: xr.Dataset) -> FloatArray:
-    """Return the values (n,) of an output that were solved at samples of one distribution."""
-    if "values" not in one or one["values"].dims != ("sample",):
-        return np.zeros(0)
-    return np.asarray(one["values"].to_numpy()[one["ok"].to_numpy()] if "ok" in one else one["values"].to_numpy())
-
-
-def density(one: xr.Dataset, unit: str) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
-    """Return a small curve of the distribution of an output, its middle 95 %, and its ends in words."""
-    if "density_edge" in one and np.isfinite(one["density"]).all():
-        edges = one["density_edge"].to_numpy()
+        edges, density = one["density_edge"].to_numpy(), one["density"].to_numpy()
+        reached = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
+        low, high = np.interp(ENDS, reached / reached[-1], edges)
         at = np.linspace(edges[0], edges[-1], CURVE)
-        curve = np.interp(at, (edges[1:] + edges[:-1]) / 2, one["density"].to_numpy(), left=0, right=0)
-    else:
-        values = samples(one)
-        if len(values) < LEAST or np.ptp(values) <= 1e-12 * np.abs(values).max():
-            return (), (0.0, 1.0), ("", "")
-        at, curve = smooth(values)
-    return curve_of(at, curve, middle(one)[:2], unit, float(one["mean"]))
+        curve = np.interp(at, (edges[1:] + edges[:-1]) / 2, density, left=0, right=0)
+        return Distribution((float(low), float(high)), curve=(at, curve))
+    if "values" in one and one["values"].dims == ("sample",):
+        values = one["values"].to_numpy()[one["ok"].to_numpy() if "ok" in one else slice(None)]
+        if len(values) >= LEAST:
+            low, high = np.quantile(values, ENDS)
+            still = np.ptp(values) <= 1e-12 * np.abs(values).max()
+            return Distribution((float(low), float(high)), curve=None if still else smooth(values))
+    mean, reach = float(one["mean"]), 1.96 * float(one["std"])
+    return Distribution((mean - reach, mean + reach), " (mean ± 1.96 standard deviations)")
 
 
 def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
@@ -333,7 +323,7 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
-        return Answer(label, quantity(mean, std, unit), lines, *curve_of(at, curve, (lower, upper), unit, mean))
+        return Answer(label, quantity(mean, std, unit), lines, curve_of(at, curve, (lower, upper), unit, mean))
     return Answer(label, quantity(mean, std, unit), lines)
 
 

@@ -55,7 +55,7 @@ def body(results: Results) -> Iterator[Block]:
     yield Heading("The deformed body")
     reduced = _file(results)
     if reduced is not None:
-        from workflows.report.scene.of_reduced import expanded
+        from workflows.report.scene.sliders import expanded
 
         try:
             dataset = expanded(reduced, results.study).assign_attrs(config=dataset.attrs["config"])

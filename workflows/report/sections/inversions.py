@@ -200,7 +200,7 @@ def population_card(results: Results) -> Card:
             f"specimens differ by {spread_} (one standard deviation)",
         ]
         shown = curve_of(at, curve, (new[0], new[2]), unit, mid)
-        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
+        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, shown))
     return Card(question, answers)
 
 
