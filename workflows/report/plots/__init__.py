@@ -6,65 +6,39 @@ is where on a body are in the modules `inversion`, `posterior`, `selection` and 
 `workflows.report.bodies`.
 """
 
-from workflows.report.plots import inversion, places, posterior, selection
-from workflows.report.plots.accuracy import (
-    error_budget,
-    errors,
-    levels,
-    mesh_cost,
-    mesh_mean,
-    mesh_samples,
-    mesh_variance,
-    refinement,
-    tolerance_bars,
-)
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span, svg
-from workflows.report.plots.indices import (
-    BARS,
-    active_summary,
-    index_bars,
-    index_convergence,
-    index_shares,
-    spectrum,
-    tornado,
-)
-from workflows.report.plots.moments import comparison, convergence, histogram, running_estimates, standard_error
-
-__all__ = [
-    "BARS",
-    "COLOURS",
-    "CONTROLLED",
-    "DARK",
-    "HIGH",
-    "LOW",
-    "PLAIN",
-    "active_summary",
-    "axes",
-    "comparison",
-    "convergence",
-    "error_budget",
-    "errors",
-    "grid",
-    "histogram",
-    "index_bars",
-    "index_convergence",
-    "index_shares",
-    "inversion",
-    "levels",
-    "mesh_cost",
-    "mesh_mean",
-    "mesh_samples",
-    "mesh_variance",
-    "places",
-    "png",
-    "posterior",
-    "refinement",
-    "running_estimates",
-    "selection",
-    "span",
-    "spectrum",
-    "standard_error",
-    "svg",
-    "tolerance_bars",
-    "tornado",
-]
+from workflows.report.plots import inversion as inversion
+from workflows.report.plots import places as places
+from workflows.report.plots import posterior as posterior
+from workflows.report.plots import selection as selection
+from workflows.report.plots.accuracy import error_budget as error_budget
+from workflows.report.plots.accuracy import errors as errors
+from workflows.report.plots.accuracy import levels as levels
+from workflows.report.plots.accuracy import mesh_cost as mesh_cost
+from workflows.report.plots.accuracy import mesh_mean as mesh_mean
+from workflows.report.plots.accuracy import mesh_samples as mesh_samples
+from workflows.report.plots.accuracy import mesh_variance as mesh_variance
+from workflows.report.plots.accuracy import refinement as refinement
+from workflows.report.plots.accuracy import tolerance_bars as tolerance_bars
+from workflows.report.plots.figure import COLOURS as COLOURS
+from workflows.report.plots.figure import CONTROLLED as CONTROLLED
+from workflows.report.plots.figure import DARK as DARK
+from workflows.report.plots.figure import HIGH as HIGH
+from workflows.report.plots.figure import LOW as LOW
+from workflows.report.plots.figure import PLAIN as PLAIN
+from workflows.report.plots.figure import axes as axes
+from workflows.report.plots.figure import grid as grid
+from workflows.report.plots.figure import png as png
+from workflows.report.plots.figure import span as span
+from workflows.report.plots.figure import svg as svg
+from workflows.report.plots.indices import BARS as BARS
+from workflows.report.plots.indices import active_summary as active_summary
+from workflows.report.plots.indices import index_bars as index_bars
+from workflows.report.plots.indices import index_convergence as index_convergence
+from workflows.report.plots.indices import index_shares as index_shares
+from workflows.report.plots.indices import spectrum as spectrum
+from workflows.report.plots.indices import tornado as tornado
+from workflows.report.plots.moments import comparison as comparison
+from workflows.report.plots.moments import convergence as convergence
+from workflows.report.plots.moments import histogram as histogram
+from workflows.report.plots.moments import running_estimates as running_estimates
+from workflows.report.plots.moments import standard_error as standard_error

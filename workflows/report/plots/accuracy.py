@@ -125,10 +125,9 @@ def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     ):
         values = dataset[name].to_numpy()
         ax.plot(places, np.where(values > 0, values, np.nan), dash, color=colour, marker="o", markersize=4, label=label)
-    if bool((dataset["level_residual"] > 0).any() | (dataset["level_change"] > 0).any()):
-        ax.set_yscale("log")
     ax.set_xticks(places)
-    return finished(ax, "level", "relative residual, relative change")
+    some = bool((dataset["level_residual"] > 0).any() | (dataset["level_change"] > 0).any())
+    return finished(ax, "level", "relative residual, relative change", log="y" if some else "")
 
 
 def mesh_variance(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -164,8 +163,7 @@ def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Ax
         relative = target / abs(float(dataset["mean"].sel(output=output)))
         ax.plot(levels, numbers, color=CONTROLLED, alpha=0.3 + 0.2 * i, marker=".", label=f"error {relative:.2g}, best")
     ax.plot(levels, dataset["mesh_samples"].to_numpy(), color=DARK, marker="o", linestyle="", label="taken")
-    ax.set_yscale("log")
-    return finished(ax, y="samples")
+    return finished(ax, y="samples", log="y")
 
 
 def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -186,9 +184,7 @@ def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
         ax.plot(errors, work / errors**2, color=colour, linestyle=style, label=label)
     taken = float(dataset["mesh_samples"].to_numpy() @ costs)
     ax.plot([error], [taken], color=DARK, marker="o", linestyle="", label="taken")
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    return finished(ax, f"standard error of {quantity(dataset, output)}", "predicted time (s)", above=2)
+    return finished(ax, f"standard error of {quantity(dataset, output)}", "predicted time (s)", log="xy", above=2)
 
 
 def _levels(dataset: xr.Dataset, output: str) -> dict[str, NDArray[np.float64]]:
@@ -233,9 +229,7 @@ def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax
             unknowns, np.where(relative > 0, relative, np.nan), "o-", color=colour, markersize=4, label=text_of(output)
         )
     ax.axhline(tolerance, color=PLAIN, linestyle=":", label="tolerance")
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    return finished(ax, "unknowns", "estimated relative error of the mesh")
+    return finished(ax, "unknowns", "estimated relative error of the mesh", log="xy")
 
 
 Cost = Literal["solves", "cpu_seconds"]
@@ -268,16 +262,16 @@ def errors(
     """
     ax = ax or axes(height=4.2, width=8.6)
     of_output = dataset.sel(output=output)
-    costs, rmse, rows = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
+    costs, rmse, methods = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
     resolved, scatter = (of_output[f"{estimated}_{name}"].to_numpy() for name in ("resolved", "rmse_error"))
     names = [
         name
         for name in of_output["estimator"].to_numpy().tolist()
-        if against == "cpu_seconds" or not of_output["derived"].to_numpy()[rows == name].all()
+        if against == "cpu_seconds" or not of_output["derived"].to_numpy()[methods == name].all()
     ]
     for i, name in enumerate(names):
         colour = METHOD_COLOURS[i % len(METHOD_COLOURS)]
-        mine = (rows == name) & (rmse > 0)
+        mine = (methods == name) & (rmse > 0)
         good = mine & resolved
         ax.errorbar(costs[mine], rmse[mine], yerr=scatter[mine], fmt="none", ecolor=colour, capsize=2)
         ax.plot(costs[mine], rmse[mine], color=colour, linewidth=0, marker="o", markerfacecolor="white")
@@ -291,7 +285,7 @@ def errors(
             ax.plot(costs[good], fitted, color=colour, linestyle="--", linewidth=1)
             label += f" (rate {rate:.2f})".replace("-", "−")
         ax.plot(costs[good], rmse[good], color=colour, linewidth=0, marker="o", label=label)
-    shown = costs[np.isin(rows, names)]
+    shown = costs[np.isin(methods, names)]
     ends = np.array([shown.min() / 1.3, shown.max() * 1.3])
     each = 1.0 if against == "solves" else float(of_output["plain_seconds"])
     if np.isfinite(each):
@@ -306,17 +300,11 @@ def errors(
         size = abs(float(of_output[floor]))
         if size > lowest and (estimated == "mean" or floor == "solver_error"):
             ax.axhline(size, color=DARK, linewidth=1, linestyle=style, label=label)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_xlim(*ends)
-    ax.set_ylim(bottom=lowest)
-    return finished(
-        ax,
-        {"solves": "solves, set-up charged", "cpu_seconds": "processor time (s), set-up charged"}[against],
-        f"RMSE of the {WORDS[estimated]} of {quantity(dataset, output)}",
-        loc="upper left",
-        bbox_to_anchor=(1.02, 1),
-    )
+    cost = {"solves": "solves", "cpu_seconds": "processor time (s)"}[against]
+    rmse_of = f"RMSE of the {WORDS[estimated]} of {quantity(dataset, output)}"
+    finished(ax, f"{cost}, set-up charged", rmse_of, log="xy", loc="upper left", bbox_to_anchor=(1.02, 1))
+    ax.set(xlim=ends, ylim=(lowest, None))
+    return ax
 
 
 def estimates(found: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -336,9 +324,8 @@ def estimates(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         ax.plot(x, y, ".", color=colour, markersize=4, alpha=0.7, label=text_of(str(name)))
     if ends[0] < ends[1]:
         ax.plot(ends, ends, color=DARK, linewidth=0.8)
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-    return finished(ax, "true error over its root mean square", "estimated error over the same")
+    log = "xy" if ends[0] < ends[1] else ""
+    return finished(ax, "true error over its root mean square", "estimated error over the same", log=log)
 
 
 def energies(found: xr.Dataset, kept: int, ax: Axes | None = None) -> Axes:
@@ -348,5 +335,4 @@ def energies(found: xr.Dataset, kept: int, ax: Axes | None = None) -> Axes:
     left = np.sqrt(np.maximum(energy[::-1].cumsum()[::-1], 1e-300) / energy.sum())
     ax.plot(np.arange(len(left)), left, color=CONTROLLED)
     ax.axvline(kept, color=HIGH, linestyle="--", linewidth=1, label=f"{kept} kept")
-    ax.set_yscale("log")
-    return finished(ax, "modes", "part that is left out")
+    return finished(ax, "modes", "part that is left out", log="y")

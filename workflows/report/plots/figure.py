@@ -201,8 +201,12 @@ def grid(
     return [figure.add_axes((x / whole[0], y / whole[1], *extent)) for x, y in places]
 
 
-def finished(ax: Axes, x: str = "", y: str = "", *, above: int = 0, **legend: Any) -> Axes:
-    """Write what axes show, and a legend of what has labels: beside the data, or in so many columns `above` it."""
+def finished(ax: Axes, x: str = "", y: str = "", *, log: str = "", above: int = 0, **legend: Any) -> Axes:
+    """Write what axes show, and a legend of what has labels: beside the data, or in so many columns `above` it.
+
+    `log` names those that are logarithmic: "xy".
+    """
+    ax.set(**{f"{axis}scale": "log" for axis in log})
     if x:
         ax.set_xlabel(x)
     if y:

@@ -42,6 +42,7 @@ AROUND_SLICE = 0.65, 0.15, 0.15, 0.3  # inches: to the left, below (its colours 
 AROUND_DENSITY = 0.15, 0.6, 0.15, 0.25
 SEEN = 1.0  # λ above which the data say more about a direction than the prior
 Density = tuple[FloatArray, FloatArray]
+Panel = tuple[FloatArray, str, tuple[float, float]]  # a field, its colours and their ends
 _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
 
 
@@ -112,11 +113,9 @@ def panels(one: xr.Dataset) -> dict[str, FloatArray]:
 
 def left_of_prior(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw on a plane the standard deviation over the prior's: 1 where the data say nothing."""
-    (ax,) = grid(1, 1, (4.5, 3.0), AROUND_SLICE)
     std, prior = (one[name].to_numpy() for name in ("stiffness_std", "stiffness_prior_std"))
     left = np.divide(std, prior, out=np.ones_like(std), where=prior > 0)
-    _draw(ax, cut, left, "standard deviation over the prior's", "plasma", (0.0, 1.0))
-    return ax
+    return _panels(cut, {"standard deviation over the prior's": (left, "plasma", (0.0, 1.0))}, 1, (4.5, 3.0))
 
 
 def slices(one: xr.Dataset, cut: Cut) -> Axes:
@@ -125,28 +124,24 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
     shown = [values for name, values in drawn.items() if "deviation" not in name]
     ends = min(float(v.min()) for v in shown), max(float(v.max()) for v in shown)
     widest = max(float(values.max()) for name, values in drawn.items() if "deviation" in name)
-    found = grid(len(drawn), 2, (2.9, 3.3), AROUND_SLICE)
-    for ax, (name, values) in zip(found, drawn.items(), strict=True):
-        spread = "deviation" in name
-        limits = (0.0, widest) if spread else ends
-        _draw(ax, cut, values, name, "plasma" if spread else "viridis", limits)
-    return found[0]
+    looks = {True: ("plasma", (0.0, widest)), False: ("viridis", ends)}
+    return _panels(cut, {name: (values, *looks["deviation" in name]) for name, values in drawn.items()})
 
 
 def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw directions of a field on a plane."""
-    shown = [i for i, n in enumerate(one["shown_number"].to_numpy()) if n >= 0]
-    found = grid(len(shown), 4, (2.1, 2.7), AROUND_SLICE)
-    for ax, i in zip(found, shown, strict=True):
-        values = one["direction_stiffness"].isel(shown=i).to_numpy()
-        n = int(one["shown_number"][i])
-        largest = float(np.abs(values).max())
-        label = f"{n + 1}: λ = {number(float(one['eigenvalue'][n]), 3)}"
-        _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
-    for part in found[0].figure.axes:
+    drawn: dict[str, Panel] = {}
+    for n, values in zip(
+        one["shown_number"].to_numpy().astype(int), one["direction_stiffness"].to_numpy(), strict=True
+    ):
+        if n >= 0:
+            largest = float(np.abs(values).max())
+            drawn[f"{n + 1}: λ = {number(float(one['eigenvalue'][n]), 3)}"] = values, "RdBu_r", (-largest, largest)
+    first = _panels(cut, drawn, 4, (2.1, 2.7))
+    for part in first.figure.axes:
         part.tick_params(labelsize="x-small")
         part.locator_params(axis="x", nbins=2)
-    return found[0]
+    return first
 
 
 def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
@@ -154,37 +149,33 @@ def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
     drawn = {str(case): one["alone_stiffness_std"].sel(case=case).to_numpy() for case in one.case.values}
     drawn["all together"] = one["stiffness_std"].to_numpy()
     widest = float(one["stiffness_prior_std"].max())
-    found = grid(len(drawn), 2, (2.9, 3.3), AROUND_SLICE)
-    for ax, (name, values) in zip(found, drawn.items(), strict=True):
-        _draw(ax, cut, values, name, "plasma", (0.0, widest))
-    return found[0]
+    return _panels(cut, {name: (values, "plasma", (0.0, widest)) for name, values in drawn.items()})
 
 
-def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, limits: tuple[float, float]) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    low, high = limits if limits[1] > limits[0] else (limits[0] - 1e-3, limits[1] + 1e-3)
-    # A picture of the points, which is small and drawn at once; browsers and printers smooth it.
+def _panels(cut: Cut, drawn: Mapping[str, Panel], columns: int = 2, size: tuple[float, float] = (2.9, 3.3)) -> Axes:
+    """Draw fields on a plane, each in a panel (inches) with its name above and its colours below."""
+    # Pictures of the points, which are small and drawn at once; browsers and printers smooth them.
     half = [(line[-1] - line[0]) / (len(line) - 1) / 2 for line in cut.lines]
-    ends = [end for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)]
-    drawn = ax.imshow(
-        cut.values(values),
-        cmap=colours,
-        vmin=low,
-        vmax=high,
-        origin="lower",
-        extent=(ends[0], ends[1], ends[2], ends[3]),
-        interpolation="none",
+    left, right, below, top = (
+        float(end) for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)
     )
-    ax.set_xlim(cut.lines[0][[0, -1]].tolist())
-    ax.set_ylim(cut.lines[1][[0, -1]].tolist())
-    ax.set_title(title, fontsize="medium")
-    ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
-    ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(MaxNLocator(3))
-    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9, pad=0.22, fraction=0.2, aspect=15)
-    bar.ax.xaxis.set_major_locator(MaxNLocator(4))
+    found = grid(len(drawn), columns, size, AROUND_SLICE)
+    for ax, (title, (values, colours, (low, high))) in zip(found, drawn.items(), strict=True):
+        ends = (low, high) if high > low else (low - 1e-3, high + 1e-3)
+        shown = ax.imshow(
+            cut.values(values),
+            colours,
+            clim=ends,
+            origin="lower",
+            extent=(left, right, below, top),
+            interpolation="none",
+        )
+        ax.set(xlim=cut.lines[0][[0, -1]], ylim=cut.lines[1][[0, -1]])
+        ax.set_title(title, fontsize="medium")
+        finished(ax, *(f"{'xyz'[axis]} (m)" for axis in cut.along)).locator_params(nbins=3)
+        bar = ax.figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.9, pad=0.22, fraction=0.2, aspect=15)
+        bar.ax.locator_params(axis="x", nbins=4)
+    return found[0]
 
 
 def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -202,11 +193,10 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
         colour = DARK if i == 0 else shade
         ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=label, linewidth=1, markersize=4)
     ax.axhline(SEEN, color=PLAIN, linestyle="--", linewidth=1)
-    ax.set_yscale("log")
     ax.locator_params(axis="x", integer=True)
     if len(found["all together"]) == 1:
         ax.set_xlim(0, 2)
-    return finished(ax, "direction", "λ")
+    return finished(ax, "direction", "λ", log="y")
 
 
 def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:

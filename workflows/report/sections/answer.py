@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -45,23 +45,12 @@ LAPLACE = 0  # value of `source`, see docs/results.md
 def answer_first(results: Results) -> Iterator[Block]:
     """What was asked and found, for every kind of study."""
     dataset = results.dataset
-    for has, card in (
-        ("probability", selection),
-        ("alone_eigenvalue", inversion),
-        ("population_draw", population),
-        ("estimator", compared),
-        ("clean", made),
-        ("chosen", design),
-        ("mode_energy", reduced),
-        ("nominal", forward),
-        ("candidate_mean", forward),
-    ):
-        if has in dataset or has in dataset.dims:
-            found = card(results)
-            yield Card(found.question, found.answers[:TILES], gravest(results))
-            if len(found.answers) > TILES:
-                yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
-            return
+    card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
+    if card is not None:
+        found = card(results)
+        yield Card(found.question, found.answers[:TILES], gravest(results))
+        if len(found.answers) > TILES:
+            yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
 
 
 def forward(results: Results) -> Card:
@@ -81,22 +70,18 @@ def forward(results: Results) -> Card:
         question = f"How large {be} {asked}{path}, if {uncertain}?"
     else:
         question = f"How do {listed(names)} change {asked}{path}?"
-    counts = dict(
-        zip(results.outputs, counting(results) if meshed(results) else np.ones(len(results.outputs)), strict=True)
-    )
-    answers = []
+    spec: Any = getattr(results.study, "spec", None)
+    counts = counting(results) if getattr(spec, "meshed", False) else np.ones(len(results.outputs))
+    own = getattr(spec, "errors", {})  # of a reduced model itself: what a mean may be off by at most
+    name, answers = "mean" if sampled else "nominal", []
+    sources = parts_of(results, name)
     for output in results.drawn:
-        name = "mean" if sampled else "nominal"
-        one, unit = results.of(output), results.unit(output)
-        value = float(one[name])
-        errors = {source: float(e[results.outputs.index(output)]) for source, e in parts_of(results, name).items()}
-        if not counts[output]:
+        k, one, unit = results.outputs.index(output), results.of(output), results.unit(output)
+        if not counts[k]:
             answers.append(Answer(called(results, output), "0", ("zero but for rounding",)))
             continue
-        itself = model_errors(results).get(output)
-        if itself is not None:
-            errors["reduced model"] = itself
-        error = whole(errors)
+        value, errors = float(one[name]), {source: float(e[k]) for source, e in sources.items()}
+        errors |= {"reduced model": own[output]} if output in own else {}
         spread = distribution(one) if sampled else None
         lines = [] if spread is None else [f"95\u00a0%: {interval(*spread.inside, unit, value)}{spread.by}"]
         unknown = output in results.meshes_unknown
@@ -108,7 +93,8 @@ def forward(results: Results) -> Card:
         curve = None
         if spread is not None and spread.curve is not None:
             curve = curve_of(*spread.curve, spread.inside, unit, float(one["mean"]))
-        shown = size(value, unit, DIGITS) if results.meshes_unknown.get(output) else quantity(value, error, unit)
+        failed = results.meshes_unknown.get(output)
+        shown = size(value, unit, DIGITS) if failed else quantity(value, whole(errors), unit)
         answers.append(Answer(called(results, output), shown, lines, curve))
     return Card(question, answers)
 
@@ -127,16 +113,6 @@ def gathered(paths: Sequence[str]) -> list[str]:
 def called(results: Results, output: str) -> str:
     """Return the name of an output; along a path, where all are those of the last step, without its number."""
     return str(results.dataset["output_of"].sel(output=output).item()) if "step" in results.dataset.coords else output
-
-
-def meshed(results: Results) -> bool:
-    """Say whether the model has a mesh, and with it errors of the mesh."""
-    return bool(getattr(getattr(results.study, "spec", None), "meshed", False))
-
-
-def model_errors(results: Results) -> dict[str, float]:
-    """Return errors of the model itself by output, if it is a reduced one: what a mean may be off by at most."""
-    return dict(getattr(getattr(results.study, "spec", None), "errors", {}))
 
 
 def whole(errors: dict[str, float]) -> float:
@@ -220,13 +196,10 @@ def inversion(results: Results) -> Card:
     of, units = results.dataset, results.study.units_of("/")
     sets = [str(name) for name in of["data_set"].values]
     data = int(np.isfinite(of["measured"]).sum())
-    kind = "values" if of.attrs.get("quantity") == "output" else "displacements"
-    what = "What is inside" if kind == "displacements" else "Which parameters explain"
     whose = sets[0].replace("-", "\N{NON-BREAKING HYPHEN}") if len(sets) == 1 else f"each of {len(sets)} specimens"
-    if kind == "displacements":
-        question = f"{what} {whose}, given {data:,} measured {measured_kind(of, results.study)}?"
-    else:
-        question = f"{what} {data:,} measured {kind} of {whose}?"
+    question = f"Which parameters explain {data:,} measured values of {whose}?"
+    if of.attrs.get("quantity") != "output":
+        question = f"What is inside {whose}, given {data:,} measured {measured_kind(of, results.study)}?"
     if len(sets) > 1:
         return Card(question, [*_sets(of), *_over_sets(of, units)])
     if not bool(of["ok"].all()):
@@ -235,10 +208,9 @@ def inversion(results: Results) -> Card:
     answers = [_unknown(one.sel(parameter=name), str(name), units.get(str(name), "1")) for name in one.parameter.values]
     if "stiffness_mean" in one and "draw" not in one:
         # The one number beside the values at the nodes is the mean of their logarithm.
-        answers = [
-            replace(answer, name=answer.name.replace("stiffness mean", "mean of ln stiffness")) for answer in answers
-        ]
-        answers.insert(0, _stiffness(one))
+        said = [answer.name.replace("stiffness mean", "mean of ln stiffness") for answer in answers]
+        named = [replace(answer, name=name) for answer, name in zip(answers, said, strict=True)]
+        answers = [_stiffness(one), *named]
     if "prediction_share" in one:
         goals = [str(name) for name in one["goal"].values]
         asked = listed([_goal(name) for name in goals])
@@ -321,10 +293,11 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     if np.isfinite(one["true"]):
         inside = "inside" if lower <= float(one["true"]) <= upper else "outside the interval"
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
+    drawn = None
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
-        return Answer(label, quantity(mean, std, unit), lines, curve_of(at, curve, (lower, upper), unit, mean))
-    return Answer(label, quantity(mean, std, unit), lines)
+        drawn = curve_of(at, curve, (lower, upper), unit, mean)
+    return Answer(label, quantity(mean, std, unit), lines, drawn)
 
 
 def _stiffness(one: xr.Dataset) -> Answer:
@@ -374,21 +347,12 @@ def compared(results: Results) -> Card:
     """The smallest error of each method in the mean of the first output, and what it takes."""
     output = results.outputs[0]
     found = {name: rows for name, rows in results.summary["methods"].items() if rows}
-    question = f"Which method finds the mean of {output} most exactly for its time?"
     best = {name: min(rows, key=lambda row: row["error"]) for name, rows in found.items()}
-    order = sorted(best, key=lambda name: best[name]["error"] ** 2 * best[name]["cpu_seconds"])
-    return Card(
-        question,
-        [
-            Answer(
-                name,
-                size(best[name]["error"], results.unit(output)),
-                (f"error with {number(best[name]['cost'], 4)} solves, {duration(best[name]['cpu_seconds'])}",),
-                leads=rank == 0,
-            )
-            for rank, name in enumerate(order)
-        ],
-    )
+    answers: list[Answer] = []
+    for name, row in sorted(best.items(), key=lambda item: item[1]["error"] ** 2 * item[1]["cpu_seconds"]):
+        line = f"error with {number(row['cost'], 4)} solves, {duration(row['cpu_seconds'])}"
+        answers.append(Answer(name, size(row["error"], results.unit(output)), (line,), leads=not answers))
+    return Card(f"Which method finds the mean of {output} most exactly for its time?", answers)
 
 
 def made(results: Results) -> Card:
@@ -400,6 +364,20 @@ def made(results: Results) -> Card:
         "What would be measured of a specimen that is known?",
         [Answer(name, f"{n:,} data", ("in the folder data",)) for name, n in zip(names, counts, strict=True)],
     )
+
+
+# By a variable or dimension that only such results have, the first that is there.
+CARDS: dict[str, Callable[[Results], Card]] = {
+    "probability": selection,
+    "alone_eigenvalue": inversion,
+    "population_draw": population,
+    "estimator": compared,
+    "clean": made,
+    "chosen": design,
+    "mode_energy": reduced,
+    "nominal": forward,
+    "candidate_mean": forward,
+}
 
 
 def listed(names: Sequence[str]) -> str:
