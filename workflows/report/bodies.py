@@ -14,7 +14,7 @@ from workflows.report.plots.places import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends, forward_scene, up_of
 from workflows.report.scene.skin import TRIANGLES, outer, skin
 from workflows.results.directory import TETRAHEDRON, mesh_grid
-from workflows.results.level import IntArray, crossing, tetrahedra
+from workflows.results.surfaces import IntArray, crossing, tetrahedra
 
 if TYPE_CHECKING:
     import xarray as xr

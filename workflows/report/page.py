@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,14 @@ from typing import NoReturn
 from pydantic import ValidationError
 
 from forward.external.own_modules import OwnCodeError, installed_only, refused
+from forward.readable import size
 from forward.settings import one_line
+from forward.words import NONE, duration
 from workflows.config.blocks import Report, located
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse
-from workflows.report import comparison
-from workflows.report.blocks import Block, Folded, Heading, Html, Text, Viewer
+from workflows.report import plots
+from workflows.report.blocks import Block, Folded, Heading, Html, Pictures, Table, Text, Viewer
 from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 from workflows.run import own_code
@@ -93,11 +95,11 @@ def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Pa
     for name, directory in zip(_names(directories), directories, strict=True):
         with _running(code) as refusals:
             studies[name] = _read(directory, refusals)
-        if not comparison.applies(studies[name]):
+        if "nominal" not in studies[name].dataset:
             message = f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison"
             raise StudyError(message)
     title = f"Comparison of {len(studies)} studies"
-    write_text(out, render(title, [("comparison", [Heading(title, 1), *comparison.content(studies)])]))
+    write_text(out, render(title, [("comparison", [Heading(title, 1), *side_by_side(studies)])]))
     return out
 
 
@@ -206,3 +208,48 @@ def _names(directories: Sequence[Path]) -> list[str]:
     times = Counter(directory.resolve().name for directory in directories)
     names = [d.resolve().name if times[d.resolve().name] == 1 else str(d) for d in directories]
     return names if len(set(names)) == len(names) else [f"{i}: {name}" for i, name in enumerate(names, start=1)]
+
+
+def side_by_side(studies: Mapping[str, Results]) -> Iterator[Block]:
+    """Costs, and then the estimates of each output."""
+    yield _costs(studies)
+    yield Text("± is one standard error.")
+    for output in dict.fromkeys(output for results in studies.values() for output in results.outputs):
+        yield Heading(output)
+        yield _estimates(studies, output)
+        datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
+        if datasets:
+            yield Pictures.of(
+                (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
+                (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
+            )
+
+
+def _costs(studies: Mapping[str, Results]) -> Table:
+    """Methods and costs of several studies."""
+    told = {name: results.summary for name, results in studies.items()}
+    return Table.of(
+        told,
+        {
+            "study": str,
+            "method": lambda name: str(told[name]["method"]),
+            "solves": lambda name: f"{told[name]['evaluations']:,}",
+            "failed": lambda name: f"{told[name]['failed']:,}",
+            "CPU time": lambda name: duration(told[name]["cpu_seconds"]),
+            "wall time": lambda name: duration(told[name]["wall_seconds"]),
+        },
+        text={0, 1},
+    )
+
+
+def _estimates(studies: Mapping[str, Results], output: str) -> Table:
+    """Estimates of an output by several studies."""
+    rows: list[tuple[str, ...]] = []
+    for name, results in studies.items():
+        if output not in results.outputs:
+            rows.append((name, NONE, NONE, NONE))
+            continue
+        central = size(float(results.dataset["nominal"].sel(output=output)), results.unit(output), 6)
+        shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
+        rows.append((name, *shown, central))
+    return Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)

@@ -8,7 +8,7 @@ from an installed package, by an entry point ``section.NAME`` of the group ``tis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from forward.readable import and_error, margin, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import NONE, with_error
-from uq.estimators.estimate import holds, part, single
+from uq.estimators.estimate import PARTS, holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
 from workflows.report.blocks import Block, Table
@@ -112,12 +112,19 @@ class Results:
         rows = [(output, *(self.estimate(output, name) for name in words)) for output in self.outputs]
         return Table(("output", *words.values()), rows)
 
-    def corrected(self, name: str, at: Mapping[str, str], unit: str = "1") -> list[str]:
-        """One estimate, with the error of the mesh added: a cell of a table, or none without such errors."""
-        if not holds(self.dataset, name, "corrected"):
-            return []
-        value, error = (float(self.dataset[part(name, which)].sel(at)) for which in ("corrected", "left"))
-        return [NONE if np.isnan(value) else and_error(value, error, unit)]
+    def cells(self, names: Sequence[str], at: Mapping[str, str], unit: str = "1") -> Iterator[str]:
+        """Write estimates somewhere, each followed by the one with the error of the mesh added where there are such."""
+        for name in names:
+            held = [which for which in PARTS if holds(self.dataset, name, which)]
+            one = single(self.dataset[[name, *(part(name, which) for which in held)]].sel(at), name)
+            yield with_error(one.value, one.error) if unit == "1" else and_error(one.value, one.error, unit)
+            if "corrected" in held:
+                yield NONE if np.isnan(one.corrected) else and_error(one.corrected, one.left, unit)
+
+    def heads(self, words: Mapping[str, str]) -> Iterator[str]:
+        """Write what `cells` are of, by the names of the estimates."""
+        for name, word in words.items():
+            yield from (word, f"{word}, corrected") if holds(self.dataset, name, "corrected") else (word,)
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""
@@ -187,7 +194,7 @@ SECTIONS = Kinds(
         "error-budget": f"{_HERE}.errors:error_budget",
         "synthetic-data": f"{_HERE}.inversions:synthetic_data",
         "design": f"{_HERE}.inversions:chosen_observations",
-        "reduced": f"{_HERE}.reduced:reduced_model_of_body",
+        "reduced": f"{_HERE}.cost:reduced_model_of_body",
         "evidences": f"{_HERE}.selection:evidences",
         "path": f"{_HERE}.bodies:curve",
         "error-against-cost": f"{_HERE}.cost:error_against_cost",
@@ -207,11 +214,11 @@ SECTIONS = Kinds(
         "places": f"{_HERE}.bodies:places",
         "finer-meshes": f"{_HERE}.errors:finer_meshes",
         "dependence": f"{_HERE}.selection:dependence",
-        "criticism": f"{_HERE}.fits:criticism",
-        "held-out": f"{_HERE}.fits:held_out",
-        "curves": f"{_HERE}.fits:curves",
+        "criticism": f"{_HERE}.selection:criticism",
+        "held-out": f"{_HERE}.selection:held_out",
+        "curves": f"{_HERE}.selection:curves",
         "averages": f"{_HERE}.selection:averages",
-        "constants": f"{_HERE}.fits:constants",
+        "constants": f"{_HERE}.selection:constants",
         "population": f"{_HERE}.inversions:population_of_specimens",
         "candidates": f"{_HERE}.selection:averaged_candidates",
         "moments": f"{_HERE}.estimates:moments",

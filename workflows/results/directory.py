@@ -17,7 +17,7 @@ from forward.machine import write_whole
 from forward.words import per
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
-from workflows.results.tools import tool_grid, tools_of
+from workflows.results.surfaces import tool_grid, tools_of
 from workflows.results.vtu import Grid, vtu
 
 if TYPE_CHECKING:

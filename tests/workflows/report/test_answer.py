@@ -10,7 +10,7 @@ from scipy import integrate, stats
 
 from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import SVG, solve, study, study_of, write
-from workflows.report import plots, small_density
+from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
 
@@ -92,7 +92,7 @@ def test_intervals_of_an_expansion_are_those_of_its_density():
 
 def test_small_densities_are_densities():
     values = stats.norm(5, 2).rvs(4000, random_state=1)
-    at, curve = small_density.smooth(values)
+    at, curve = blocks.smooth(values)
     scaled = curve / integrate.trapezoid(curve, at)
     np.testing.assert_allclose(scaled, stats.norm(5, 2).pdf(at), atol=0.02)
 
@@ -109,16 +109,16 @@ def test_small_densities_of_one_sign_end_at_zero():
 @pytest.mark.parametrize("value", [3.0, 0.0, 0.1, -1e5 / 3])
 def test_a_small_density_of_one_value_is_drawn(value):
     """One point copied, the last digit of whose mean is rounding; and a lattice without length."""
-    at, curve = small_density.smooth(np.full(400, value))
-    found = small_density.curve_of(at, curve, (value, value), "m", value)
+    at, curve = blocks.smooth(np.full(400, value))
+    found = blocks.curve_of(at, curve, (value, value), "m", value)
     assert np.isfinite(curve).all()
     assert found.inside == pytest.approx((0.5, 0.5))
-    assert small_density.curve_of(np.full(48, value), curve, (value, value), "m", value).inside == (0.0, 0.0)
+    assert blocks.curve_of(np.full(48, value), curve, (value, value), "m", value).inside == (0.0, 0.0)
 
 
 def test_a_small_density_holds_an_interval_that_reaches_beyond_its_samples():
     at, curve = np.linspace(2.0, 4.0, 5), np.array([0.0, 1.0, 2.0, 1.0, 0.0])
-    found = small_density.curve_of(at, curve, (1.0, 3.5), "m", 3.0)
+    found = blocks.curve_of(at, curve, (1.0, 3.5), "m", 3.0)
     drawn = found.heights
     assert found.inside == pytest.approx((0.0, 2.5 / 3))
     assert found.ends == ("1.0", "4.0\N{NO-BREAK SPACE}m")

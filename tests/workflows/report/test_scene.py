@@ -16,7 +16,7 @@ from workflows.report.scene.pack import Packer
 from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, packed
 from workflows.report.scene.skin import skin, split
 from workflows.report.scene.sliders import sliders
-from workflows.results.level import crossing, level, tetrahedra
+from workflows.results.surfaces import crossing, level, tetrahedra
 
 pyvista = pytest.importorskip("pyvista")
 

@@ -7,7 +7,7 @@ import xarray as xr
 from forward.terms.indenter import Indenter
 from tests.forward.terms.test_indenter import SHAPES, SIDE, only
 from workflows.report.plots.places import pressure_map
-from workflows.results.tools import surface, tools_of
+from workflows.results.surfaces import surface, tools_of
 
 CORNERS = SIDE * np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
 

@@ -18,9 +18,8 @@ from uq.estimators.estimate import estimate_of, holds
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
-from workflows.results.level import IntArray, level, tetrahedra
 from workflows.results.points import has_points, measured_points
-from workflows.results.tools import surface, tools_of
+from workflows.results.surfaces import IntArray, level, surface, tetrahedra, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr

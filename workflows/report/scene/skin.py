@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from forward.model import FloatArray
-from workflows.results.level import HEXAHEDRA, IntArray
+from workflows.results.surfaces import HEXAHEDRA, IntArray
 
 SHARP = np.cos(np.radians(40))  # of the angle between faces from which an edge is one
 # The corners of each face, seen from outside against the clock.

@@ -16,7 +16,7 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels
 from workflows.report.scene.pack import Packer
-from workflows.results.level import IntArray
+from workflows.results.surfaces import IntArray
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,15 +12,13 @@ from forward.readable import and_error, interval, margin, percent, quantity, siz
 from forward.words import duration, number, power_of_ten, with_error
 from uq.estimators.estimate import single
 from uq.findings import DIGITS, NOT_KNOWN
-from workflows.report.blocks import Answer, Block, Card, Text
+from workflows.report.blocks import CURVE, Answer, Block, Card, Text, curve_of, smooth
 from workflows.report.section import Results, section
+from workflows.report.sections.cost import reduced_card
 from workflows.report.sections.errors import counting, parts_of
 from workflows.report.sections.frame import gravest
-from workflows.report.sections.inversions import design_card as design
-from workflows.report.sections.inversions import population_card as population
+from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
-from workflows.report.sections.reduced import card as reduced
-from workflows.report.small_density import CURVE, curve_of, smooth
 from workflows.studies.findings_inversion import NEITHER
 from workflows.studies.selection_results import bayes_factor, by_probability, grade
 
@@ -370,11 +368,11 @@ def made(results: Results) -> Card:
 CARDS: dict[str, Callable[[Results], Card]] = {
     "probability": selection,
     "alone_eigenvalue": inversion,
-    "population_draw": population,
+    "population_draw": population_card,
     "estimator": compared,
     "clean": made,
-    "chosen": design,
-    "mode_energy": reduced,
+    "chosen": design_card,
+    "mode_energy": reduced_card,
     "nominal": forward,
     "candidate_mean": forward,
 }

@@ -222,10 +222,17 @@ def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Ta
     alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
     rows = []
     for k, case, name, unit in _outputs(one, model):
-        of = one.isel(datum=k)
-        pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        shown = [and_error(float(of[value]), float(of[error]), unit) for value, error in pairs]
         told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
-        rows.append((case, name, *shown, number(float(of["residual"]), 3), *told))
-    head = ["load case", "output", "measured", "predicted", "residual over its error"]
-    return Table([*head, *(["information alone (nat)"] if alone else [])], rows, text=frozenset({0, 1}))
+        rows.append((case, name, *misses(one.isel(datum=k), unit), *told))
+    more = ["information alone (nat)"] if alone else []
+    return Table(["load case", "output", *MISSES, *more], rows, text=frozenset({0, 1}))
+
+
+MISSES = ("measured", "predicted", "residual over its error")
+
+
+def misses(datum: xr.Dataset, unit: str, like: float | None = None) -> Iterator[str]:
+    """Write what was measured and predicted of a datum, in the unit of `like` if given, and the residual."""
+    for value, error in (("measured", "sigma"), ("predicted", "predicted_std")):
+        yield and_error(float(datum[value]), float(datum[error]), unit, like)
+    yield number(float(datum["residual"]), 3)

@@ -11,11 +11,10 @@ from forward.readable import and_error, interval, percent, place, quantity, scal
 from forward.specimen import Specimen
 from forward.words import NONE, named, number, with_error
 from uq.estimators.estimate import single
-from workflows.report.blocks import Answer, Block, Card, Heading, Pictures, Table, Text
+from workflows.report.blocks import CURVE, Answer, Block, Card, Heading, Pictures, Table, Text, curve_of, smooth
 from workflows.report.plots import places as maps
 from workflows.report.plots import posterior as plots
 from workflows.report.section import Results, section
-from workflows.report.small_density import CURVE, curve_of, smooth
 from workflows.results.summary import against_random
 
 if TYPE_CHECKING:
@@ -40,35 +39,30 @@ def batch(results: Results) -> Iterator[Block]:
 def _batch(results: Results) -> Table:
     """A row for each data set."""
     dataset = results.dataset
-    names = [str(name) for name in dataset.parameter.values]
-    sizes = {
-        name: scale(float(abs(dataset["mean"].sel(parameter=name)).median()), results.parameter_unit(name))
-        for name in names
-    }
+    sizes = _sizes(results, abs(dataset["mean"]).median("data_set"))
     rows = []
     for label in dataset.data_set.values:
         one = dataset.sel(data_set=label)
         if not bool(one["ok"]):
-            rows.append((str(label), "", "failed", *[""] * (len(names) + 3)))
+            rows.append((str(label), "", "failed", *[""] * (len(sizes) + 3)))
             continue
         values = [
-            with_error(*(float(one[which].sel(parameter=name)) / sizes[name][0] for which in ("mean", "std")))
-            for name in names
+            with_error(*(float(one[which].sel(parameter=name)) / size for which in ("mean", "std")))
+            for name, (size, _) in sizes.items()
         ]
-        rows.append(
-            (
-                str(label),
-                f"{int(np.isfinite(one['measured']).sum()):,}",
-                TRUSTED[int(one["trust"])],
-                *values,
-                number(float(one["determined"]), 3),
-                number(float(one["residual_probability"]), 2),
-                number(float(one["log_evidence"]), 6),
-            )
-        )
-    units = [named(spoken(name), sizes[name][1]) for name in names]
+        digits = {"determined": 3, "residual_probability": 2, "log_evidence": 6}
+        rest = (number(float(one[name]), most) for name, most in digits.items())
+        count = f"{int(np.isfinite(one['measured']).sum()):,}"
+        rows.append((str(label), count, TRUSTED[int(one["trust"])], *values, *rest))
+    units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     return Table(head, rows, text=frozenset({0, 2}))
+
+
+def _sizes(results: Results, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
+    """Return by parameter what one of the unit of its column is in the SI unit, and its head, for usual values."""
+    found = {name: scale(float(usual.sel(parameter=name)), results.parameter_unit(name)) for name in results.parameters}
+    return {name: (one, named(spoken(name), unit)) for name, (one, unit) in found.items()}
 
 
 SHOWN = 24  # rows of the table of a data set
@@ -152,10 +146,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         "By its own data alone, and with what the others say on what specimens are like. The last column is how "
         "many of its draws lie where the population is."
     )
-    sizes = {
-        name: scale(float(of["typical_quantiles"].sel(parameter=name)[1]), results.parameter_unit(name))
-        for name in results.parameters
-    }
+    sizes = _sizes(results, of["typical_quantiles"].transpose(..., "parameter")[1])
     lines = []
     for specimen in map(str, of["specimen"].values):
         one = of.sel(specimen=specimen)
@@ -165,11 +156,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
             for who in ("own", "specimen")
         ]
         lines.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
-    heads = [
-        f"{named(spoken(name), unit)}, {who}"
-        for name, (_, unit) in sizes.items()
-        for who in ("by itself", "of the population")
-    ]
+    heads = [f"{head}, {who}" for _, head in sizes.values() for who in ("by itself", "of the population")]
     yield Table(("specimen", *heads, "effective"), lines)
 
 

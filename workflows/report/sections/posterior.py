@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.readable import and_error, interval, scale, size, spoken
+from forward.readable import interval, scale, size, spoken
 from forward.words import margin, named, number, rounded, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
@@ -16,7 +16,7 @@ from workflows.report.plots import places as maps
 from workflows.report.plots.moments import measured_over_path
 from workflows.report.plots.posterior import told_by_case
 from workflows.report.section import Results, section
-from workflows.report.sections.bodies import first, specimen
+from workflows.report.sections.bodies import MISSES, first, misses, specimen
 from workflows.results.points import has_points
 
 if TYPE_CHECKING:
@@ -33,19 +33,12 @@ CASES_DRAWN = 24  # load cases and parameters that a map has
 LEAST = 0.005  # of a component that is not written as 0
 
 
-class Words(NamedTuple):
-    """Words for a part of the data, and for several parts."""
-
-    part: str
-    several: str
+OUTPUT, CASE = "output", "load case"
 
 
-DISPLACEMENTS = Words("load case", "load cases")
-OUTPUTS = Words("output", "outputs")
-
-
-def _words(one: xr.Dataset) -> Words:
-    return OUTPUTS if one.attrs.get("quantity") == "output" else DISPLACEMENTS
+def _part(one: xr.Dataset) -> str:
+    """Name a part of the data, in words."""
+    return OUTPUT if one.attrs.get("quantity") == "output" else CASE
 
 
 def measured_kind(of: xr.Dataset, study: Any) -> str:
@@ -67,7 +60,7 @@ def posterior(results: Results) -> Iterator[Block]:
         yield from again(results, one)
         yield Pairs.of(*amounts(one, one.sizes["direction"], results.study))
         yield parameters(one, units)
-        if _words(one) is OUTPUTS:
+        if _part(one) == OUTPUT:
             yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
             yield from _curves(one, results.study.model)
         yield Pictures.of(*pictures(one, before, units))
@@ -75,7 +68,7 @@ def posterior(results: Results) -> Iterator[Block]:
         yield from cases(one, *_widths(one, names, units))
         if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
             caption = (
-                f"How many times narrower each {_words(one).part} alone makes what was known of each parameter "
+                f"How many times narrower each {_part(one)} alone makes what was known of each parameter "
                 "before the data, with the model linearised at the mode; empty where it tells nothing."
             )
             yield Pictures.of((told_by_case(one), caption))
@@ -113,7 +106,7 @@ def again(results: Results, one: xr.Dataset) -> Iterator[Block]:
 
 def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
     """Amounts of data, information and work, given the total number of directions."""
-    kind = "values of outputs" if _words(one) is OUTPUTS else measured_kind(one, study)
+    kind = "values of outputs" if _part(one) == OUTPUT else measured_kind(one, study)
     yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {kind}"
     if "points_moved" in one and (moved := int(one["points_moved"])):
         yield "outside the body", f"{moved} points, up to {size(float(one['largest_move']), 'm')}, moved to its surface"
@@ -197,11 +190,9 @@ def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator
     together = ["all together", f"{int(one['misfit_count'].sum()):,}"]
     together += [f"{_shown(one['misfit'].sum())} of {_shown(one['misfit_degrees'].sum())}"]
     together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3), *widths[-1]]
-    yield Heading(_words(one).several.capitalize(), level=3)
+    yield Heading(f"{_part(one)}s".capitalize(), level=3)
     yield Text("The widths from each of them alone, with the model linearised at the mode.")
-    yield Table(
-        [_words(one).part, "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together]
-    )
+    yield Table([_part(one), "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together])
 
 
 def directions(one: xr.Dataset) -> Table:
@@ -257,11 +248,9 @@ def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     for output, value in zip(outputs, np.abs(one["measured"].to_numpy()[known]).tolist(), strict=True):
         largest[units.get(output, "1")] = max(value, largest.get(units.get(output, "1"), 0.0))
     for k, output in zip(known, outputs, strict=True):
-        of, unit = one.isel(datum=k), units.get(output, "1")
-        pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
-        shown = [and_error(float(of[value]), float(of[error]), unit, largest[unit]) for value, error in pairs]
-        rows.append((output, *shown, _shown(of["residual"], 3)))
-    return Table(("output", "measured", "predicted", "residual over its error"), rows)
+        unit = units.get(output, "1")
+        rows.append((output, *misses(one.isel(datum=k), unit, largest[unit])))
+    return Table(("output", *MISSES), rows)
 
 
 def _curves(one: xr.Dataset, spec: ModelSpec) -> Iterator[Block]:
@@ -279,7 +268,7 @@ def _curves(one: xr.Dataset, spec: ModelSpec) -> Iterator[Block]:
 
 def of_spectrum(one: xr.Dataset) -> tuple[Axes, str]:
     """Draw the spectrum of the data."""
-    words = f"λ of all {_words(one).several} together and of each alone; above 1 the data say more than the prior."
+    words = f"λ of all {_part(one)}s together and of each alone; above 1 the data say more than the prior."
     return plots.spectrum(one), words
 
 
@@ -301,13 +290,13 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
 
 def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
     """Draw the misfits of the load cases."""
-    words = f"|r|² of each {_words(one).part}, and what is expected: mean and two standard deviations."
+    words = f"|r|² of each {_part(one)}, and what is expected: mean and two standard deviations."
     return plots.misfits(one), words
 
 
 def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[str, str]) -> Iterator[tuple[Axes, str]]:
     """Draw the results for one data set, each with a caption."""
-    if _words(one) is OUTPUTS:
+    if _part(one) == OUTPUT:
         yield of_spectrum(one)
     else:
         yield from on_a_plane(one, plots.Cut.of(one))

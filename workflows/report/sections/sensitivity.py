@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from forward.readable import percent, size
 from forward.words import NONE, number, per, with_unit
-from uq.estimators.estimate import holds, part
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.section import Results, section, written
@@ -37,11 +36,11 @@ def sensitivities(results: Results, output: str) -> Table:
         of_parameter = slopes.sel(parameter=name)
         by = per(unit, results.parameter_unit(name))
         slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
-        corrected = results.corrected("derivative", {"output": output, "parameter": name}, by)
+        _, *corrected = results.cells(("derivative",), {"output": output, "parameter": name}, by)
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
         rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
-    known = ("corrected for the mesh",) if holds(results.dataset, "derivative", "corrected") else ()
-    return Table(("parameter", "derivative", *known, "× standard deviation", "× range"), rows)
+    head = results.heads({"derivative": "derivative"})
+    return Table(("parameter", *head, "× standard deviation", "× range"), rows)
 
 
 def largest_of(dataset: xr.Dataset) -> str:
@@ -94,11 +93,11 @@ def sobol(results: Results, output: str) -> Table:
     """Sobol' indices of an output, and what they are without the error of the mesh."""
     leading = results.leading(results.of(output)["sobol_total"])
     groups = map(str, results.dataset["group"].values if "group" in results.dataset.coords else ())
-    single, grouped = (("sobol_first", "sobol_total"), ("sobol_group_first", "sobol_group_total"))
-    rows = [(name, *_cells(results, single, {"output": output, "parameter": name})) for name in leading]
-    rows += [(f"group {name}", *_cells(results, grouped, {"output": output, "group": name})) for name in groups]
-    head = _head(results, "sobol_first", ("first order", "total"))
-    return Table(("parameter", *head), rows)
+    words = {"sobol_first": "first order", "sobol_total": "total"}
+    grouped = ("sobol_group_first", "sobol_group_total")
+    rows = [(name, *results.cells(list(words), {"output": output, "parameter": name})) for name in leading]
+    rows += [(f"group {name}", *results.cells(grouped, {"output": output, "group": name})) for name in groups]
+    return Table(("parameter", *results.heads(words)), rows)
 
 
 def second_order(results: Results, output: str) -> Table:
@@ -108,23 +107,9 @@ def second_order(results: Results, output: str) -> Table:
     for i, name in enumerate(names):
         for partner in names[i + 1 :]:
             at = {"output": output, "parameter": name, "partner": partner}
-            rows.append((name, partner, *_cells(results, ("sobol_second",), at)))
-    head = _head(results, "sobol_second", ("second order",))
+            rows.append((name, partner, *results.cells(("sobol_second",), at)))
+    head = results.heads({"sobol_second": "second order"})
     return Table(("parameter", "with", *head), rows, text=frozenset({0, 1}))
-
-
-def _cells(results: Results, names: Sequence[str], at: Mapping[str, str]) -> Iterator[str]:
-    """Indices with their errors, each followed by its corrected value where there is one."""
-    for name in names:
-        yield written(results.dataset[[name, part(name, "error")]].sel(at), name)
-        yield from results.corrected(name, at)
-
-
-def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
-    for word in words:
-        yield word
-        if holds(results.dataset, name, "corrected"):
-            yield f"{word}, corrected"
 
 
 @section("field_sobol_first")
@@ -196,16 +181,9 @@ def bounds(results: Results, output: str) -> Table:
         slope = per(results.unit(output), results.parameter_unit(name))
         squared = with_unit(written(of, "dgsm"), slope if slope == "1" else f"({slope})²")
         total = written(of, "sobol_total") if "sobol_total" in of else NONE
-        corrected = results.corrected("total_bound", {"output": output, "parameter": name})
+        bound = results.cells(("total_bound",), {"output": output, "parameter": name})
         share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
-        rows.append((name, share, squared, constant, total, written(of, "total_bound"), *corrected))
-    head = (
-        "parameter",
-        "share of the local variance",
-        "mean squared derivative",
-        "Poincaré constant",
-        "total index (expansion)",
-        "is at most",
-        *(("is at most, corrected",) if holds(results.dataset, "total_bound", "corrected") else ()),
-    )
-    return Table(head, rows)
+        rows.append((name, share, squared, constant, total, *bound))
+    head = ("parameter", "share of the local variance", "mean squared derivative", "Poincaré constant")
+    bound = results.heads({"total_bound": "is at most"})
+    return Table((*head, "total index (expansion)", *bound), rows)
