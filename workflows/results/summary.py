@@ -10,17 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
-from forward.words import with_error
 from uq.estimators.estimate import ESTIMATED, OF_MESH, PARTS, holds, part
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
-from uq.findings import NOT_KNOWN
 
 if TYPE_CHECKING:
     import xarray as xr
 
 Part = dict[str, Any]
-LISTED = 20  # observations of a design
 ALONE = ""  # name of a number that stands without one
 OTHER_ESTIMATES = (
     *("variance_ratio", "std_variance_ratio", "loo_error"),
@@ -43,40 +40,6 @@ def summarise(dataset: xr.Dataset) -> Part:
     if "accuracy" in dataset.attrs:
         summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
     return summary
-
-
-def inverted(summary: Mapping[str, Any], unknown: Collection[str]) -> list[str]:
-    """Say in a line what was found for each data set, if data were inverted.
-
-    Of the predictions in `unknown`, whose error of the mesh nobody knows, that is said too.
-    """
-    lines = []
-    for name, found in summary.get("data_sets", {}).items():
-        if "failed" in found:
-            lines.append(f"{name}: failed: {found['failed']}")
-            continue
-        values = [f"{path} {with_error(at['mode'], at['std'])}" for path, at in found["posterior"].items()]
-        by = "by Laplace, " if (found.get("source"), found.get("trust")) == ("laplace", "neither") else ""
-        lines.append(f"{name}: {by}{', '.join(values)}")
-        lines += [
-            _predicted(f"{name}: {goal}", at, known=goal not in unknown)
-            for goal, at in found.get("predictions", {}).items()
-        ]
-    if "data" in summary:
-        lines.append(f"{summary['data']} data made")
-    if "design" in summary:
-        lines += _design_in_words(summary["design"])
-    return lines
-
-
-def _predicted(what: str, at: Mapping[str, Any], *, known: bool) -> str:
-    """Say in a line what is predicted of an output."""
-    if at["mean"] is None:
-        return f"{what} is not predicted"
-    untold = "" if known else f", {NOT_KNOWN}"
-    mesh = untold if at["mesh_error"] is None else f", mesh {at['mesh_error']:+.2g}"
-    before = "" if at["prior_mean"] is None else f" (before the data {with_error(at['prior_mean'], at['prior_std'])})"
-    return f"{what} {with_error(at['mean'], at['std'])}{before}{mesh}"
 
 
 def _inversion(dataset: xr.Dataset) -> Part:
@@ -110,19 +73,6 @@ def _design(dataset: xr.Dataset) -> Part:
             "random_most": dataset.sizes["random_number"],
         }
     }
-
-
-def _design_in_words(design: Mapping[str, Any]) -> list[str]:
-    """Say which observations were chosen, and how many random ones are worth as much."""
-    chosen = design["chosen"]
-    lines = [
-        f"{k}. {one['name']}: {one['gain']:+.3g} nat, {one['information']:.4g} nat together"
-        for k, one in enumerate(chosen[:LISTED], start=1)
-    ]
-    if len(chosen) > LISTED:
-        last = chosen[-1]["information"]
-        lines.append(f"{len(chosen) - LISTED} more are in design.csv, {last:.4g} nat together")
-    return [*lines, against_random(design)]
 
 
 def against_random(design: Mapping[str, Any]) -> str:

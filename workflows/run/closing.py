@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.words import NONE, duration, named, places, with_error
+from forward.words import NONE, duration, named, places
 from uq.estimators.estimate import ESTIMATED, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown, only_rounding
 from workflows.report import words
-from workflows.results.summary import inverted
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from workflows.studies.study import StudyKind
 
 MOST = 8  # significant digits of values
 SMALL = -5  # power of ten below which it is written
@@ -24,18 +25,20 @@ WIDTH = 24  # letters of a bar
 Row = Sequence[str]
 
 
-def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    """Summarise the results at the end of a run: after what makes them doubtful, which is read first."""
+def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind) -> str:
+    """Summarise the results at the end of a run: after what makes them doubtful, which is read first.
+
+    What estimates outputs has tables of them; other studies have the answers that their report begins with.
+    """
     severe = [one for one in summary["findings"] if one["severity"] != "note"]
     notes = [one for one in summary["findings"] if one["severity"] == "note"]
     lines = _said(severe)
     before = len(lines)
-    lines += [
-        f"{model}: ln Z {with_error(found['log_evidence'], found['log_evidence_error'])}, "
-        f"probability {found['probability']:.3g}{_stacking(found)}{_not_known(dataset, model, found)}"
-        for model, found in summary.get("models", {}).items()
-    ]
-    lines += inverted(summary, meshes_unknown(dataset))
+    if not {"outputs", "methods", "local"} & summary.keys():
+        from workflows.report.section import Results
+        from workflows.report.sections.answer import in_lines
+
+        lines += in_lines(Results(dataset, summary, study))
     lines += _outputs(dataset, summary.get("outputs", {}))
     lines += _bars(summary)
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
@@ -63,17 +66,6 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
 
 def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
     return [f"{one['severity']}: {one['text']}" for one in findings]
-
-
-def _stacking(found: Mapping[str, Any]) -> str:
-    return f", stacking {found['stacking']:.3g}" if found.get("stacking") is not None else ""
-
-
-def _not_known(dataset: xr.Dataset, model: str, found: Mapping[str, Any]) -> str:
-    """Say beside an evidence that it is not to be trusted, or that nobody has looked at its mesh."""
-    if "mesh_checked" in dataset and not bool(dataset["mesh_checked"].sel(model=model).all()):
-        return f" ({NOT_KNOWN})"
-    return "" if found["trusted"] else " (not to be trusted)"
 
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

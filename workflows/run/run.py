@@ -162,7 +162,7 @@ def _run(
         wall = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
         _leave(directory, dataset, evaluations, summary, checkpoint, job, study.units_of)
-        _tell(directory, "" if quiet else closing_words(dataset, summary), report=report)
+        _tell(directory, "" if quiet else closing_words(dataset, summary, study), report=report)
         return exit_code(summary)
 
 

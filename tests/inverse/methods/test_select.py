@@ -511,7 +511,7 @@ def test_a_study_from_the_command_line(small, looked_at, capsys):
     """One rank or two: the same bytes; a report; nothing to do the second time."""
     done = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
     assert done.returncode == 0, done.stderr
-    assert "neo-hookean: ln Z" in done.stdout
+    assert re.search("^neo-hookean: .* %; ln Z ", done.stdout, re.MULTILINE)
     summary = json.loads((small.parent / "one" / "summary.json").read_text())
     assert set(summary["models"]) == {"neo-hookean", "mooney-rivlin"}
     for found in summary["models"].values():
@@ -571,7 +571,7 @@ def test_specimens_that_disagree(small, capsys):
     lines = capsys.readouterr().out.splitlines()
     said = next(k for k, line in enumerate(lines) if "Specimens disagree: of 6, 3 are rather" in line)
     assert "s0, s2, s4" in lines[said] or "s1, s3, s5" in lines[said]
-    assert said < next(k for k, line in enumerate(lines) if ": ln Z" in line)
+    assert said < next(k for k, line in enumerate(lines) if "; ln Z" in line)
 
 
 @pytest.mark.unit

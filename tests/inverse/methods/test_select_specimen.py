@@ -320,7 +320,7 @@ def test_a_study_says_what_its_meshes_do(study, monkeypatch, capsys):
     assert main(["run", str(study), "--out", str(blind), "--set", "method.mesh_check=false"]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "ln Z" in line]
     assert len(lines) == 2
-    assert all("(mesh not known)" in line for line in lines)
+    assert all("; mesh not known" in line for line in lines)
     summary = json.loads((blind / "summary.json").read_text())
     assert not any(one["trusted"] for one in summary["models"].values())
     said = [one["text"] for one in summary["findings"] if one["severity"] == "warning"]

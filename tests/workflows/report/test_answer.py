@@ -13,6 +13,7 @@ from tests.workflows.report.test_report import SVG, solve, study, study_of, writ
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
+from workflows.studies import findings_inversion
 
 
 @pytest.fixture(autouse=True)
@@ -144,6 +145,16 @@ def test_a_comparison_of_methods_names_the_best(tmp_path):
     card = answer.compared(answer.Results(of, {"methods": json.loads(json.dumps(rows))}, None))
     assert "mean of tip" in card.question
     assert [(one.name, one.value) for one in card.answers if one.leads] == [("b", "10\u00a0µm")]
+
+
+@pytest.mark.parametrize(
+    ("trust", "source", "by"), [(findings_inversion.NEITHER, answer.LAPLACE, ", by Laplace"), (0, answer.LAPLACE, "")]
+)
+def test_numbers_that_nothing_stands_in_place_of_are_said_to_be_by_laplace(trust, source, by):
+    names = ("mean", "mode", "lower", "upper", "prior_mean")
+    one = xr.Dataset(dict.fromkeys(names, 1.0) | {"std": 0.1, "prior_std": 1.0, "true": np.nan})
+    found = answer._unknown(one.assign(trust=trust, source=source), "material.C1", "Pa")
+    assert (found.name, found.value) == (f"C1{by}", "1.00\u00a0Pa")
 
 
 def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():

@@ -42,13 +42,25 @@ LAPLACE = 0  # value of `source`, see docs/results.md
 @section()
 def answer_first(results: Results) -> Iterator[Block]:
     """What was asked and found, for every kind of study."""
-    dataset = results.dataset
-    card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
-    if card is not None:
-        found = card(results)
+    found = answers(results)
+    if found is not None:
         yield Card(found.question, found.answers[:TILES], gravest(results))
         if len(found.answers) > TILES:
             yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
+
+
+def answers(results: Results) -> Card | None:
+    """Return the question of a study and its answers, or none of what asks nothing."""
+    dataset = results.dataset
+    card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
+    return None if card is None else card(results)
+
+
+def in_lines(results: Results) -> Iterator[str]:
+    """Write the answers for a terminal, a line each."""
+    found = answers(results)
+    for one in () if found is None else found.answers:
+        yield "; ".join([f"{one.name}: {one.value}", *one.lines]).replace("\u00a0", " ")
 
 
 def forward(results: Results) -> Card:
@@ -331,6 +343,12 @@ def selection(results: Results) -> Card:
             lines.append(f"{_odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
         elif rank:
             lines.append(f"{_odds(bayes_factor(of, order[0], model)[0])} against it")
+        if "stacking" in one:
+            lines.append(f"stacking {percent(float(one['stacking']))}")
+        if "mesh_checked" in one and not bool(one["mesh_checked"].all()):
+            lines.append(NOT_KNOWN)
+        elif not bool(one["trusted"].all()):
+            lines.append("not to be trusted")
         answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
     return Card(question, answers)
 
