@@ -367,21 +367,15 @@ def _of_measures(energy: Energy, names: tuple[str, ...], families: int) -> _Ener
     values = dict(zip(names, theta, strict=True))
     W = (isochoric(energy) if incompressible(energy, names) else energy)(_operators(), *given, **values)
     slopes = [sympy.diff(W, one) for one in m]
-    first = _compiled([*m, *theta], [W, *slopes])
-    second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m])
-    mixed = _compiled([*m, *theta], [slope.diff(one) for one in theta for slope in slopes])
-    n = len(m)
-
-    def rows(found: Sequence[Any]) -> list[list[Any]]:
-        return [list(found[i : i + n]) for i in range(0, len(found), n)]
+    first = _compiled([*m, *theta], [W, *slopes], 1 + len(m))
+    second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m], len(m))
+    mixed = _compiled([*m, *theta], [slope.diff(one) for one in theta for slope in slopes], len(m))
 
     def value_and_slopes(m: Any, theta: Any) -> tuple[Any, list[Any]]:
-        value, *by_m = first(*m, *theta)
+        ((value, *by_m),) = first(*m, *theta)
         return value, by_m
 
-    return _Energies(
-        value_and_slopes, lambda m, theta: rows(second(*m, *theta)), lambda m, theta: rows(mixed(*m, *theta))
-    )
+    return _Energies(value_and_slopes, lambda m, theta: second(*m, *theta), lambda m, theta: mixed(*m, *theta))
 
 
 class _Paths(NamedTuple):
@@ -417,32 +411,27 @@ def _of_stretches(
     known = of_stretches(ops, stretches, dilation, longer)
     m = list(known[name]) if name == "i4" else [known[name]]
     by_y = [sympy.diff(one, y) for one in m]
-    first = _compiled(symbols, [*m, *(sympy.diff(one, way) for way in (x, z) for one in m), *by_y])
-    second = _compiled(symbols, [one.diff(way) for way in (x, z, y) for one in by_y])
-    n = len(m)
-
-    def rows(found: Sequence[Any]) -> list[list[Any]]:
-        return [list(found[i : i + n]) for i in range(0, len(found), n)]
-
-    return _Paths(lambda *at: rows(first(*at)), lambda *at: rows(second(*at)))
+    first = [*m, *(sympy.diff(one, way) for way in (x, z) for one in m), *by_y]
+    second = [one.diff(way) for way in (x, z, y) for one in by_y]
+    return _Paths(_compiled(symbols, first, len(m)), _compiled(symbols, second, len(m)))
 
 
-def _compiled(symbols: Sequence[Any], expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
+def _compiled(symbols: Sequence[Any], expressions: Sequence[Any], width: int) -> Callable[..., list[list[Any]]]:
+    """Return expressions as a function of numbers, whose values come in rows of a width."""
     import sympy
 
-    function: Callable[..., Sequence[Any]] = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
-    return function
+    function = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
+
+    def rows(*at: Any) -> list[list[Any]]:
+        found = function(*at)
+        return [list(found[i : i + width]) for i in range(0, len(found), width)]
+
+    return rows
 
 
 def _operators() -> SimpleNamespace:
     import sympy
     from sympy.codegen.cfunctions import expm1, log1p
-
-    def positive(x: Any) -> Any:
-        return sympy.Piecewise((x, x > 0), (0, True))
-
-    def near(z: Any, limit: float, inside: Any, outside: Any) -> Any:
-        return sympy.Piecewise((inside, z**2 < limit**2), (outside, True))
 
     return SimpleNamespace(
         ln=sympy.log,
@@ -451,8 +440,8 @@ def _operators() -> SimpleNamespace:
         expm1=expm1,
         sinh=sympy.sinh,
         sqrt=sympy.sqrt,
-        positive=positive,
-        near=near,
+        positive=lambda x: sympy.Piecewise((x, x > 0), (0, True)),
+        near=lambda z, limit, inside, outside: sympy.Piecewise((inside, z**2 < limit**2), (outside, True)),
     )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt, Unit
@@ -25,7 +25,6 @@ from forward.findings import Finding
 from forward.model import FloatArray
 from forward.readable import told
 from forward.scalars import Scalar
-from forward.settings import Settings
 from forward.terms import tools
 from forward.terms.term import Place, Term
 from forward.words import listed
@@ -50,96 +49,6 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "plane": (),
 }
 ALLOWED: dict[str, tuple[str, ...]] = {"flat": ("edge",), "cone": ("tip",)}
-
-
-class Position(Settings):
-    """Where a tool is.
-
-    Parameters
-    ----------
-    x, y, z
-        Of its tip (m) before it is moved.
-    """
-
-    x: Annotated[float, Unit("m")]
-    y: Annotated[float, Unit("m")]
-    z: Annotated[float, Unit("m")]
-
-
-class Pointing(Settings):
-    """How a tool points.
-
-    Parameters
-    ----------
-    direction_x, direction_y, direction_z
-        Components of its direction; their length does not matter.
-    """
-
-    direction_x: Annotated[float, Unit("1")]
-    direction_y: Annotated[float, Unit("1")]
-    direction_z: Annotated[float, Unit("1")]
-
-
-class Stiffness(NamedTuple):
-    """How a tool resists penetration.
-
-    Attributes
-    ----------
-    value
-        Pressure per penetration (Pa/m).
-    width
-        Range of gaps (m) over which contact sets in.
-    """
-
-    value: float
-    width: float
-
-
-class Touch(NamedTuple):
-    """A gap (m) in UFL, and how the tool resists where it closes (as `Stiffness`)."""
-
-    gap: Any
-    stiffness: Any
-    width: Any
-
-
-class Rub(NamedTuple):
-    """How a tool rubs, in UFL.
-
-    Attributes
-    ----------
-    limit
-        Largest traction μp (Pa).
-    slip
-        What the body has slid along the tool in the increment (m): a vector.
-    width
-        Slip (m) over which the traction grows.
-    normal
-        Unit normal of the tool.
-    """
-
-    limit: Any
-    slip: Any
-    width: Any
-    normal: Any
-
-    @property
-    def length(self) -> Any:
-        """√(|slip|² + width²) (m)."""
-        import ufl
-
-        return ufl.sqrt(ufl.dot(self.slip, self.slip) + self.width**2)
-
-    @property
-    def traction(self) -> Any:
-        """Traction (Pa) on the tool: μp along the slip, less where this is not large against its width."""
-        return self.limit * self.slip / self.length
-
-    def along(self, v: Any) -> Any:
-        """Return the part of a vector along the surface of the tool."""
-        import ufl
-
-        return v - ufl.dot(v, self.normal) * self.normal
 
 
 class Indenter(Term):
@@ -203,9 +112,9 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        found |= {axis: Scalar(value, Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
+        found |= {axis: Scalar(value, tools.Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
         pointing = zip(POINTING, self.along, strict=True)
-        return found | {name: Scalar(component, Pointing, name) for name, component in pointing}
+        return found | {name: Scalar(component, tools.Pointing, name) for name, component in pointing}
 
     @property
     def size(self) -> float:
@@ -226,7 +135,7 @@ class Indenter(Term):
         """Unit vector of its direction."""
         return unit_vector(self.direction)
 
-    def resistance(self, modulus: float, extent: float) -> Stiffness:
+    def resistance(self, modulus: float, extent: float) -> tools.Stiffness:
         """Return the stiffness that keeps the penetration small.
 
         The formulas are at the top of this file.
@@ -248,7 +157,7 @@ class Indenter(Term):
             case _:
                 slope = ROUND * 2 / math.pi * modulus / self._moved.size
         width = BORNE * extent if self.shape == "plane" and self.depth == 0 else SMOOTH * self.penetration * self._depth
-        return Stiffness(MARGIN * slope / self.penetration, width)
+        return tools.Stiffness(MARGIN * slope / self.penetration, width)
 
     @property
     def _depth(self) -> float:
@@ -275,12 +184,12 @@ class Indenter(Term):
         """
         d = self.pointing(ops, numbers)
         apart = [x[i] - numbers[axis] for i, axis in enumerate("xyz")]
-        t = _dot(apart, d) - numbers["depth"]
+        t = tools.dot(apart, d) - numbers["depth"]
         if self.axis is not None:
-            side = _cross(d, unit_vector(self.axis))
-            across = _dot(apart, side) ** 2 / _dot(side, side)
+            side = tools.cross(d, unit_vector(self.axis))
+            across = tools.dot(apart, side) ** 2 / tools.dot(side, side)
         else:  # |a − (a·d) d|² as |a × d|², which loses no digits
-            across = sum(part**2 for part in _cross(apart, d))
+            across = sum(part**2 for part in tools.cross(apart, d))
         return tools.distance(ops, self.shape, t, across, self._sized(numbers, constant))
 
     def pointing(self, ops: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any, Any]:
@@ -354,7 +263,7 @@ class Indenter(Term):
             straight -= ufl.dot(rub.slip, v) * ufl.dot(rub.slip, w) / rub.length**3
         return rub.limit * straight * self.measure(at)
 
-    def rub(self, at: Place) -> Rub:
+    def rub(self, at: Place) -> tools.Rub:
         """Return how the tool rubs on the body in this increment, in UFL.
 
         Pressures are those of its end, and slip is what the body has moved along the tool since the increment before,
@@ -380,12 +289,12 @@ class Indenter(Term):
         apart = since_touched * (at.u - since.u - moved)
         width = touch.width / (SMOOTH * since.count)
         limit = at.numbers["friction"] * tools.pressure(at.ops, *touch) * size
-        return Rub(limit, apart - ufl.dot(apart, normal) * normal, width, normal)
+        return tools.Rub(limit, apart - ufl.dot(apart, normal) * normal, width, normal)
 
-    def touch(self, at: Place, x: Any) -> Touch:
+    def touch(self, at: Place, x: Any) -> tools.Touch:
         """Return how a place `x` of the deformed body is touched, in UFL."""
         stiffness, width = map(at.constant, self.resistance(at.modulus(), self.extent(at.bounds)))
-        return Touch(self.gap(at.ops, x, at.numbers, at.constant), at.stiffer * stiffness, width)
+        return tools.Touch(self.gap(at.ops, x, at.numbers, at.constant), at.stiffer * stiffness, width)
 
     def measure(self, at: Place) -> Any:
         """Measure of its boundary, fine enough for the pressure under it."""
@@ -508,11 +417,3 @@ def _behind(body: Body, tip: FloatArray, d: FloatArray, extent: float) -> bool:
     """Whether the body lies behind the tip (m) of a tool that points along d."""
     behind = tip - np.outer([1e-3, 0.01, 0.05], extent * d)
     return bool((np.linalg.norm(body.nearest(behind) - behind, axis=1) < 1e-9 * extent).any())
-
-
-def _dot(a: Any, b: Any) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Any, b: Any) -> tuple[Any, Any, Any]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

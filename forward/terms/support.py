@@ -46,19 +46,23 @@ class Support:
         """
         moved = any(value for item in self.displacements for value in item.components.values())
         alone = not moved and len(self.loads) == 1
-        for i, load in enumerate(self.loads):
-            if getattr(load, "on", "") in self.body.boundaries:
-                for field, said, given in load.mistakes(self.body, alone=alone):
-                    yield ("loads", i, field), said, given
-                if load.contact and not self._gives_way(load):
-                    message = "this boundary is held where the tool presses on it, expected one that can move"
-                    yield ("loads", i, "on"), message, getattr(load, "on", "")
+        for i, load in self._on_boundaries:
+            for field, said, given in load.mistakes(self.body, alone=alone):
+                yield ("loads", i, field), said, given
+            if load.contact and not self._gives_way(load):
+                message = "this boundary is held where the tool presses on it, expected one that can move"
+                yield ("loads", i, "on"), message, load.on
         if free := self._free:
             message = f"nothing holds the body along {', '.join(free)}, expected a clamp or prescribed displacements"
             yield ("clamp",), message, ()
         elif complete and not self._held_against_turning():
             message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
             yield ("displacements",), message, ()
+
+    @property
+    def _on_boundaries(self) -> list[tuple[int, Any]]:
+        """Loads that act on a boundary of the body, with their numbers."""
+        return [one for one in enumerate(self.loads) if getattr(one[1], "on", "") in self.body.boundaries]
 
     def _gives_way(self, tool: Any) -> bool:
         """Whether the boundary that a tool may touch can move along its direction."""
@@ -69,8 +73,7 @@ class Support:
     @cached_property
     def _touched(self) -> list[tuple[Vector, Vector]]:
         """Points (m) of the body and the directions in which tools hold them against what presses them there."""
-        on_body = [load for load in self.loads if getattr(load, "on", "") in self.body.boundaries]
-        found = [one for load in on_body for one in load.holds(self.body)]
+        found = [one for _, load in self._on_boundaries for one in load.holds(self.body)]
         pressed = any(not load.contact for load in self.loads)
         return [one for one in found if pressed or any(np.dot(one[1], other) < 0 for _, other in found)]
 

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Unit
+
+from forward.settings import Settings
 
 TINY = 1e-8  # of a length, which keeps slopes of roots finite
 NUMPY = SimpleNamespace(
@@ -23,6 +26,96 @@ NUMPY = SimpleNamespace(
     positive=lambda x: np.maximum(x, 0.0),
     choose=lambda z, positive, negative: np.where(z > 0, positive, negative),
 )
+
+
+class Position(Settings):
+    """Where a tool is.
+
+    Parameters
+    ----------
+    x, y, z
+        Of its tip (m) before it is moved.
+    """
+
+    x: Annotated[float, Unit("m")]
+    y: Annotated[float, Unit("m")]
+    z: Annotated[float, Unit("m")]
+
+
+class Pointing(Settings):
+    """How a tool points.
+
+    Parameters
+    ----------
+    direction_x, direction_y, direction_z
+        Components of its direction; their length does not matter.
+    """
+
+    direction_x: Annotated[float, Unit("1")]
+    direction_y: Annotated[float, Unit("1")]
+    direction_z: Annotated[float, Unit("1")]
+
+
+class Stiffness(NamedTuple):
+    """How a tool resists penetration.
+
+    Attributes
+    ----------
+    value
+        Pressure per penetration (Pa/m).
+    width
+        Range of gaps (m) over which contact sets in.
+    """
+
+    value: float
+    width: float
+
+
+class Touch(NamedTuple):
+    """A gap (m) in UFL, and how the tool resists where it closes (as `Stiffness`)."""
+
+    gap: Any
+    stiffness: Any
+    width: Any
+
+
+class Rub(NamedTuple):
+    """How a tool rubs, in UFL.
+
+    Attributes
+    ----------
+    limit
+        Largest traction μp (Pa).
+    slip
+        What the body has slid along the tool in the increment (m): a vector.
+    width
+        Slip (m) over which the traction grows.
+    normal
+        Unit normal of the tool.
+    """
+
+    limit: Any
+    slip: Any
+    width: Any
+    normal: Any
+
+    @property
+    def length(self) -> Any:
+        """√(|slip|² + width²) (m)."""
+        import ufl
+
+        return ufl.sqrt(ufl.dot(self.slip, self.slip) + self.width**2)
+
+    @property
+    def traction(self) -> Any:
+        """Traction (Pa) on the tool: μp along the slip, less where this is not large against its width."""
+        return self.limit * self.slip / self.length
+
+    def along(self, v: Any) -> Any:
+        """Return the part of a vector along the surface of the tool."""
+        import ufl
+
+        return v - ufl.dot(v, self.normal) * self.normal
 
 
 def distance(ops: Any, shape: str, t: Any, across: Any, numbers: Mapping[str, Any]) -> Any:
@@ -83,3 +176,13 @@ def contact(ops: Any, gap: Any, width: float) -> Any:
     """Return 1 in contact and 0 outside, continuous: the derivative of the pressure relative to its stiffness."""
     near = width / 2 - gap
     return (ops.positive(near) - ops.positive(near - width)) / width
+
+
+def dot(a: Any, b: Any) -> Any:
+    """Return the inner product of two vectors of numbers or forms."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    """Return the vector product of two."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
