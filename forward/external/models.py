@@ -8,16 +8,18 @@ Functions and servers share this file because only the way a point is evaluated 
 from __future__ import annotations
 
 import json
+import signal
+import threading
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from forward.external.own_modules import imported
-from forward.external.patience import TimeLimitError, time_limit
 from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
 from forward.scalars import Scalar
@@ -31,6 +33,7 @@ SECONDS_TO_ANSWER = 30.0  # for questions that need no solve
 PROTOCOL = 1.0
 LITTLE = 1024 * MIB  # memory left, below which a message mentions it
 MISUSED = ("InvalidInput", "UnsupportedFeature", "ModelNotFound")  # errors of a server at any parameters
+AGAIN = 0.5  # seconds after which code that swallowed the exception is interrupted again
 
 
 class Value(Settings):
@@ -396,3 +399,37 @@ class Client:
         if code == 404 or kind in MISUSED:
             raise ModelError(f"model.url: {self._url} refuses {what}: {message}")
         raise SolveError(f"{self._url}: {message}")
+
+
+class TimeLimitError(BaseException):
+    """Code took too long. It is not an Exception, so that `except Exception` in that code does not swallow it."""
+
+
+@contextmanager
+def time_limit(seconds: float | None) -> Iterator[None]:
+    """Interrupt the code in this context after so many seconds; code outside Python, when it returns.
+
+    There is no limit if `seconds` is None, or outside the main thread, since only that can be interrupted.
+
+    Raises
+    ------
+    TimeLimitError
+        If the time has passed.
+    """
+    if seconds is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting = True
+
+    def interrupt(*_: Any) -> None:
+        if waiting:
+            raise TimeLimitError
+
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
+    try:
+        yield
+    finally:
+        waiting = False
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from forward.findings import Finding
 from forward.model import FloatArray
 from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_shape, of_tails
-from uq.estimators.indices import Analysis, coefficient_moments, moments, shares
+from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.estimators.tails import influences
 from uq.inputs.distributions import Normal
@@ -108,8 +108,6 @@ class Regression:
 
     def _dependent(self) -> dict[str, FloatArray]:
         """Moments and, of few parameters, Shapley effects."""
-        from uq.estimators.indices import MOST, Shapley
-
         draws = self.inputs.draws
         assert draws is not None
         if len(draws.names) > MOST:
