@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -281,10 +281,10 @@ class Joined(OneByOne):
         """Solve all at `parameters` (d,)."""
         return self.solve_each(parameters, self.guesses(guess))
 
-    def guesses(self, guess: Guess | None) -> list[Guess | None]:
+    def guesses(self, guess: Guess | None) -> list[Guess]:
         """Split a guess into those of the models."""
         if guess is None or not self.order:
-            return [None] * len(self.models)
+            return [Guess()] * len(self.models)
         near, count = guess.reference, len(self.order)
         states = [None] * count if guess.state is None else self.states(guess.state)
         there = [None] * count if near is None else [replace(near, state=one) for one in self.states(near.state)]
@@ -295,7 +295,7 @@ class Joined(OneByOne):
         parts = np.split(rows, len(self.order), axis=-1)
         return [parts[place] for place in np.argsort(self.order)]
 
-    def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess | None]) -> JoinedSolution:
+    def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess]) -> JoinedSolution:
         """Solve all at `parameters` (d,), each with its own guess."""
         found = []
         for k, (model, near) in enumerate(zip(self.models, guesses, strict=True)):
@@ -395,43 +395,35 @@ class JoinedSolution:
             sum(one.energy for one in known),
             max(one.relative for one in known),
             Work.sum_of(one.work for one in known),
-            nonlinearity=farthest(one.nonlinearity for one in known),
+            nonlinearity=max((one.nonlinearity for one in known), key=lambda far: (not np.isfinite(far), far)),
             stored=sum(one.stored for one in known),
         )
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the errors of all meshes; None where there are none."""
-        return together([(len(one.outputs), one.saturation(spare)) for one in self.solutions])
+        """Calibrate estimates of the errors of all meshes; None where there are none, and a factor of one without."""
+        parts = self.saturations(spare)
+        known = [one for one in parts if one is not None]
+        if not known:
+            return None
+
+        def all_of(values: Sequence[FloatArray | float | None], otherwise: float) -> FloatArray:
+            pairs = zip(self.solutions, values, strict=True)
+            return np.concatenate([np.broadcast_to(otherwise if v is None else v, len(s.outputs)) for s, v in pairs])
+
+        return Saturation(
+            all_of([None if one is None else one.outputs for one in parts], 1.0),
+            float(np.mean([one.state for one in known])),
+            float(np.mean([one.energy for one in known])),
+            all(one.measured for one in known),
+            all_of([0.0 if one is None else one.shifts for one in parts], 0.0),
+            all_of([0.0 if one is None else one.doubts for one in parts], math.nan),
+        )
+
+    def saturations(self, spare: float) -> list[Saturation | None]:
+        """Calibrate each."""
+        return [one.saturation(spare) for one in self.solutions]
 
 
 def side_by_side(states: Sequence[FloatArray], order: Sequence[int]) -> FloatArray:
     """Return states (…, U_local) in an order as one; none (…, 0) without an order."""
     return np.concatenate([states[0][..., :0], *(states[k] for k in order)], axis=-1)
-
-
-def farthest(nonlinearities: Iterable[float]) -> float:
-    """Return the largest nonlinearity of several estimates; NaN is larger than all."""
-    return max(nonlinearities, key=lambda far: (not np.isfinite(far), far))
-
-
-def together(parts: Sequence[tuple[int, Saturation | None]]) -> Saturation | None:
-    """Return what calibrates the outputs of several solutions, from their numbers of outputs and what calibrates them.
-
-    Where there is no mesh the factor is one.
-    """
-    known = [one for _, one in parts if one is not None]
-    if not known:
-        return None
-
-    def all_of(values: Sequence[FloatArray | float | None], otherwise: float) -> FloatArray:
-        pairs = zip(parts, values, strict=True)
-        return np.concatenate([np.broadcast_to(otherwise if v is None else v, n) for (n, _), v in pairs])
-
-    return Saturation(
-        all_of([None if one is None else one.outputs for _, one in parts], 1.0),
-        float(np.mean([one.state for one in known])),
-        float(np.mean([one.energy for one in known])),
-        all(one.measured for one in known),
-        all_of([0.0 if one is None else one.shifts for _, one in parts], 0.0),
-        all_of([0.0 if one is None else one.doubts for _, one in parts], math.nan),
-    )

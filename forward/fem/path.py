@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 from scipy.sparse import eye
 
-from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped, together
+from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped
 from forward.fem.calibration import FinerMesh
 from forward.fem.equations import Discretisation
 from forward.fem.model import HyperelasticModel
@@ -60,12 +59,8 @@ class PathModel(Joined):
         solutions: list[StepSolution] = []
         directions = np.eye(len(parameters))
         soon = guess is not None and guess.derivatives and len(directions) <= FEW
-        for label, model, one, given in zip(
-            self.labels, self.steps, self.models, self.guesses(guess or Guess()), strict=True
-        ):
-            known = given
-            if given is None or given.state is None:
-                known = Guess(self._continued(solutions), iterations=None if given is None else given.iterations)
+        for label, model, one, given in zip(self.labels, self.steps, self.models, self.guesses(guess), strict=True):
+            known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
             try:
                 found = StepSolution(model.solve(one.by.values(parameters[None])[0], mapped(known, one.by)), one.by)
                 if soon:  # while its factor is at hand: the next step needs the room
@@ -150,7 +145,7 @@ class PathSolution(JoinedSolution):
         """Return the equations, set to the last step."""
         return self.solutions[-1].solution.visit()
 
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the error of the mesh, step by step on one finer mesh; collective."""
+    def saturations(self, spare: float) -> list[Saturation | None]:
+        """Calibrate each step on one finer mesh; collective."""
         finer = FinerMesh(self.body, spare)
-        return together([(len(one.outputs), one.solution.saturation(spare, finer)) for one in self.solutions])
+        return [one.solution.saturation(spare, finer) for one in self.solutions]
