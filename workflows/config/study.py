@@ -216,8 +216,7 @@ def schema() -> dict[str, Any]:
 def document(study: StudyKind) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     blocks = study.model_dump(mode="json", exclude_none=True)
-    last = {key: blocks.pop(key) for key in WITHOUT_EFFECT if key in blocks}
-    return blocks | last
+    return dict(sorted(blocks.items(), key=lambda item: item[0] in WITHOUT_EFFECT))
 
 
 def dump(study: StudyKind) -> str:

@@ -93,8 +93,9 @@ class DesignStudy(Sourced, StudyKind):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about model and prior before anything is solved."""
-        found = (*self.model.findings_over(ranges(self.given)), *findings_of_materials(self.inputs))
-        return found if self.source is None else (*found, *named(f"{READER}:findings")(self, self.source))
+        inputs, source = self.inputs, self.source
+        of_draws = () if source is None else named(f"{READER}:findings")(source, self.spec, inputs)
+        return (*self.model.findings_over(ranges(self.given)), *findings_of_materials(inputs), *of_draws)
 
     @classmethod
     def forms(cls) -> Iterator[type[StudyKind]]:

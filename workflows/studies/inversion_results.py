@@ -204,7 +204,7 @@ def summary(found: xr.Dataset) -> dict[str, Any]:
 def _one(found: xr.Dataset) -> dict[str, Any]:
     if not bool(found["ok"]):
         return {"failed": str(found["why"].item())}
-    numbers = ("log_evidence", "log_evidence_error", "determined", "residual_probability")
+    numbers = (*EVIDENCE, "residual_probability")
     keys = ("mode", "std", "lower", "upper", *(("mesh_shift", "mesh_left") if "mesh_checked" in found else ()))
     return {
         "posterior": {
@@ -249,66 +249,48 @@ def _number(value: Any) -> float | None:
 
 
 STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
-NUMBERS = ("log_evidence", "log_evidence_error", "determined", "residual_square", "residual_degrees")
+EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
+NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
 
 
 def batch_table(found: xr.Dataset) -> str:
     """Return a table of comma-separated values with a row for each data set."""
     names, cases = ([str(name) for name in found[key].values] for key in ("parameter", "case"))
-    return _table([_head(names, cases), *(_row(found.sel(data_set=label)) for label in found.data_set.values)])
+    return _table(names, cases, (_row(found.sel(data_set=label)) for label in found.data_set.values))
 
 
-def _table(rows: Iterable[Sequence[Any]]) -> str:
+def _table(names: Sequence[str], cases: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return a table with all columns; what a row does not have is empty."""
+    columns = ["data_set", "ok", "data", "points_moved"]
+    columns += [*(f"{name} {key}" for name in names for key in STATISTICS), *NUMBERS]
+    columns += [*(f"misfit {case}" for case in cases), "why", "mesh_error", "mesh_corrected"]
+    columns += [f"{name} mesh_shift" for name in names]
     file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows(rows)
+    writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return file.getvalue()
 
 
-def _head(names: Sequence[str], cases: Sequence[str]) -> list[str]:
-    of_parameters = [f"{name} {key}" for name in names for key in STATISTICS]
-    of_cases = [f"misfit {case}" for case in cases]
-    return [
-        "data_set",
-        "ok",
-        "data",
-        "points_moved",
-        *of_parameters,
-        *NUMBERS,
-        "residual_probability",
-        *of_cases,
-        "why",
-        "mesh_error",
-        "mesh_corrected",
-        *(f"{name} mesh_shift" for name in names),
-    ]
-
-
-def _row(one: xr.Dataset) -> list[Any]:
-    """Cells of a data set."""
-    values = [one[key].sel(parameter=name) for name in one.parameter.values for key in STATISTICS]
-    values += [one[key] for key in (*NUMBERS, "residual_probability")]
-    values += [one["misfit"].sel(case=case) for case in one.case.values]
-    shown = [f"{float(value):.8g}" if np.isfinite(float(value)) else "" for value in values]
-    count = int(np.isfinite(one["measured"]).sum())
-    ok = "yes" if bool(one["ok"]) else "no"
-    return [
-        str(one.data_set.item()),
-        ok,
-        count,
-        int(one["points_moved"]) if "points_moved" in one else 0,
-        *shown,
-        str(one["why"].item()),
-        *_mesh_cells(one),
-    ]
-
-
-def _mesh_cells(one: xr.Dataset) -> list[str]:
-    """Cells of what finer meshes said; empty where they said nothing."""
-    if "mesh_checked" not in one or one["mesh_checked"] != 1:
-        return [""] * (2 + one.sizes["parameter"])
-    shifts = [f"{value:.4g}" if np.isfinite(value) else "" for value in one["mesh_shift"].to_numpy()]
-    error = _mesh(one)["error"]
-    return ["" if error is None else f"{error:.4g}", "yes" if one["mesh_corrected"] == 1 else "no", *shifts]
+def _row(one: xr.Dataset) -> dict[str, Any]:
+    """Cells of a data set, by columns."""
+    names = [str(name) for name in one.parameter.values]
+    values = {f"{name} {key}": one[key].sel(parameter=name) for name in names for key in STATISTICS}
+    values |= {key: one[key] for key in NUMBERS}
+    values |= {f"misfit {case}": one["misfit"].sel(case=case) for case in one.case.values}
+    row = {key: f"{float(value):.8g}" for key, value in values.items() if np.isfinite(float(value))} | {
+        "data_set": str(one.data_set.item()),
+        "ok": "yes" if bool(one["ok"]) else "no",
+        "data": str(int(np.isfinite(one["measured"]).sum())),
+        "points_moved": str(int(one["points_moved"]) if "points_moved" in one else 0),
+        "why": str(one["why"].item()),
+    }
+    if "mesh_checked" not in one or one["mesh_checked"] != 1:  # finer meshes said nothing
+        return row
+    error, shifts = _mesh(one)["error"], zip(names, one["mesh_shift"].to_numpy(), strict=True)
+    row |= {"mesh_error": "" if error is None else f"{error:.4g}"}
+    row |= {"mesh_corrected": "yes" if one["mesh_corrected"] == 1 else "no"}
+    return row | {f"{name} mesh_shift": f"{shift:.4g}" for name, shift in shifts if np.isfinite(shift)}
 
 
 class Rows:
@@ -326,23 +308,22 @@ class Rows:
 
     def __init__(self, study: Inversion, vertices: Vertices | None, write: Callable[[str], None]) -> None:
         self._study, self._vertices, self._write = study, vertices, write
-        self._rows: dict[int, list[Any]] = {}
-        self._head = _head(study.names, study.parts)
+        self._rows: dict[int, Mapping[str, Any]] = {}
 
     def add(self, number: int, outcome: Outcome) -> None:
         """Add a finished data set."""
         sets, measurement = self._study.data.sets[number], self._study.measurements[number]
         if outcome.dataset is None:
             moved = 0 if measurement is None else int((measurement.moves > 0).sum())
-            after = len(self._head) - self._head.index("why") - 1
-            empty = [""] * (len(self._head) - 5 - after)
-            self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason, *[""] * after]
+            row = {"data_set": sets.name, "ok": "no", "data": 0, "points_moved": moved, "why": outcome.reason}
+            self._rows[number] = row
         else:
             data = self._study.data.model_copy(update={"sets": (sets,)})
             alone = self._study.model_copy(update={"data": data, "measurements": (measurement,)})
             found = judged(dataset(alone, [outcome], self._vertices), alone)
             self._rows[number] = _row(found.isel(data_set=0))
-        self._write(_table([self._head, *(self._rows[number] for number in sorted(self._rows))]))
+        rows = (self._rows[number] for number in sorted(self._rows))
+        self._write(_table(self._study.names, self._study.parts, rows))
 
 
 def arviz_groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:

@@ -28,7 +28,7 @@ from workflows.studies.posteriors import Left, draws_in
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     import xarray as xr
 
@@ -240,7 +240,7 @@ class PopulationJob(Job):
 
         def task(asked: Callable[[tuple[str, Inputs]], Draws | str]) -> xr.Dataset:
             posteriors = self.study.posteriors
-            prior = self.study.source.prior(method.model, next(iter(posteriors.values())).names)
+            prior = _prior(self.study, prior_names(posteriors))
             asking = 0.0
 
             def timed(*one: Any) -> Draws | str:
@@ -261,6 +261,17 @@ class PopulationJob(Job):
         self.own.append(job.own_seconds)
         for part, found in job.evaluations.items():
             self.solved[label if part == "/" else f"{label}/{part}"] = found
+
+
+def _prior(study: PopulationStudy, names: Sequence[str]) -> Inputs:
+    """Return the prior of these parameters, which the posteriors were found with."""
+    from workflows.config.study import parse
+
+    left = study.source
+    before: Any = parse(left.blocks, folder=left.path)
+    by_candidate = "candidates" in left.blocks
+    inputs: Inputs = before.models[left.candidate(study.method.model)].inputs if by_candidate else before.inputs
+    return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
 
 
 def _source(study: PopulationStudy) -> StudyKind | None:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from forward.scalars import Mistake, Scalar
     from forward.spec import ModelSpec
     from workflows.config.source import Source
-    from workflows.studies.sampling import Study
 
 Arrays = Mapping[str, Any]
 LETTERS = 16  # of a hash
@@ -180,14 +179,6 @@ class Left:
         names = _texts(self.found, "group" if self.kind == "select" else "data_set")
         done = np.atleast_1d(self.found["ok"]).astype(bool) if self.kind == "invert" else [True] * len(names)
         return {name: self.draws(name, model) for name, one in zip(names, done, strict=True) if one}
-
-    def prior(self, model: str | None, names: Sequence[str]) -> Inputs:
-        """Return the prior of these parameters, which the posteriors were found with."""
-        from workflows.config.study import parse
-
-        study: Any = parse(self.blocks, folder=self.path)
-        inputs: Inputs = study.models[self.candidate(model)].inputs if "candidates" in self.blocks else study.inputs
-        return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
 
 
 def _texts(found: Arrays, name: str) -> list[str]:
@@ -356,16 +347,15 @@ def mistakes(source: Source, model: ModelSpec, own: Sequence[str]) -> Iterator[M
             yield place, str(error), source.file
 
 
-def findings(study: Study, source: Source) -> Iterator[Finding]:
+def findings(source: Source, model: ModelSpec, inputs: Inputs) -> Iterator[Finding]:
     """Find what the draws say before anything is solved."""
     from uq.estimators.of_draws import findings_of_source
 
-    inputs, scalars = study.inputs, study.spec.scalars
     yield from findings_of_source(inputs)
-    materials = study.spec.materials(study.given)
+    materials = model.materials(inputs.names)
     if inputs.draws is not None:
-        yield from findings_of_impossible(scalars, inputs.draws, () if materials is None else materials.names)
-    block, mine = material_of(source), getattr(study.model, "material", None)
+        yield from findings_of_impossible(model.scalars, inputs.draws, () if materials is None else materials.names)
+    block, mine = material_of(source), getattr(model, "material", None)
     if block and mine is not None:
         fixed = {
             name: float(v) for name, v in block.items() if isinstance(v, int | float) and name not in source.drawn.names

@@ -172,7 +172,7 @@ class Study(Sourced, StudyKind):
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
         found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
         if self.source is not None:
-            found = (*found, *named(f"{READER}:findings")(self, self.source))
+            found = (*found, *named(f"{READER}:findings")(self.source, self.spec, self.inputs))
         return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
