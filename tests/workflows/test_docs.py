@@ -96,6 +96,17 @@ def test_files_are_there(page, place):
     assert (ROOT / place).exists()
 
 
+def test_the_design_names_modules_that_there_are():
+    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    table = page.partition("## Where things are")[2].partition("\n## ")[0]
+    for folders, told in re.findall(r"^\| (`[^|]*`) \| (.*) \|$", table, re.MULTILINE):
+        inside = [ROOT / folder for folder in re.findall(r"`([\w/]+/)`", folders)]
+        inside += [folder / part for folder in inside for part in re.findall(r"`(\w+/)`", told)]
+        for name in re.findall(r"`(\w+)`", told):
+            assert any((folder / f"{name}.py").exists() for folder in inside), (folders, name)
+    assert len(page.splitlines()) <= 250
+
+
 def test_every_kind_and_every_study_of_the_net_stands_among_the_abilities():
     page = (ROOT / "docs" / "abilities.md").read_text(encoding="utf-8")
     studies = [path.relative_to(ROOT).as_posix() for path in (ROOT / "benchmarks" / "net").glob("*.toml")]
