@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, model_validator
@@ -219,19 +219,35 @@ class Specimen(Solid):
         ModelError
             If nodes of a boundary are observed: only the mesh knows which these are.
         """
-        found: list[Output] = []
         for i, item in enumerate(self.observed):
             if item.on is not None:
                 message = f"observed[{i}].on: its nodes are not known before there is a mesh, expected points ('at')"
                 raise ModelError(message)
-        for case in self.cases:
-            for item in self.seen(case):
-                for i, at in enumerate(item.at):
-                    for axis in (one for one in AXES if one in item.components):
-                        name = f"{case.name}.{item.label}.{i}.{axis}"
-                        found.append(PointDisplacement(name=name, at=at, component=axis))
-            found += [output.model_copy(update={"name": f"{case.name}.{output.name}"}) for output in case.outputs]
+        found: list[Output] = []
+        for number, name, axis, at in self.rows():
+            if axis < len(AXES):
+                found.append(PointDisplacement(name=name, at=at, component=AXES[axis]))
+            else:
+                found.append(self.cases[number].outputs[axis - len(AXES)].model_copy(update={"name": name}))
         return tuple(found)
+
+    def rows(self, nodes: Callable[[str], Sequence[Vector]] = lambda _: ()) -> Iterator[tuple[int, str, int, Vector]]:
+        """Yield the load case, by number, the name, the component and the place of all that is observed.
+
+        Components 3 and more are the other outputs of the load case, in its order, which have no place: NaN.
+
+        Parameters
+        ----------
+        nodes
+            Returns the places (m) of the nodes of a boundary.
+        """
+        for number, case in enumerate(self.cases):
+            for item in self.seen(case):
+                for i, at in enumerate(item.at if item.on is None else nodes(item.on)):
+                    for axis in item.components:
+                        yield number, f"{case.name}.{item.label}.{i}.{axis}", AXES.index(axis), at
+            for k, output in enumerate(case.outputs):
+                yield number, f"{case.name}.{output.name}", len(AXES) + k, (math.nan,) * 3
 
     def cost(self) -> Times:
         """Predict the cost of a solve of all load cases, each with its own factor."""

@@ -9,7 +9,7 @@ order a, which is 2 at most, the richer ones have 2a − 1. Orders below 1, and 
 believed: then it is 1, and the doubt is larger.
 
 Where the estimate on the finer mesh would take too much, ψ_h, ψ_h + e_h and ψ_f are left. Beside such singularities
-errors fall twice as fast with the degree p as with the size of cells (`forward.fem.saturation`), as C (h/p²)^a: then
+errors fall twice as fast with the degree p as with the size of cells (`forward.fem.solution`), as C (h/p²)^a: then
 e_h/(ψ_f − ψ_h) = (1 − (p/(p+1))^2a)/(1 − t^−a), which tells a, and ψ − ψ_h = (ψ_f − ψ_h)/(1 − t^−a). For quadratic
 elements and t = 3/2 richer elements are as good as a second such mesh, and this is Aitken's extrapolation. Where no
 order shows, it is 3/2, and the doubt reaches from order 1 to 4.

@@ -438,10 +438,6 @@ class Linearisation(Forms):
                 right[i, self.fixed] = w[self.fixed]
         return right
 
-    def right_sides_of_all(self) -> FloatArray:
-        """Right-hand sides (d, U_local) of the tangents along every parameter, at the state set."""
-        return self.right_sides_along(np.eye(len(self.parameters)))
-
     def right_sides_along(self, directions: FloatArray) -> FloatArray:
         """Right-hand sides (k, U_local) of the tangents along directions (k, d) of the parameters, at the state set."""
         right = directions[:, self.scalars] @ self.right_sides()

@@ -77,7 +77,7 @@ class ReferenceFactor:
             assert self._reference is not None
             equations = self._set(self._reference)
             kept, equations.work = equations.work, Work()  # its cost is not counted for the first solution
-            self._slopes = self._solver.solve(equations.right_sides_of_all())
+            self._slopes = self._solver.solve(equations.right_sides_along(np.eye(len(equations.parameters))))
             equations.work = kept
         return self._slopes
 

@@ -13,12 +13,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.fem.reference import WayFromReference
-from forward.fem.saturation import factors, typical
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
 from forward.registry import named
 from forward.solvers.anderson import block_galerkin
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
+LEAST, MOST = 0.5, 3.0  # factors
+# Where finding them takes too much memory: of linear elements, which see most, and of others at edges that are held.
+TYPICAL = {1: 1.1, 2: 1.35}
+RATES = np.geomspace(1e-3, 60.0, 2000)  # β
 
 
 class FiniteElementSolution:
@@ -296,7 +300,7 @@ class FiniteElementSolution:
     def saturation(self, spare: float = math.inf, finer: Any | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
-        Where that is too large, by elements of two degrees more (`forward.fem.saturation`); typical values where this
+        Where that is too large, by elements of two degrees more (`factors`); typical values where this
         takes too much memory too. In a short study, either is too large also where it would take too long
         (`forward.fem.mesh_error_cost.allowance`).
 
@@ -344,3 +348,39 @@ class FiniteElementSolution:
         self.visit()
         found = self._model.enriched.indicators(self, np.atleast_2d(weights))
         return found.reshape(*np.shape(weights)[:-1], -1)
+
+
+def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.0) -> FloatArray:
+    """Return what errors seen in elements of one degree more are to be multiplied by, from what two degrees more see.
+
+    Beside edges and corners, where stresses are singular, errors fall with a power of the degree p, C p^−β, and twice
+    as fast in p as in the size of cells (I. Babuška, M. Suri, The p and h-p versions of the finite element method, SIAM
+    Rev. 36 (1994) 578–632). Values in three degrees tell β and with it the rest. An extrapolation, so bounded: no
+    factor is trusted beyond that of β ≈ 1.
+
+    Parameters
+    ----------
+    seen, more
+        Errors (m,) as elements of one and of two degrees more see them.
+    degree
+        Of the body.
+    otherwise
+        The factor of what is too small beside the others to have one of its own.
+    """
+    one, two = np.atleast_1d(np.asarray(seen, dtype=float)), np.atleast_1d(np.asarray(more, dtype=float))
+    p = float(degree)
+    first = p**-RATES - (p + 1) ** -RATES
+    ratios = ((p + 1) ** -RATES - (p + 2) ** -RATES) / first  # falls with β
+    found = np.full(one.shape, otherwise)
+    good = np.isfinite(one) & np.isfinite(two) & (one != 0)
+    step = (two[good] - one[good]) / one[good]
+    powers = np.interp(step, ratios[::-1], (p**-RATES / first)[::-1])
+    found[good] = np.clip(np.where(step > 0, powers, 1 + step), LEAST, MOST)
+    found[np.isnan(one)] = math.nan
+    return found
+
+
+def typical(seen: FloatArray, degree: int) -> Saturation:
+    """Return what is typical of elements of a degree, for outputs whose errors (m,) are seen."""
+    factor = TYPICAL[degree]
+    return Saturation(np.where(np.isnan(seen), np.nan, factor), factor, factor, measured=False)

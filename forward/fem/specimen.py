@@ -207,18 +207,9 @@ def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         directions=np.zeros((0, 3)),
         cases=none,
     )
-    names, places, axes, cases = list[str](), [np.zeros((0, 3))], list[int](), list[int]()
-    for number, (case, body) in enumerate(zip(spec.cases, bodies, strict=True)):
-        for item in spec.seen(case):
-            at = np.array(item.at) if item.on is None else _nodes(body, item.on)
-            names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(at)) for axis in item.components]
-            places.append(np.repeat(at, len(item.components), axis=0))
-            axes += [AXES.index(axis) for axis in item.components] * len(at)
-        names += [f"{case.name}.{output.name}" for output in case.outputs]
-        places.append(np.full((len(case.outputs), 3), np.nan))
-        axes += [len(AXES) + i for i in range(len(case.outputs))]
-        cases += [number] * (len(axes) - len(cases))
-    return model.observing(np.concatenate(places), axes, cases, names=names)
+    rows = list(spec.rows(lambda boundary: _nodes(bodies[0], boundary)))
+    cases, names, axes, places = zip(*rows, strict=True) if rows else ((),) * 4
+    return model.observing(np.array(places).reshape(-1, 3), axes, cases, names=names)
 
 
 def _nodes(model: HyperelasticModel, boundary: str) -> FloatArray:

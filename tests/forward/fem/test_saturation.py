@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.fem.saturation import LEAST, MOST, factors, typical
+from forward.fem.solution import LEAST, MOST, factors, typical
 
 pytestmark = pytest.mark.unit
 
