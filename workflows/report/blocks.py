@@ -11,7 +11,7 @@ import numpy as np
 
 from forward.readable import interval
 from workflows.report import plots
-from workflows.report.plots.figure import png_of
+from workflows.report.plots.figure import figure_of, png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +109,7 @@ class Picture:
     @classmethod
     def drawn(cls, ax: Axes, caption: str) -> Picture:
         """Show the figure of axes."""
-        wide = ax.figure.get_figure(root=True).get_size_inches()[0] > HALF
+        wide = figure_of(ax).get_size_inches()[0] > HALF
         return cls(base64.b64encode(plots.svg(ax)).decode(), caption, wide=wide, kind="svg+xml")
 
 

@@ -128,20 +128,10 @@ def _painted(
     edges: str | None,
     bar: tuple[Any, Any, str],
 ) -> tuple[Figure, Any]:
-    """Return a figure of faces, each layer from far to near, and its bar of colours.
+    """Return a figure of faces (`_faces`), and its bar: of colours, their ends, and what they are of.
 
-    Parameters
-    ----------
-    layers
-        Faces as of `_faces`, behind each other.
-    places
-        Points (n, 2) that the picture holds beside these.
-    before
-        Lines (m, 2, 2) behind all faces.
-    edges
-        Colour of the edges of faces, if not their own.
-    bar
-        Colours, their ends, and what they are of.
+    Layers of faces are behind each other, each from far to near, and lines `before` (m, 2, 2) behind all of them. Edges
+    of faces have a colour, or their own. The picture holds all that, and `places` (n, 2).
     """
     import matplotlib as mpl
     from matplotlib.collections import LineCollection, PolyCollection

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import and_error, margin, size
+from forward.readable import and_error, margin, quantity, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import NONE, with_error
@@ -95,6 +95,11 @@ class Results:
     def meshes_unknown(self) -> dict[str, bool]:
         """Outputs whose error of the mesh is not known, and whether its estimates have failed."""
         return meshes_unknown(self.dataset)
+
+    def value(self, output: str, value: float, error: float) -> str:
+        """Write a value of an output to the place of its error, or to few digits where estimates of its mesh failed."""
+        unit = self.unit(output)
+        return size(value, unit, DIGITS) if self.meshes_unknown.get(output) else quantity(value, error, unit)
 
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""

@@ -28,10 +28,15 @@ COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1
 
 def png(ax: Axes) -> bytes:
     """Return the whole figure of axes as a PNG file."""
-    whole = ax.get_figure(root=True)
-    assert whole is not None
-    in_fitting_units(whole)
-    return png_of(whole, dpi=130)
+    in_fitting_units(figure_of(ax))
+    return png_of(figure_of(ax), dpi=130)
+
+
+def figure_of(ax: Axes) -> Figure:
+    """Return the whole figure that axes are on."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    return figure
 
 
 def png_of(figure: Figure, dpi: float) -> bytes:
@@ -51,8 +56,7 @@ def svg(ax: Axes) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.collections import QuadMesh
 
-    whole = ax.get_figure(root=True)
-    assert whole is not None
+    whole = figure_of(ax)
     in_fitting_units(whole)
     FigureCanvasSVG(whole)
     _lay_out(whole, FigureCanvasSVG.fixed_dpi)

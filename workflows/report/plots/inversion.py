@@ -20,6 +20,7 @@ from workflows.report.plots.figure import (
     LEGEND,
     PLAIN,
     axes,
+    figure_of,
     finished,
     grid,
     rows,
@@ -301,8 +302,7 @@ def _finish(ax: Axes, label: str, x: FloatArray) -> None:
 
 def _legend(found: list[Axes]) -> None:
     handles, labels = found[0].get_legend_handles_labels()
-    figure = found[0].get_figure(root=True)
-    assert figure is not None
+    figure = figure_of(found[0])
     columns = 4 if figure.get_figwidth() > 5 else 2
     figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize="small", frameon=False)
 

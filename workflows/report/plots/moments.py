@@ -130,25 +130,16 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     for i, probability in enumerate(dataset["quantile"].to_numpy()):
         place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
         ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
-        ax.annotate(
-            f"{100 * probability:g} %",
-            (place, 1),
-            xycoords=ax.get_xaxis_transform(),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize="small",
-            color=HIGH,
-        )
-    ax.set_xlabel(quantity(dataset, output))
+        above: dict[str, Any] = {
+            "xycoords": ax.get_xaxis_transform(),
+            "xytext": (0, 3),
+            "textcoords": "offset points",
+            "ha": "center",
+        }
+        ax.annotate(f"{100 * probability:g} %", (place, 1), fontsize="small", color=HIGH, **above)
     unit = str(dataset["unit"].sel(output=output).item())
-    return finished(
-        ax,
-        y="density" if unit == "1" else f"density (1/{unit})",
-        ncols=4,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.06),
-    )
+    density_of = "density" if unit == "1" else f"density (1/{unit})"
+    return finished(ax, quantity(dataset, output), density_of, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
 
 
 def _corrected_density(dataset: xr.Dataset, output: str, ax: Axes) -> None:
@@ -206,7 +197,8 @@ def _series(
         mean, error = (dataset[f"running_{name}"].sel(output=output).to_numpy() for name in ("mean", "mean_error"))
         return [("scrambled Sobol' points", CONTROLLED, dataset["round"].to_numpy(), mean, error)]
     n = int(dataset["ok"].sum())
-    counts = np.unique(np.geomspace(_first(n), n, 160).round().astype(np.int64))
+    first = max(2, min(FIRST_SHOWN, n // 2))
+    counts = np.unique(np.geomspace(first, n, 160).round().astype(np.int64))
     kinds = [("plain", PLAIN, False)]
     if "variance_ratio" in dataset:
         kinds.append(("with sensitivity derivatives", CONTROLLED, True))
@@ -216,11 +208,6 @@ def _series(
         mean, error = np.array([m.mean for m in running]), np.array([m.mean_error for m in running])
         series.append((label, colour, counts, mean, error))
     return series
-
-
-def _first(n: int) -> int:
-    """Return the number of samples where running estimates of n samples begin."""
-    return max(2, min(FIRST_SHOWN, n // 2))
 
 
 NAMED = 8  # parameters that have a colour of their own

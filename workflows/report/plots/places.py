@@ -19,6 +19,7 @@ from workflows.report.plots.figure import (
     LEGEND,
     PLAIN,
     axes,
+    figure_of,
     finished,
     grid,
     text_of,
@@ -102,19 +103,10 @@ def agreement(one: xr.Dataset) -> Axes:
     rows = displacements(one)
     measured, predicted, case = (one[name].to_numpy()[rows] for name in ("measured", "predicted", "datum_case"))
     size, unit = scale(float(np.abs(measured).max()), "m")
-    for k, name in enumerate(one["case"].values):
-        here = case == k
-        if here.any():
-            colour = COLOURS[k % len(COLOURS)]
-            ax.plot(
-                predicted[here] / size,
-                measured[here] / size,
-                ".",
-                ms=4,
-                alpha=0.7,
-                color=colour,
-                label=text_of(str(name)),
-            )
+    for k in np.unique(case).astype(int):
+        x, y = predicted[case == k] / size, measured[case == k] / size
+        name = text_of(str(one["case"].values[k]))
+        ax.plot(x, y, ".", ms=4, alpha=0.7, color=COLOURS[k % len(COLOURS)], label=name)
     both = np.concatenate([measured, predicted]) / size
     ends = [float(both.min()), float(both.max())]
     ax.plot(ends, ends, color=DARK, linewidth=0.8, zorder=1)
@@ -222,9 +214,7 @@ def pressure_map(dataset: xr.Dataset, tool: str, direction: Vector, ax: Axes | N
     if len(corners):  # the area in contact and the cells around it
         for values, limit in ((x[corners], ax.set_xlim), (y[corners], ax.set_ylim)):
             limit(float(values.min()), float(values.max()))
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    figure.colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
+    figure_of(ax).colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
     ax.set_aspect("equal")
     return finished(ax, f"{AXES[int(across[0])]} (mm)", f"{AXES[int(across[1])]} (mm)")
 

@@ -16,6 +16,7 @@ from workflows.report.plots.figure import (
     HIGH,
     PLAIN,
     axes,
+    figure_of,
     finished,
     rows,
     span,
@@ -59,8 +60,7 @@ def pairs(
     """
     names, n = list(columns), len(columns)
     first = axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
-    figure = first.get_figure(root=True)
-    assert figure is not None
+    figure = figure_of(first)
     first.remove()
     # Places by hand: a layout that looks at every label takes longer than all densities.
     figure.set_layout_engine(None)

@@ -11,7 +11,7 @@ import numpy as np
 from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
 from forward.words import duration, number, power_of_ten, with_error
 from uq.estimators.estimate import single
-from uq.findings import DIGITS, NOT_KNOWN
+from uq.findings import NOT_KNOWN
 from workflows.report.blocks import CURVE, Answer, Block, Card, Text, curve_of, smooth
 from workflows.report.section import Results, section
 from workflows.report.sections.cost import reduced_card
@@ -103,8 +103,7 @@ def forward(results: Results) -> Card:
         curve = None
         if spread is not None and spread.curve is not None:
             curve = curve_of(*spread.curve, spread.inside, unit, float(one["mean"]))
-        failed = results.meshes_unknown.get(output)
-        shown = size(value, unit, DIGITS) if failed else quantity(value, whole(errors), unit)
+        shown = results.value(output, value, whole(errors))
         answers.append(Answer(called(results, output), shown, lines, curve))
     return Card(question, answers)
 
@@ -186,14 +185,12 @@ def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
             continue
         effects = one[name].to_numpy()
         names = [spoken(str(p)) for p in one["parameter"].to_numpy()]
+        if name == "derivative_per_std" and not sampled:
+            moved = {names[i]: float(effects[i]) for i in np.argsort(-np.abs(effects))[:DRIVERS]}
+            by = (f"{parameter} by {'+' if x > 0 else ''}{size(x, unit)}" for parameter, x in moved.items())
+            yield f"moved, by one standard deviation of: {', '.join(by)}"
+            return
         if name == "derivative_per_std":
-            if not sampled:
-                largest = np.argsort(-np.abs(effects))[:DRIVERS]
-                moved = (
-                    f"{names[i]} by {'+' if effects[i] > 0 else ''}{size(float(effects[i]), unit)}" for i in largest
-                )
-                yield f"moved, by one standard deviation of: {', '.join(moved)}"
-                return
             effects = effects**2 / max(float((effects**2).sum()), 1e-300)
         order = [i for i in np.argsort(-effects)[:DRIVERS] if effects[i] >= SAID]
         if order and np.isfinite(effects).all():

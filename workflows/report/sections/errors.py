@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import and_error, margin, quantity, size, spoken
+from forward.readable import and_error, margin, size, spoken
 from forward.words import NONE, duration, number
 from uq.estimators.estimate import estimate_of, holds, single
-from uq.findings import DIGITS, NOT_KNOWN, only_rounding
+from uq.findings import NOT_KNOWN, only_rounding
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.section import Results, section, written
@@ -118,20 +118,14 @@ def table(results: Results, names: list[str]) -> Table:
         of_output, unit = results.of(output), results.unit(output)
         for name in names:
             one = single(of_output, name)
-            value, error = one.value, one.mesh
-            total = abs(error) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
-            rows.append(
-                (
-                    f"{ESTIMATES[name]} of {output}",
-                    size(value, unit, DIGITS)
-                    if results.meshes_unknown.get(output)
-                    else quantity(value, total if np.isfinite(total) else one.error, unit),
-                    margin(one.error, unit, like=value),
-                    "not known" if np.isnan(error) else and_error(error, one.doubt, unit, like=value),
-                    margin(total, unit, like=value),
-                    NONE if np.isnan(error) else and_error(one.corrected, one.left, unit),
-                )
-            )
+            total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
+            value = results.value(output, one.value, total if np.isfinite(total) else one.error)
+            sampling, whole = (margin(error, unit, like=one.value) for error in (one.error, total))
+            of_mesh, corrected = "not known", NONE
+            if np.isfinite(one.mesh):
+                of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
+                corrected = and_error(one.corrected, one.left, unit)
+            rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
     head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")
     return Table(head, rows)
 
@@ -197,7 +191,13 @@ def meshes(results: Results) -> Iterator[Block]:
     )
     for output in results.outputs:
         yield Heading(output, level=3)
-        yield Text(rates(results, output))
+        of = results.of(output)
+        weak, strong, cost = (float(of[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
+        yield Text(
+            f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, "
+            f"and the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 confirms that the sum "
+            "over the meshes telescopes."
+        )
         yield differences(results, output)
         yield Pictures.of(
             (plots.mesh_variance(dataset, output), f"Variance of {output} and of its difference between meshes."),
@@ -222,17 +222,6 @@ def differences(results: Results, output: str) -> Table:
         text = written(here, "difference_mean", results.unit(output))
         rows.append((f"{level}", text, *(number(float(here[name]), 3) for name in rest.values())))
     return Table(("level", "mean of the difference", *rest), rows)
-
-
-def rates(results: Results, output: str) -> str:
-    """The rates of convergence of an output, in words."""
-    of_output = results.of(output)
-    weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
-    return (
-        f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "
-        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 confirms that the sum over the "
-        "meshes telescopes."
-    )
 
 
 @section("probability", "mesh_checked")
