@@ -169,6 +169,11 @@ class Inversion(StudyKind):
         found: ModelSpec = named("workflows.studies.predicted:spec")(self)
         return found
 
+    @property
+    def predicted_by(self) -> int:
+        """Number of solves for what is predicted, beside the first, for the posterior as for the prior."""
+        return 0 if self.predict is None else self.predict.solves(field=self.field)
+
     @cached_property
     def reduced(self) -> dict[str, Reduced]:
         """The reduced models that stand for the load cases of a specimen, by name, or for the model, as "".
@@ -255,7 +260,7 @@ class Inversion(StudyKind):
             return (1 + method.reduced.solves) * sum(measurement is not None for measurement in self.measurements)
         each = method.solves(len(self.names), field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
-        more = 0 if self.predict is None else 1 + self.predict.solves(field=field)
+        more = 0 if self.predict is None else 1 + self.predicted_by
         count = sum(measurement is not None for measurement in self.measurements)
         return (each + more) * count + more
 

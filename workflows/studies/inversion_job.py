@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -139,12 +139,19 @@ def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[F
     return finer_meshes(model, start)
 
 
-def _judged(study: Inversion, made: _Made, found: xr.Dataset) -> xr.Dataset:
-    """Add what is to be said of the results; on rank 0."""
-    found = judged(found, study)
-    if study.specimen is None and not has_mesh(study.model):
-        add(found, *of_answers(made.model, study.inputs))
-    return found
+def _written(study: Inversion, made: _Made) -> dict[str, Any]:
+    """Return what every job of an inversion leaves beside its results."""
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = judged(found, study)
+        if study.specimen is None and not has_mesh(study.model):
+            add(found, *of_answers(made.model, study.inputs))
+        return found
+
+    def texts(found: xr.Dataset) -> dict[str, str]:
+        return {BATCH: batch_table(found)}
+
+    return {"labelled": labelled, "arviz_groups": partial(arviz_groups, study), "texts": texts}
 
 
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
@@ -252,16 +259,7 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
             raise SolveError("; ".join(f"{name}: {one.reason}" for name, one in zip(names, outcomes, strict=True)))
         return dataset(study, outcomes, made.vertices)
 
-    return TasksJob(
-        names,
-        invert,
-        rows.add,
-        forget,
-        results,
-        labelled=partial(_judged, study, made),
-        arviz_groups=partial(arviz_groups, study),
-        texts=lambda found: {BATCH: batch_table(found)},
-    )
+    return TasksJob(names, invert, rows.add, forget, results, **_written(study, made))
 
 
 def _expanded(
@@ -366,15 +364,7 @@ def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
             found = _with_predictions(study, found, predicted, on, before)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
-    return MethodJob(
-        seen.model,
-        others,
-        task,
-        recorders,
-        labelled=partial(_judged, study, made),
-        arviz_groups=partial(arviz_groups, study),
-        texts=lambda found: {BATCH: batch_table(found)},
-    )
+    return MethodJob(seen.model, others, task, recorders, **_written(study, made))
 
 
 def _itself(model: ForwardModel) -> ForwardModel:

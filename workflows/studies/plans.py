@@ -203,17 +203,17 @@ def _predicted(study: Inversion) -> list[str]:
         return []
     names = [output.name for output in study.predicted.returned]
     more = f" and {len(names) - LISTED} others" if len(names) > LISTED else ""
-    solves = 1 + study.predict.solves(field=study.field)
+    solves = 1 + study.predicted_by
     return [f"predicts    {', '.join(names[:LISTED])}{more}, by {solves} solves, and as many of the prior"]
 
 
 def _seconds_of_predictions(study: Inversion) -> float:
     """Predict the processor time (s) of what is predicted."""
     cost = None if study.predict is None else study.predicted.cost()
-    if cost is None or study.predict is None:
+    if cost is None:
         return 0.0
     own = 0.0 if study.field else cost.tangents_of_sample(len(study.inputs.names))
-    return 2 * (cost.textbook + study.predict.solves(field=study.field) * (cost.sample + own))
+    return 2 * (cost.textbook + study.predicted_by * (cost.sample + own))
 
 
 def _own_seconds(study: Inversion, data: int) -> float:

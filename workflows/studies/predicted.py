@@ -43,7 +43,8 @@ LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 
 def spec(study: Inversion) -> ModelSpec:
     """Return the model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
-    asked = _asked(study)
+    asked = study.predict
+    assert asked is not None
     if isinstance(study.model, Specimen):
         own = study.model.over(ranges(study.parameters))
         known = {case.name: case for case in own.cases}
@@ -53,11 +54,6 @@ def spec(study: Inversion) -> ModelSpec:
     kept = {name: getattr(study.model, name) for name in type(study.model).model_fields}
     made: ModelSpec = type(study.model).model_validate(kept | asked.model)
     return made.over(ranges({name: one for name, one in study.parameters.items() if name in made.scalars}))
-
-
-def _asked(study: Inversion) -> Predict:
-    assert study.predict is not None
-    return study.predict
 
 
 def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:
@@ -80,7 +76,8 @@ def _unknown(study: Inversion) -> tuple[str, ...]:
 
 def mistakes(study: Inversion) -> Iterator[Mistake]:
     """Find what cannot be predicted."""
-    asked, specimen = _asked(study), isinstance(study.model, Specimen)
+    asked, specimen = study.predict, isinstance(study.model, Specimen)
+    assert asked is not None
     if specimen and asked.model:
         message = "a specimen is predicted in load cases and at places, expected predict.cases and predict.observed"
         yield ("predict", "model"), message, asked.model
@@ -175,8 +172,7 @@ def of_few(
     points = found["point"].to_numpy()[used][:, columns]
     kept = weights[used] / weights[used].sum()
     draws = Draws(names, points, kept, float(1 / (kept**2).sum()))
-    asked, seed = _asked(study), study.method.seed
-    after = predict.of_draws(draws, evaluate, asked.solves(field=False), seed)
+    after = predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
     looked = study.method.treatment is not None and has_mesh(study.predicted)
     mesh = predict.mesh_error_at(draws, of_mesh) if looked and not np.isnan(after.mean).all() else np.nan
     return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
@@ -188,7 +184,7 @@ def prior_band(study: Inversion, evaluate: Evaluate) -> Band:
     points = study.inputs.points(sobol_points(study.method.seed, 0, 0, POINTS, len(every)))
     values = points[study.inputs.allowed(points)][:, [every.index(name) for name in names]]
     draws = Draws(names, values, np.full(len(values), 1 / len(values)), float(len(values)))
-    return predict.of_draws(draws, evaluate, _asked(study).solves(field=False), study.method.seed)
+    return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
 
 
 def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> Callable[[str], FieldPredictions]:
@@ -202,7 +198,7 @@ def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> Callable
         The model of what is predicted, whose solves are kept under a name.
     """
     prior = study.model.fields[0].prior(study.model.body)
-    pairs, seed, size = _asked(study).solves(field=True) // 2, study.method.seed, len(parameters(study))
+    pairs, seed, size = study.predicted_by // 2, study.method.seed, len(parameters(study))
 
     @cache
     def before() -> Band:
