@@ -149,7 +149,7 @@ def mesh_error_at(draws: Draws, evaluate: Evaluate) -> FloatArray:
 # --- fields ----------------------------------------------------------------------------------------------------------
 
 
-def of_field(
+def _of_field(
     model: ForwardModel,
     mean: FloatArray,
     covariance: Callable[[FloatArray], FloatArray],
@@ -158,22 +158,9 @@ def of_field(
     *,
     of_mesh: bool = False,
 ) -> tuple[Band, FloatArray, FloatArray]:
-    """Return what a normal distribution of a field says on the outputs of a model, their gradients, and mesh errors.
+    """Return what N(m̂ (N,), Γ) of a field says on the k outputs of a model, their gradients, and mesh errors (k,).
 
-    Parameters
-    ----------
-    model
-        The model; all of its parameters are values of the field.
-    mean
-        m̂ (N,).
-    covariance
-        Multiplies Γ with (k, N).
-    deviations
-        Draws (S, N) of N(0, Γ), with which it is seen what the gradients leave out.
-    weighted
-        Values (n, N) with weights (n,) that correct the normal distribution; None where it is right.
-    of_mesh
-        Whether the error of the mesh is estimated.
+    The covariance multiplies Γ with (k, N); draws (S, N) of N(0, Γ) are the deviations. Others as of `after_field`.
     """
     count, pairs = len(model.outputs), len(deviations)
     mesh = np.full(count, np.nan)
@@ -248,7 +235,7 @@ def before_field(model: ForwardModel, prior: Prior, size: int, pairs: int, seed:
     def covariance(g: FloatArray) -> FloatArray:
         return prior.root(prior.root_transposed(g))
 
-    return of_field(model, np.zeros(size), covariance, deviations(prior, size, pairs, seed))[0]
+    return _of_field(model, np.zeros(size), covariance, deviations(prior, size, pairs, seed))[0]
 
 
 def after_field(
@@ -276,12 +263,12 @@ def after_field(
     seed
         Of these.
     weighted
-        As in `of_field`.
+        Values (n, N) with weights (n,) that correct the normal distribution; None where it is right.
     of_mesh
         Whether the error of the mesh is estimated.
     """
     drawn = deviations(found.prior, len(found.mean), pairs, seed, found)
-    after, gradients, mesh = of_field(model, found.mean, found.covariance, drawn, weighted, of_mesh=of_mesh)
+    after, gradients, mesh = _of_field(model, found.mean, found.covariance, drawn, weighted, of_mesh=of_mesh)
     whole = (found.prior.root_transposed(gradients) ** 2).sum(axis=1)
     left = np.einsum("kn,kn->k", gradients, found.covariance(gradients))
     share = np.divide(whole - left, whole, out=np.full(len(whole), np.nan), where=whole > 0)

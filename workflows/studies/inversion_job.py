@@ -300,7 +300,7 @@ def _inverting_field(
     model = cast("SpecimenModel", made.model)
     prior = study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
-    predicting: Callable[[str], FieldPredictions] | None = None
+    predicting: FieldPredictions | None = None
     if study.predict is not None:
         other = _predicted(study, ensemble)
         predicting = named("workflows.studies.predicted:of_field")(study, lambda name: states_of(name, other))
@@ -308,7 +308,7 @@ def _inverting_field(
     def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
         data, errors = problem.data, problem.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
-        predict = None if predicting is None else predicting(name)
+        predict = None if predicting is None else partial(predicting, name)
         return invert_field(posterior, problem, Vertices(offset, prior.matern.mass), predict)
 
     return invert

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from uq.evaluation.request import Evaluate
     from workflows.studies.inversion import Inversion, Predict
 
-FieldPredictions = Callable[["LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
+# From the name of a data set, the posterior of its field, and what corrects that.
+FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
 ACTING = ("clamp", "displacements", "loads")
 POINTS = 4096  # that stand for the prior
 LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
@@ -187,8 +188,8 @@ def prior_band(study: Inversion, evaluate: Evaluate) -> Band:
     return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
 
 
-def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> Callable[[str], FieldPredictions]:
-    """Return what predicts from the posterior of a field of a data set, by its name.
+def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> FieldPredictions:
+    """Return what predicts from the posterior of a field of a data set.
 
     Parameters
     ----------
@@ -197,21 +198,18 @@ def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> Callable
     model
         The model of what is predicted, whose solves are kept under a name.
     """
-    prior = study.model.fields[0].prior(study.model.body)
+    prior, looked = study.model.fields[0].prior(study.model.body), study.method.treatment is not None
     pairs, seed, size = study.predicted_by // 2, study.method.seed, len(parameters(study))
 
     @cache
     def before() -> Band:
         return predict.before_field(model(f"prior, {PREDICTED}"), prior, size, pairs, seed)
 
-    def of(name: str) -> FieldPredictions:
-        def record(found: LowRankPosterior, weighted: tuple[FloatArray, FloatArray] | None) -> Record:
-            there, looked = model(f"{name}/{PREDICTED}"), study.method.treatment is not None
-            return predict.after_field(there, found, before(), pairs, seed, weighted, of_mesh=looked)
+    def record(name: str, found: LowRankPosterior, weighted: tuple[FloatArray, FloatArray] | None) -> Record:
+        there = model(f"{name}/{PREDICTED}")
+        return predict.after_field(there, found, before(), pairs, seed, weighted, of_mesh=looked)
 
-        return record
-
-    return of
+    return record
 
 
 # --- what is said ----------------------------------------------------------------------------------------------------
