@@ -163,6 +163,11 @@ class Specimen(Solid):
         return {case.name: {output.name: output.unit for output in case.outputs} for case in self.cases}
 
     @property
+    def observable(self) -> dict[str, tuple[str, ...]]:
+        """Load cases by name, with the names of what can be observed in them: components of displacements, outputs."""
+        return {name: (*AXES, *outputs) for name, outputs in self.measurable.items()}
+
+    @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number of every case that can be made a parameter, by its path; equal paths are one parameter."""
         found: dict[str, Scalar] = {}

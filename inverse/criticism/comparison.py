@@ -29,6 +29,7 @@ from inverse.criticism.assessment import Assessment, Points
 from inverse.criticism.stacking import stacking
 from inverse.criticism.verdict import Verdict
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
+from inverse.data.measurements import Measurements
 from inverse.data.neighbours import DRAWS, agreement, neighbours
 from inverse.low_dimensional.posterior import Posterior
 from uq.inputs.random_parameters import Inputs
@@ -59,48 +60,6 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Data:
-    """The measurements of one specimen, and what else is to be predicted.
-
-    Attributes
-    ----------
-    values
-        y (m,), the first m outputs of the model.
-    sigma
-        Their standard deviations (m,), if known.
-    tests
-        Name of the test of each output (M,).
-    at
-        Where in the test (M,).
-    places
-        Positions (m, k) of the data in the space in which neighbours are found; by default `at`.
-    kinds
-        Numbers (m,) of what can be compared; by default of the tests.
-    """
-
-    values: FloatArray
-    sigma: FloatArray | None
-    tests: tuple[str, ...]
-    at: FloatArray
-    places: FloatArray | None = None
-    kinds: NDArray[np.int64] | None = None
-
-    @property
-    def measured(self) -> tuple[str, ...]:
-        """Names of the tests that were measured."""
-        return tuple(dict.fromkeys(self.tests[: self.values.size]))
-
-    @property
-    def sorted(self) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.int64]]:
-        """Numbers (m,) of the data in an order independent of the rows, and their places and kinds in it."""
-        m = self.values.size
-        places = self.at[:m, None] if self.places is None else self.places
-        kinds = np.unique(self.tests[:m], return_inverse=True)[1] if self.kinds is None else self.kinds
-        order = np.lexsort((*places.T, kinds))
-        return order, places[order], kinds[order]
-
-
-@dataclass(frozen=True)
 class Criticism:
     """What the data say about one model.
 
@@ -124,7 +83,7 @@ class Criticism:
     correlation: float
 
 
-def criticise(found: Points, posterior: Posterior, data: Data) -> Criticism:
+def criticise(found: Points, posterior: Posterior, data: Measurements) -> Criticism:
     """Compare the residuals of a model with its predictions of them."""
     from scipy.stats import chi2
 
@@ -143,9 +102,11 @@ def criticise(found: Points, posterior: Posterior, data: Data) -> Criticism:
     ]
     whole = np.full((found.weights.size, posterior.data.size), -np.inf)
     whole[used] = pointwise
-    order, places, kinds = data.sorted
-    beside = neighbours(places, kinds)
     m = posterior.data.size
+    seen = data.seen()
+    places = np.nan_to_num(seen.places)
+    order = np.lexsort((*places.T, seen.kinds))  # independent of the rows
+    beside = neighbours(places[order], seen.kinds[order])
     misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
     drawn = np.sort(agreement(errors, beside))
@@ -158,7 +119,7 @@ def criticise(found: Points, posterior: Posterior, data: Data) -> Criticism:
 
 def comparison(
     candidates: Mapping[str, Candidate],
-    data_groups: Mapping[str, Data],
+    data_groups: Mapping[str, Measurements],
     posteriors: Mapping[Pair, Posterior],
     stated: Mapping[Pair, Assessment],
     points: Mapping[Pair, Points],
@@ -295,13 +256,13 @@ def _chance_errors(P: FloatArray, errors: FloatArray) -> FloatArray:
 def _predictions(
     names: list[str],
     group: str,
-    data: Data,
+    data: Measurements,
     posteriors: Mapping[Pair, Posterior],
     points: Mapping[Pair, Points],
     P: FloatArray,
 ) -> dict[str, tuple[Any, Any]]:
     """Outputs of one group without noise, by each model and by all, beside the data."""
-    m, M = data.values.size, len(data.tests)
+    m, M = len(data.seen()), len(data)
     mean, std = np.empty((2, len(names), M))
     bands = np.empty((len(QUANTILES), len(names), M))
     for k, name in enumerate(names):
@@ -317,9 +278,9 @@ def _predictions(
     sigma = next(posteriors[name, group].sigma for name in names)
     return {
         "output_group": ("output", np.full(M, group)),
-        "output_test": ("output", np.array(data.tests)),
-        "output_at": ("output", data.at),
-        "measured": ("output", np.concatenate([data.values, missing])),
+        "output_test": ("output", data.tests),
+        "output_at": ("output", data.positions),
+        "measured": ("output", data.values),
         "sigma": ("output", np.concatenate([sigma, missing])),
         "prediction_mean": (("model", "output"), mean),
         "prediction_std": (("model", "output"), std),
@@ -369,12 +330,14 @@ def _constants(
     }
 
 
-def _pointwise(names: list[str], data_groups: Mapping[str, Data], critics: Mapping[Pair, Criticism]) -> tuple[Any, Any]:
+def _pointwise(
+    names: list[str], data_groups: Mapping[str, Measurements], critics: Mapping[Pair, Criticism]
+) -> tuple[Any, Any]:
     """Ln of the density of every datum at every point of its group; NaN where nothing was measured."""
     count = max(critic.pointwise.shape[0] for critic in critics.values())
     parts = []
     for group, data in data_groups.items():
-        part = np.full((len(names), count, len(data.tests)), np.nan)
+        part = np.full((len(names), count, len(data)), np.nan)
         for k, name in enumerate(names):
             found = critics[name, group].pointwise
             part[k, : found.shape[0], : found.shape[1]] = found
@@ -384,7 +347,7 @@ def _pointwise(names: list[str], data_groups: Mapping[str, Data], critics: Mappi
 
 def _meshes(
     names: list[str],
-    data_groups: Mapping[str, Data],
+    data_groups: Mapping[str, Measurements],
     parameters: list[str],
     posteriors: Mapping[Pair, Posterior],
     meshes: Mapping[Pair, MeshFound],
@@ -395,7 +358,7 @@ def _meshes(
     whys, added, fixed = np.full(shape, "", dtype=object), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     shift, left, errors = np.full(std.shape, np.nan), np.full(std.shape, np.nan), []
     for g, (group, data) in enumerate(data_groups.items()):
-        error = np.full((len(names), len(data.tests)), np.nan)
+        error = np.full((len(names), len(data)), np.nan)
         for k, name in enumerate(names):
             found = meshes[name, group]
             whys[k, g], added[k, g] = found.why, found.log_evidence

@@ -18,8 +18,8 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.table import DataError, Table, needed
-from inverse.data.units import factor, split_head
+from inverse.data.table import DataError, Table, needed, others
+from inverse.data.units import factor
 
 CLOSE = 1e-6  # of the largest number: rows this near to a step are at it
 
@@ -69,48 +69,44 @@ def as_rows(table: Table, name: str, steps: Steps) -> Table:
     """
     scales = _scales(table, name, steps)
     places = steps.places
-    heads = {split_head(head)[0]: head for head in table.columns}
-    where = [column for column in heads if column in places]
+    where = [column for column in table.columns if column in places]
     rows, lines, wrong = [], [], []
     before: tuple[int, int] | None = None  # step and line of the row before
     first: dict[tuple[int, str, str], int] = {}  # lines by what was measured
     for row, line in zip(table.rows, table.lines, strict=True):
-        at = _step(row, f"{name}: line {line}", {column: heads[column] for column in where}, places, scales)
+        at = _step(row, f"{name}: line {line}", where, places, scales)
         if isinstance(at, str):
             wrong.append(at)
             continue
-        if before is not None and at < before[0] and "step" not in heads:
-            head = heads[where[0]]
-            message = f"{where[0]} = {row[head]} after that of line {before[1]}, which is farther along the path"
+        if before is not None and at < before[0] and "step" not in table.columns:
+            message = f"{where[0]} = {row[where[0]]} after that of line {before[1]}, which is farther along the path"
             wrong.append(f"{name}: line {line}: {message}; expected loading only, in order")
         before = at, line
-        for output in (one for one in steps.units if one in heads and row[heads[one]]):
-            key = at, output, row[heads[output]]
+        for output in (one for one in steps.units if row.get(one)):
+            key = at, output, row[output]
             if key in first:
                 message = f"'{output}' of line {first[key]} again, expected each measurement once"
                 wrong.append(f"{name}: line {line}: {message}")
             first.setdefault(key, line)
-        for output in (one for one in steps.units if one in heads and row[heads[one]]):
-            sigma = next((heads[one] for one in (f"sigma_{output}", "sigma") if one in heads), None)
+            sigma = next((one for one in (f"sigma_{output}", "sigma") if one in row), None)
             rows.append(
                 {
                     "output": f"{output}.{at}",
-                    "value": _scaled(row[heads[output]], scales[heads[output]]),
+                    "value": _scaled(row[output], scales[output]),
                     "sigma": "" if sigma is None else _scaled(row[sigma], scales[sigma]),
                 }
             )
             lines.append(line)
     if wrong:
-        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-        raise DataError(f"{wrong[0]}{more}")
+        raise DataError(f"{wrong[0]}{others(len(wrong) - 1)}")
     return replace(table, columns=("output", "value", "sigma"), rows=rows, lines=lines)
 
 
 def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
     """Return how many SI units a number in each column is, by its head."""
     scales, wrong, places = {}, [], steps.places
-    columns = [split_head(head) for head in table.columns]
-    for head, (column, unit) in zip(table.columns, columns, strict=True):
+    columns = table.units.items()
+    for column, unit in columns:
         of = column.removeprefix("sigma_")
         if column in places:
             si = places[column][0]
@@ -127,7 +123,7 @@ def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
             wrong.append(f"{name}: unknown column '{column}'; {nearest(column, known)}")
             continue
         try:
-            scales[head] = 1.0 if unit is None else factor(unit, si)
+            scales[column] = 1.0 if unit is None else factor(unit, si)
         except ValueError as error:
             wrong.append(f"{name}: column '{column}' has {error}")
     named = [column for column, _ in columns]
@@ -150,16 +146,16 @@ def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
 def _step(
     row: Mapping[str, str],
     label: str,
-    where: Mapping[str, str],
+    where: Sequence[str],
     places: Mapping[str, tuple[str, FloatArray]],
     scales: Mapping[str, float],
 ) -> int | str:
     """Return the step of a row, from 1, or what is wrong with its place."""
     near = np.ones(len(places["step"][1]), dtype=bool)
     told = []
-    for column, head in where.items():
+    for column in where:
         try:
-            value = needed(row[head], column) * scales[head]
+            value = needed(row[column], column) * scales[column]
         except ValueError as error:
             return f"{label}: {error}"
         values = places[column][1]
@@ -167,14 +163,14 @@ def _step(
         told.append(f"{column} = {value:g}")
     if near.sum() == 1:
         return int(near.argmax()) + 1
-    known = ", ".join(f"{value:g}" for value in places[next(iter(where))][1])
+    known = ", ".join(f"{value:g}" for value in places[where[0]][1])
     ways = "no step of the model" if not near.any() else "more than one step of the model"
     hint = ""
-    for column, head in where.items():
-        values, given = places[column][1], float(row[head])
+    for column in where:
+        values, given = places[column][1], float(row[column])
         if places[column][0] == "m" and (np.abs(values - 1e-3 * given) <= CLOSE * np.abs(values).max()).any():
             hint = f" (in millimetres? then its head is '{column} [mm]', and all heads state units)"
-    return f"{label}: {', '.join(told)} is {ways}; its steps are {next(iter(where))} = {known}{hint}"
+    return f"{label}: {', '.join(told)} is {ways}; its steps are {where[0]} = {known}{hint}"
 
 
 def _scaled(text: str, scale: float) -> str:

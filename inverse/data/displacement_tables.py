@@ -24,7 +24,7 @@ from forward.settings import nearest
 from inverse.data.measurements import AXES, SAME, Measurements
 from inverse.data.readings import Units, split
 from inverse.data.table import DataError, Table, needed, numeric, others, read_table
-from inverse.data.units import factor, split_head
+from inverse.data.units import factor
 
 MOTION, ERRORS = ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (*AXES, *MOTION, "sigma", *ERRORS, "case")
@@ -48,12 +48,11 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         With every kind of mistake in the file.
     """
     name, cases = path.name, tuple(known)
-    table, readings = split(read_table(path), name, known)
+    table, readings = split(read_table(path).with_units(name), name, known)
     readings = replace(readings, source=table.source, truth={one: value.strip('"') for one, value in table.truth})
     if not table.rows:
         return readings
-    found, unit = _without_units(table, name, unit)
-    columns = found.columns
+    unit, columns, rows = _metres(table, name, unit), table.columns, table.rows
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
     ]
@@ -64,8 +63,7 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         wrong.append(f"{name}: no column 'case', expected one where there are several load cases: {', '.join(cases)}")
     if wrong:
         raise DataError(*wrong)
-    rows = found.rows
-    labels = tuple(f"{name}: line {n}" for n in found.lines)
+    labels = tuple(f"{name}: line {n}" for n in table.lines)
     numbers: dict[str, FloatArray] = {}
     mistakes = []
     for column in (*AXES, *MOTION, "sigma", *ERRORS):
@@ -102,14 +100,13 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
     ).with_rows(readings)
 
 
-def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, float]:
-    """Return a table whose heads are names alone, and m per unit of its lengths."""
-    heads = [split_head(head) for head in table.columns]
-    lengths = [(column, said) for column, said in heads if column != "case"]
+def _metres(table: Table, name: str, unit: float | None) -> float:
+    """Return m per unit of the lengths of a table, which its heads state, or the study."""
+    lengths = [(column, table.units[column]) for column in table.columns if column != "case"]
     said = {unit for _, unit in lengths}
     stated = sorted(one for one in said if one is not None)
     if not stated:
-        return table, 1.0 if unit is None else unit
+        return 1.0 if unit is None else unit
     if len(said) > 1:
         words = ", ".join(column if one is None else f"{column} [{one}]" for column, one in lengths)
         raise DataError(f"{name}: mixed units: {words}; expected the same unit in all heads, or in none")
@@ -121,12 +118,7 @@ def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, 
         raise DataError(
             f"{name}: its heads state {stated[0]}, but the study says {unit:g} m per unit; expected one of them"
         )
-    names = [column for column, _ in heads]
-    twice = next((column for column in names if names.count(column) > 1), None)
-    if twice is not None:
-        raise DataError(f"{name}: several columns '{twice}', expected different names")
-    rows = [dict(zip(names, row.values(), strict=True)) for row in table.rows]
-    return replace(table, columns=tuple(names), rows=rows), scale
+    return scale
 
 
 def _number(text: str, column: str) -> float:

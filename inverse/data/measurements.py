@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ AXES = ("x", "y", "z")
 FAR = 0.02  # of the extent of a body: median distance of points from which on they may belong to another
 SAME = 1e-9  # of the extent of all points: distance within which points coincide
 LISTED = 5  # points that do not belong to a body
-COLUMNS = ("values", "sigma", "cases", "axes", "names", "labels", "places", "along", "points", "moved")
+COLUMNS = ("values", "sigma", "cases", "axes", "names", "labels", "places", "along", "points", "moved", "at")
 Ints = NDArray[np.int64]
 
 
@@ -32,7 +32,8 @@ class Measurements:
     Attributes
     ----------
     values, sigma
-        What was measured (m,), and the standard deviations (m,) of the errors, in SI units; NaN if unknown.
+        What was measured (m,), and the standard deviations (m,) of the errors, in SI units; NaN if unknown, and of what
+        is predicted only.
     cases
         Number (m,) of the part of the data that each belongs to, whose information is also shown separately.
     axes, names
@@ -47,6 +48,8 @@ class Measurements:
         of outputs.
     points, moved
         Number (m,) of the point in its file, -1 of outputs, and how far (m,) it was moved onto the body (m).
+    at
+        Where (m,) in a test of a material: stretch, or amount of shear; NaN of others.
     some
         Whether these are some outputs of a model, by their numbers `axes`: a specimen is observed where they are.
     source
@@ -76,6 +79,7 @@ class Measurements:
     along: FloatArray
     points: Ints
     moved: FloatArray
+    at: FloatArray
     some: bool = False
     source: tuple[str, ...] = ()
     truth: dict[str, Any] = field(default_factory=dict)
@@ -97,6 +101,7 @@ class Measurements:
         parts: Sequence[str] = (),
         places: FloatArray | None = None,
         points: Ints | None = None,
+        at: FloatArray | None = None,
         **more: Any,
     ) -> Measurements:
         """Return numbers (m,) at places (m, 3) along the axes of the body, or outputs, which are measured at none."""
@@ -105,8 +110,8 @@ class Measurements:
         along, numbers = np.eye(4, 3)[np.minimum(which, 3)], np.arange(m) if points is None else points
         if places is None:
             places, along, numbers = np.full((m, 3), np.nan), np.zeros((m, 3)), np.full(m, -1)
-        moved = np.zeros(m)
-        return cls(values, sigma, of, which, name, label, tuple(parts), places, along, numbers, moved, **more)
+        rest = np.zeros(m), np.full(m, np.nan) if at is None else at
+        return cls(values, sigma, of, which, name, label, tuple(parts), places, along, numbers, *rest, **more)
 
     @classmethod
     def of_points(
@@ -126,6 +131,23 @@ class Measurements:
         rows = (displacements.ravel(), sigma.ravel(), cases[points], axes, names, words, parts, places[points], points)
         return cls.of(*rows, **more)
 
+    @classmethod
+    def of_tests(
+        cls,
+        values: FloatArray,
+        sigma: FloatArray,
+        tests: Sequence[str],
+        at: FloatArray,
+        places: FloatArray | None = None,
+    ) -> Measurements:
+        """Return stresses (m,) of tests of a material, by name, at stretches or amounts of shear `at` (m,).
+
+        Their places (m, k) are those in which neighbours are found, by default `at`.
+        """
+        parts, cases = np.unique(np.array(tests, dtype=np.str_), return_inverse=True)
+        where = at[:, None] if places is None else places
+        return cls.of(values, sigma, cases, np.zeros_like(cases), parts=parts.tolist(), places=where, at=at)
+
     def __len__(self) -> int:
         """Return their number."""
         return len(self.values)
@@ -133,9 +155,27 @@ class Measurements:
     # --- what others need of data ------------------------------------------------------------------------------------
 
     @property
-    def which(self) -> tuple[int, ...] | None:
-        """Numbers (m,) of the outputs of the model that were measured; None if these are all, in order."""
-        return tuple(self.axes.tolist()) if self.some else None
+    def which(self) -> Ints | slice:
+        """The outputs of the model that were measured: numbers (m,), or all of a slice."""
+        return self.axes if self.some else slice(None)
+
+    @property
+    def tests(self) -> NDArray[np.str_]:
+        """Names (m,) of the parts."""
+        return np.array(self.parts, dtype=np.str_)[self.cases]
+
+    @property
+    def measured_tests(self) -> tuple[str, ...]:
+        """Names of the parts in which something was measured, in the order of the data."""
+        return tuple(dict.fromkeys(self.seen().tests.tolist()))
+
+    @property
+    def positions(self) -> FloatArray:
+        """Where (m,) in its part each is: in a test, or else its number."""
+        numbers = np.zeros(len(self))
+        for case in np.unique(self.cases):
+            numbers[self.cases == case] = np.arange((self.cases == case).sum())
+        return np.where(np.isfinite(self.at), self.at, numbers)
 
     @property
     def described(self) -> dict[str, FloatArray]:
@@ -194,6 +234,10 @@ class Measurements:
 
     # --- the same with something else --------------------------------------------------------------------------------
 
+    def seen(self) -> Measurements:
+        """Return those that were measured."""
+        return self.subset(np.isfinite(self.values))
+
     def subset(self, rows: NDArray[Any]) -> Measurements:
         """Return some of them, by number or mask."""
         return replace(self, **{name: vars(self)[name][rows] for name in COLUMNS})
@@ -205,6 +249,13 @@ class Measurements:
     def with_sigma(self, usual: FloatArray) -> Measurements:
         """Return the same with standard deviations (m,) where the file states none."""
         return replace(self, sigma=np.where(np.isfinite(self.sigma), self.sigma, usual))
+
+    def in_model(self, known: Mapping[str, Sequence[str]]) -> Measurements:
+        """Return displacements and outputs of load cases as a specimen numbers what it has in each of its own."""
+        pairs = [(case, name) for case, name in zip(self.tests.tolist(), self.names.tolist(), strict=True)]
+        order = list(known)
+        cases, axes = [order.index(case) for case, _ in pairs], [known[case].index(name) for case, name in pairs]
+        return replace(self, parts=tuple(order), cases=np.array(cases), axes=np.array(axes))
 
     def by_part(self, numbers: Ints) -> Measurements:
         """Return outputs of a model by the parts that have data in any data set: numbers (k,) of these, ascending."""

@@ -44,7 +44,7 @@ def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None)
     table = read_table(path)
     name = path.name
     if steps is not None and "output" not in table.columns:
-        table = as_rows(table, name, steps)
+        table = as_rows(table.with_units(name), name, steps)
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}"
         for column in table.columns

@@ -46,7 +46,37 @@ Degrees = Annotated[float, Field(ge=0, le=30)]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class Given(Settings):
+class _Motion(Settings):
+    """A rigid motion from the frame of a file to that of the body; lengths are in the unit of the file."""
+
+    kind: str
+    rotation: Vector = (0.0, 0.0, 0.0)
+    translation: Vector = (0.0, 0.0, 0.0)
+    matrix: tuple[tuple[float, float, float, float], ...] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motion is stated."""
+        return self.matrix is not None or any(self.rotation) or any(self.translation)
+
+    @model_validator(mode="after")
+    def _check(self) -> _Motion:
+        if self.matrix is None:
+            return self
+        if any(self.rotation) or any(self.translation):
+            raise ValueError("expected either matrix, or rotation and translation")
+        check_rigid(np.array(self.matrix))
+        return self
+
+    def at(self, unit: float) -> Rigid:
+        """Return the motion, in m."""
+        if self.matrix is None:
+            return Rigid(turned(self.rotation), unit * np.array(self.translation))
+        whole = np.array(self.matrix)
+        return Rigid(orthonormal(whole[:3, :3]), unit * whole[:3, 3])
+
+
+class Given(_Motion):
     """A known rigid motion from the frame of a file to that of the body; lengths are in the unit of the file.
 
     Parameters
@@ -63,9 +93,6 @@ class Given(Settings):
     """
 
     kind: Literal["given"] = "given"
-    rotation: Vector = (0.0, 0.0, 0.0)
-    translation: Vector = (0.0, 0.0, 0.0)
-    matrix: tuple[tuple[float, float, float, float], ...] | None = None
     rotation_std: Degrees = 0.0
     translation_std: Annotated[float, Field(ge=0)] = 0.0
 
@@ -73,22 +100,6 @@ class Given(Settings):
     def uncertain(self) -> bool:
         """Whether its errors are among those of the data."""
         return self.rotation_std > 0 or self.translation_std > 0
-
-    @model_validator(mode="after")
-    def _check(self) -> Given:
-        if self.matrix is None:
-            return self
-        if any(self.rotation) or any(self.translation):
-            raise ValueError("expected either matrix, or rotation and translation")
-        check_rigid(np.array(self.matrix))
-        return self
-
-    def at(self, unit: float) -> Rigid:
-        """Return the motion, in m."""
-        if self.matrix is None:
-            return Rigid(turned(self.rotation), unit * np.array(self.translation))
-        whole = np.array(self.matrix)
-        return Rigid(orthonormal(whole[:3, :3]), unit * whole[:3, 3])
 
 
 class Landmarks(Settings):
@@ -125,7 +136,7 @@ class Landmarks(Settings):
         return self
 
 
-class ToSurface(Settings):
+class ToSurface(_Motion):
     """The motion that takes the points of a file to the surface of the body; lengths are in the unit of the file.
 
     Parameters
@@ -140,51 +151,11 @@ class ToSurface(Settings):
     """
 
     kind: Literal["to-surface"] = "to-surface"
-    rotation: Vector = (0.0, 0.0, 0.0)
-    translation: Vector = (0.0, 0.0, 0.0)
-    matrix: tuple[tuple[float, float, float, float], ...] | None = None
     sigma: Positive | None = None
     uncertain: bool = False
 
-    @property
-    def start(self) -> Given:
-        """Where the search starts."""
-        return Given(rotation=self.rotation, translation=self.translation, matrix=self.matrix)
-
-    @model_validator(mode="after")
-    def _check(self) -> ToSurface:
-        _ = self.start  # with its mistakes
-        return self
-
 
 Registration = Annotated[Given | Landmarks | ToSurface, Field(discriminator="kind")]
-
-
-class UncertainMotion(Settings):
-    """What is uncertain of the rigid motions of a scan.
-
-    Parameters
-    ----------
-    root
-        Lᵀ of the registration, rows of rotations (rad) and translations (m); none if that is known.
-    between
-        Standard deviations (rad, m) of motions between the undeformed scan and that of each load case.
-    centre
-        About which it turns (m); by default the mean of the points.
-    """
-
-    root: tuple[tuple[float, float, float, float, float, float], ...] = ()
-    between: tuple[float, float] = (0.0, 0.0)
-    centre: tuple[float, float, float] | None = None
-
-    @classmethod
-    def of(cls, registered: Registered | None, between: tuple[float, float]) -> UncertainMotion | None:
-        """Return that of a registration, and of motions between scans (rad, m); None if nothing is uncertain."""
-        known = registered is None or not registered.uncertain
-        if known and not any(between):
-            return None
-        root = () if registered is None or known else tuple(map(tuple, registered.root.tolist()))
-        return cls(root=root, between=between, centre=None if registered is None else tuple(registered.centre.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,9 +303,9 @@ def _to_surface(
         raise DataError(
             f"{name}: registration: {len(places)} points, expected at least {LEAST} to fit them to a surface"
         )
-    start = how.start.at(unit)
+    start = how.at(unit)
     starts = [start]
-    if how.start == Given():
+    if not how.moves:
         there = start(places)
         shift = surface.middle - (there.min(axis=0) + there.max(axis=0)) / 2
         starts.append(Rigid(start.rotation, start.shift + shift))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from forward.findings import Finding
 from forward.model import FloatArray, SolveError
 from inverse.data.approximation_error import Whitening
-from inverse.data.registration import UncertainMotion
+from inverse.data.measurements import Measurements
 from inverse.data.rigid import Rigid, slopes
 from inverse.fields.low_rank import Spectrum
 from uq.evaluation.request import Evaluate, Request
@@ -65,31 +65,20 @@ class SharedMotion:
     project: Callable[[FloatArray], FloatArray] | None = None
 
     @classmethod
-    def of(
-        cls,
-        places: FloatArray,
-        along: FloatArray,
-        cases: NDArray[np.int64],
-        motion: UncertainMotion,
-        project: Callable[[FloatArray], FloatArray] | None = None,
-    ) -> SharedMotion | None:
-        """Return those of data, of which some may be at no place (NaN), as forces; None if none of it can move.
+    def of(cls, data: Measurements, project: Callable[[FloatArray], FloatArray] | None = None) -> SharedMotion | None:
+        """Return those of data, of which some may be at no place, as forces; None if none of it can move.
 
-        Parameters
-        ----------
-        places, along, cases, project
-            As of the class.
-        motion
-            What is uncertain.
+        Points are put back by `project`, as of the class.
         """
-        root = np.reshape(motion.root, (-1, 6))
+        registered = data.registered
+        root = np.zeros((0, 6)) if registered is None or not registered.uncertain else registered.root
         root = root[np.linalg.norm(root, axis=1) > 0]
-        there = np.isfinite(places).all(axis=1)
-        if not there.any() or not (len(root) or any(motion.between)):
+        there = np.isfinite(data.places).all(axis=1)
+        if not there.any() or not (len(root) or any(data.between)):
             return None
-        known = np.where(there[:, None], places, places[there][0])
-        centre = known[there].mean(axis=0) if motion.centre is None else np.array(motion.centre)
-        return cls(known, along, cases, root, np.repeat(motion.between, 3), centre, project)
+        known = np.where(there[:, None], data.places, data.places[there][0])
+        centre = known[there].mean(axis=0) if registered is None else registered.centre
+        return cls(known, data.along, data.cases, root, np.repeat(data.between, 3), centre, project)
 
     @cached_property
     def steps(self) -> FloatArray:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+from inverse.data.units import split_head
 
 TRUTH = "truth."  # begins remarks that state true values behind synthetic data
 
@@ -33,12 +35,15 @@ class Table:
         The cells of each column, row by row.
     lines
         Numbers of the lines of the rows.
+    units
+        What heads state, by column, where that is kept apart (`with_units`); None where one states nothing.
     """
 
     remarks: tuple[str, ...]
     columns: tuple[str, ...]
     rows: list[dict[str, str]]
     lines: list[int]
+    units: Mapping[str, str | None] = field(default_factory=dict)
 
     @property
     def source(self) -> tuple[str, ...]:
@@ -52,6 +57,16 @@ class Table:
             if line.startswith(TRUTH):
                 name, _, value = line.removeprefix(TRUTH).partition("=")
                 yield name.strip(), value.strip()
+
+    def with_units(self, name: str) -> Table:
+        """Return the same with units apart, of a file: `force [mN]` is `force`; a DataError for columns of one name."""
+        heads = [split_head(head) for head in self.columns]
+        columns = tuple(column for column, _ in heads)
+        twice = next((column for column in columns if columns.count(column) > 1), None)
+        if twice is not None:
+            raise DataError(f"{name}: several columns '{twice}', expected different names")
+        rows = [dict(zip(columns, row.values(), strict=True)) for row in self.rows]
+        return replace(self, columns=columns, rows=rows, units=dict(heads))
 
 
 def read_table(path: Path) -> Table:

@@ -23,7 +23,7 @@ Wright, Numerical Optimization (2006), section 10.2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -114,7 +114,7 @@ class Posterior:
     noise
         Prior of s; None for s = 1.
     which
-        Numbers (m,) of the outputs of the model that were measured.
+        Outputs of the model that were measured: numbers (m,), or all of a slice.
     start
         Initial guesses of the solver.
     errors
@@ -130,7 +130,7 @@ class Posterior:
     data: FloatArray
     sigma: FloatArray
     noise: Distribution | None = None
-    which: tuple[int, ...] | None = None
+    which: NDArray[np.int64] | slice = field(default_factory=lambda: slice(None))
     start: Start | None = None
     errors: NormalErrors | StudentErrors = NORMAL
     mesh: ApproximationError | None = None
@@ -183,8 +183,7 @@ class Posterior:
     def output_slopes(self, at: Density) -> FloatArray:
         """Return derivatives (n, m, d) of the corrected outputs by the normal coordinates of the parameters."""
         assert at.tangents is not None
-        which = slice(None) if self.which is None else list(self.which)
-        tangents = at.tangents[:, which]
+        tangents = at.tangents[:, self.which]
         if self.mesh is not None and self.mesh.slopes.size:
             tangents = tangents + self.mesh.slopes
         return np.asarray(tangents @ self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1])
@@ -211,15 +210,14 @@ class Posterior:
             solution = model.solve(point[0], guess)
         except SolveError:
             return np.inf, np.zeros(len(x))
-        which = np.arange(m) if self.which is None else np.array(self.which)
-        outputs = np.asarray(solution.outputs)[None, which]
+        outputs = np.asarray(solution.outputs)[None, self.which]
         if self.mesh is not None:
             outputs = outputs + self.mesh.at(point)
         residual = self.residuals(outputs, here)
         score = self.errors.score(residual)
         pull = (self.whitening(score) / self.scale(here))[0]  # W is symmetric
         weights = np.zeros(len(model.outputs))
-        np.add.at(weights, which, pull)
+        np.add.at(weights, np.arange(len(weights))[self.which], pull)
         by_parameters = solution.adjoint(weights)
         if self.mesh is not None and self.mesh.slopes.size:
             by_parameters = by_parameters + pull @ self.mesh.slopes
@@ -237,8 +235,7 @@ class Posterior:
         n, c = x.shape
         points = self.inputs.from_normals(x[:, :d])[0]
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
-        which = slice(None) if self.which is None else list(self.which)
-        outputs = found.outputs[:, which]
+        outputs = found.outputs[:, self.which]
         if self.mesh is not None:
             outputs = outputs + self.mesh.at(points)
         residual = self.residuals(outputs, x)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
@@ -83,8 +84,7 @@ def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -
     own = posterior.evaluate(Request(point[None], start=posterior.start))
     if look is None or own.failures:
         return np.nan
-    which = slice(None) if posterior.which is None else list(posterior.which)
-    error = (look.outputs - own.outputs[0])[which] / posterior.sigma
+    error = (look.outputs - own.outputs[0])[posterior.which] / posterior.sigma
     size = float(np.sqrt((error**2).mean()))
     say(of_the_mean(size, float(np.abs(error).max())))
     return size
@@ -102,7 +102,7 @@ def error_of(
     return ApproximationError(point, error, slopes, root, apart)
 
 
-def part(look: Look, which: list[int] | slice) -> Look:
+def part(look: Look, which: NDArray[np.int64] | slice) -> Look:
     """Return what is said of some of the outputs."""
     return Look(look.outputs[which], look.between[which], None if look.tangents is None else look.tangents[which])
 
@@ -118,7 +118,6 @@ def corrected_few(
         If the model has no answer at the mode.
     """
     d, m = len(posterior.inputs.names), posterior.data.size
-    which = slice(None) if posterior.which is None else list(posterior.which)
     plain, known, left = gaussian.mode, None, np.zeros(d)
     settled = False
     for solves in range(1, ROUNDS + 1):
@@ -129,7 +128,8 @@ def corrected_few(
         if look is None:
             break
         assert at.tangents is not None
-        found = error_of(part(look, which), at.everything[0, which], point, places, at.tangents[0, which])
+        tangents = at.tangents[0, posterior.which]
+        found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, places, tangents)
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
         root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
@@ -172,9 +172,8 @@ def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
     alone = replace(posterior, mesh=None)
     white = alone.whitening
     d, s = len(posterior.inputs.names), float((alone.scale(at.x) / white.sigma)[0, 0])
-    which = slice(None) if posterior.which is None else list(posterior.which)
     A = s * alone.sensitivities(at)[0]
-    residual = white((posterior.data - at.everything[0, which]) / white.sigma)
+    residual = white((posterior.data - at.everything[0, posterior.which]) / white.sigma)
     return evidence_moved(A, residual + A @ at.x[0, :d], white(error / white.sigma), posterior.noise)
 
 

@@ -20,11 +20,12 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import Settings
 from inverse.criticism.assessment import Assessment, Kind, Points, of_chains, of_gaussian, solves_of, weighted
-from inverse.criticism.comparison import Candidate, Data, comparison
+from inverse.criticism.comparison import Candidate, comparison
 from inverse.criticism.finer import Finer
 from inverse.criticism.verdict import verdict_on_points
 from inverse.criticism.weights import fewest
 from inverse.data.approximation_error import Places
+from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.laplace import Laplace
@@ -63,7 +64,7 @@ class Noise(Settings):
         """Whether σ is given with the data."""
         return self.absolute == 0 and self.relative == 0
 
-    def sigma(self, values: FloatArray, given: FloatArray | None) -> FloatArray:
+    def sigma_of(self, data: Measurements) -> FloatArray:
         """Return σ (m,) for data (m,).
 
         Raises
@@ -72,11 +73,11 @@ class Noise(Settings):
             If one of them is not positive.
         """
         if self.given:
-            if given is None:
+            if not np.isfinite(data.sigma).all():
                 message = "neither absolute nor relative noise, and no sigma with the data: expected one of them"
                 raise ValueError(message)
-            return given
-        sigma = np.maximum(self.relative * np.abs(values), self.absolute)
+            return data.sigma
+        sigma = np.maximum(self.relative * np.abs(data.values), self.absolute)
         if not (sigma > 0).all():
             message = "relative noise vanishes where a datum is zero, expected a floor: absolute = ..."
             raise ValueError(message)
@@ -140,7 +141,7 @@ class Select(Settings):
     def run(
         self,
         candidates: Mapping[str, Candidate],
-        data_groups: Mapping[str, Data],
+        data_groups: Mapping[str, Measurements],
         evaluate: Callable[[str, str], Evaluate],
         free: Callable[[str, str], Evaluate] | None = None,
         finer: Callable[[str, str], Finer] | None = None,
@@ -185,7 +186,8 @@ class Select(Settings):
         for name, group in pairs:
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
             starts[name, group] = by_tangents(one.inputs, one.evaluate)
-            places = _places(data_groups[group])
+            data = data_groups[group].seen()
+            places = Places(data.kinds, np.nan_to_num(data.places))
             with _of((name, group)):
                 found[name, group] = infer(
                     one,
@@ -224,7 +226,7 @@ class Select(Settings):
             variants[label] = {
                 pair: value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
                 for pair in pairs
-                if set(tests) & set(data_groups[pair[1]].measured)
+                if set(tests) & set(data_groups[pair[1]].measured_tests)
             }
         checks = {}
         if self.check is not None:
@@ -269,29 +271,22 @@ class SelectSpecimens(MeshTreatment, Select):
     mesh_check: bool = True
 
 
-def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate) -> Posterior:
+def posterior(candidate: Candidate, data: Measurements, noise: Noise, evaluate: Evaluate) -> Posterior:
     """Return the posterior of a candidate."""
-    sigma = noise.sigma(data.values, data.sigma)
-    return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
-
-
-def _places(data: Data) -> Places:
-    """Where the data are that were measured, by their kind."""
-    _, places, kinds = data.sorted
-    order = np.argsort(data.sorted[0])
-    return Places(kinds[order], places[order] if places.shape[1] == 3 else None)
+    seen = data.seen()
+    return Posterior(candidate.inputs, evaluate, seen.values, noise.sigma_of(seen), noise.factor, slice(len(seen)))
 
 
 def _without(
     test: str,
-    data_groups: Mapping[str, Data],
+    data_groups: Mapping[str, Measurements],
     posteriors: Mapping[tuple[str, str], Posterior],
     value: Callable[[Posterior, tuple[str, str]], tuple[float, float]],
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Return ln Z and its error without a test, in the groups that have it and others."""
     found = {}
     for pair, posterior in posteriors.items():
-        rest = data_groups[pair[1]].measured
+        rest = data_groups[pair[1]].measured_tests
         if test in rest and len(rest) > 1:
             others = tuple(other for other in rest if other != test)
             found[pair] = value(_only(posterior, data_groups[pair[1]], others), pair)
@@ -307,22 +302,22 @@ def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
     return determined(spectrum_of(posterior, at), posterior.whitening, posterior.shared, np.ones(posterior.data.size))
 
 
-def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
+def _with_noise(posterior: Posterior, data: Measurements, noise: Noise) -> Posterior:
     """The same with other errors."""
-    return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
+    return replace(posterior, sigma=noise.sigma_of(data.seen()), noise=noise.factor)
 
 
-def _testnames(data_groups: Mapping[str, Data]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(test for data in data_groups.values() for test in data.measured))
+def _testnames(data_groups: Mapping[str, Measurements]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(test for data in data_groups.values() for test in data.measured_tests))
 
 
-def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:
+def _only(posterior: Posterior, data: Measurements, tests: tuple[str, ...]) -> Posterior:
     """The same with the data of some tests only."""
-    which = np.array([i for i in range(data.values.size) if data.tests[i] in tests])
+    which = np.flatnonzero(np.isin(data.seen().tests, tests))
     mesh = None if posterior.mesh is None else posterior.mesh.of(which)
     shared = None if posterior.shared is None else posterior.shared[:, which]
     values, sigma = posterior.data[which], posterior.sigma[which]
-    return replace(posterior, data=values, sigma=sigma, which=tuple(which.tolist()), mesh=mesh, shared=shared)
+    return replace(posterior, data=values, sigma=sigma, which=which, mesh=mesh, shared=shared)
 
 
 def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from forward.findings import Finding
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
-from forward.spec import MEASURED, SPECIMEN, usual_kind
+from forward.spec import MEASURED
 from forward.specimen import LoadCase, Observed, Specimen
 from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced, Invert, names_of
@@ -104,12 +104,6 @@ class Inversion(StudyKind):
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     stopped: ClassVar[str] = "all data sets inverted"
-
-    def __eq__(self, other: object) -> bool:
-        """Whether the same is asked of the same files."""
-        return type(self) is type(other) and self.model_dump() == other.model_dump()
-
-    __hash__ = None  # type: ignore[assignment]
 
     # --- the model ---------------------------------------------------------------------------------------------------
 
@@ -326,9 +320,7 @@ class Inversion(StudyKind):
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
-        if not isinstance(blocks, Mapping):
-            return blocks
-        return data_as(blocks, DataFiles if usual_kind(blocks.get("model")) == SPECIMEN else MeasuredOutputs)
+        return data_as(blocks, DataFiles, MeasuredOutputs)
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""

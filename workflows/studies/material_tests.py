@@ -224,7 +224,7 @@ class DataFile(Settings):
         return self
 
 
-class Measurements(Settings):
+class MeasuredTests(Settings):
     """What was measured.
 
     Parameters

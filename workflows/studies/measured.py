@@ -19,11 +19,12 @@ from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.files import meshes
 from forward.settings import Settings, one_line
+from forward.spec import SPECIMEN, usual_kind
 from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
 from inverse.data.measurements import Measurements
-from inverse.data.registration import ToSurface, UncertainMotion, register
+from inverse.data.registration import ToSurface, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
@@ -67,10 +68,13 @@ class _Given:
     table: Any
 
 
-def data_as(blocks: Mapping[str, Any], block: type[Settings]) -> dict[str, Any]:
-    """Return the blocks of a study whose `data`, if it is a table, is of a block that was chosen by the model."""
-    data = blocks.get("data", _Given)
-    return dict(blocks) if data is _Given or isinstance(data, Settings) else {**blocks, "data": _Given(block, data)}
+def data_as(blocks: Any, of_specimen: type[Settings], of_outputs: type[Settings]) -> Any:
+    """Return the blocks of a study whose `data`, if it is a table, is of the block that the model decides on."""
+    data = blocks.get("data") if isinstance(blocks, Mapping) else None
+    if data is None or isinstance(data, Settings):
+        return blocks
+    block = of_specimen if usual_kind(blocks.get("model")) == SPECIMEN else of_outputs
+    return {**blocks, "data": _Given(block, data)}
 
 
 def as_block(data: Any) -> Any:
@@ -125,6 +129,35 @@ class DataFiles(Reading):
             If no file can be used.
         """
         return read_files(self.files, folder, lambda path: read_measurement(path, model, self))
+
+
+class DisplacementFile(Reading):
+    """A file of displacements by which models of a specimen are compared (`inverse.data.scans`).
+
+    Parameters
+    ----------
+    file
+        The file, beside the study.
+    sigma
+        Standard deviation (m) of the errors, if the file does not state it; not needed if the method's noise is given
+        otherwise.
+    sigma_of
+        The same of other outputs, such as forces, by their names.
+    unit, units, field, on_surface, tolerance, beyond, registration, between
+        As of an inversion.
+    digest, source
+        Of the file as it was when the study ran: of its bytes, and what its remarks say; written by the run.
+    """
+
+    quantity: ClassVar[str] = "displacement"
+
+    file: str
+    digest: str = ""
+    source: tuple[str, ...] = ()
+
+    def read(self, folder: Path, specimen: Specimen) -> Measurements:
+        """Read the file; a DataError if it cannot be used."""
+        return read_on(folder / self.file, specimen, self)
 
 
 Found = tuple[tuple[DataSet, ...], tuple[Any, ...]]  # what was read, and what it holds; None of what is refused
@@ -204,11 +237,7 @@ def motion_of(found: Measurements, body: Body) -> SharedMotion | None:
     """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
     from inverse.data.shared_motion import SharedMotion
 
-    motion = UncertainMotion.of(found.registered, found.between)
-    if motion is None:
-        return None
-    project = onto(body) if found.on_surface else None
-    return SharedMotion.of(found.places, found.along, found.cases, motion, project)
+    return SharedMotion.of(found, onto(body) if found.on_surface else None)
 
 
 def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
@@ -251,7 +280,8 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     pairs = zip(forces.cases, forces.axes - len(AXES), strict=True)
     negative = [specimen.cases[case].outputs[which].negative for case, which in pairs]
     signs.check(forces.names, forces.values, forces.labels, negative)
-    return replace(found, between=scan.moved_between(found.unit), truth=found.truth | scan.truth)
+    truth = found.truth | {name: repr(value) for name, value in scan.truth.items()}
+    return replace(found, between=scan.moved_between(found.unit), truth=truth)
 
 
 def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurements:
@@ -266,10 +296,8 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     return replace(found, truth={name: _known(name, value, path) for name, value in found.truth.items()} | data.truth)
 
 
-def _known(name: str, said: str | float, path: Path) -> Any:
+def _known(name: str, said: str, path: Path) -> Any:
     """Return what is true: a number, inclusions, or places (k, 3) and ln of the true stiffness factor (k,) there."""
-    if not isinstance(said, str):
-        return said
     if name == "inclusions":
         return _true_inclusions(said, path)
     if name == "stiffness":

@@ -22,6 +22,7 @@ from inverse.data.table import DataError, others
 from workflows.config.mistakes import StudyError
 from workflows.studies.measured import DataSet, FileNames, Found, Positive, read_files
 
+Stated = dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]]  # one or several, by output
 STATED = "outputs"  # name of the data set given in the study itself
 
 
@@ -38,6 +39,48 @@ class OutputNoise(Settings):
 
     relative: Annotated[float, Field(ge=0)] = 0.0
     absolute: Annotated[float, Field(ge=0)] = 0.0
+
+
+class OutputFile(Settings):
+    """Outputs by which models are compared, in a table or stated by name.
+
+    Parameters
+    ----------
+    file
+        A table with the columns output, value and, where it is known, sigma, beside the study.
+    outputs
+        Instead of a file: measurements by output, a number or a list of repeated measurements.
+    sigma
+        Standard deviations of the errors by output, if the table does not state them.
+    digest, source
+        Of the file as it was when the study ran: of its bytes, and what its remarks say; written by the run.
+    """
+
+    quantity: ClassVar[str] = "output"
+
+    file: str | None = None
+    outputs: Stated = Field(default={})
+    sigma: dict[str, Positive] = Field(default={})
+    digest: str = ""
+    source: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> OutputFile:
+        if (self.file is None) == (not self.outputs):
+            message = "expected either a file or outputs"
+            raise ValueError(message)
+        return self
+
+    def read(self, folder: Path, model: ModelSpec) -> Measurements:
+        """Read the table, or what the study itself states, of a model; a DataError if it cannot be used."""
+        names = tuple(output.name for output in model.returned)
+        found = (
+            stated(self.outputs, names)
+            if self.file is None
+            else read_outputs(folder / self.file, names, steps_of(model))
+        )
+        check_signs(found, model)
+        return found.with_sigma(np.array([self.sigma.get(name, np.nan) for name in found.names]))
 
 
 class MeasuredOutputs(Settings):
@@ -66,7 +109,7 @@ class MeasuredOutputs(Settings):
     quantity: ClassVar[str] = "output"
 
     files: FileNames = ()
-    outputs: dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]] = Field(default={})
+    outputs: Stated = Field(default={})
     sigma: dict[str, Positive] = Field(default={})
     noise: OutputNoise = OutputNoise()
     errors: Errors = NORMAL

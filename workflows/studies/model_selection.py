@@ -5,28 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 
-from pydantic import BeforeValidator, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
+from forward.combine import selected
 from forward.fem.finer import finer
 from forward.findings import Finding
 from forward.model import ForwardModel
 from forward.scalars import Mistake
-from forward.settings import Settings, one_line, shown
-from forward.spec import SPECIMEN, ModelSpec, usual_kind
+from forward.settings import one_line, shown
+from forward.spec import ModelSpec
 from forward.specimen import Specimen
-from inverse.criticism.comparison import Candidate, Data
+from forward.words import named
+from inverse.criticism.comparison import Candidate
 from inverse.criticism.doubts_of_meshes import not_estimable
+from inverse.data.measurements import AXES, Measurements
+from inverse.data.table import DataError
+from inverse.methods.invert import derivable
 from inverse.methods.selection import SelectSpecimens
-from workflows.config.mistakes import StudyError, lines
+from workflows.config.mistakes import StudyError, refused
 from workflows.config.priors import ranges
 from workflows.studies.candidates import OfCandidates, changed, spec_of
-from workflows.studies.listed_displacements import ListedDisplacements
-from workflows.studies.listed_outputs import ListedOutputs
 from workflows.studies.material_tests import WHOLE, expanded
-from workflows.studies.measured import as_block, data_as
-from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, of_file
+from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of
+from workflows.studies.measured_outputs import OutputFile
+from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, never_estimable, of_file
 from workflows.studies.selection import Comparison, Selection
 from workflows.studies.solves import of_answers
 from workflows.studies.study import StudyKind, bytes_of
@@ -53,11 +58,11 @@ class ModelSelection(OfCandidates, Comparison):
         How the candidates are compared.
     """
 
-    data: Annotated[ListedDisplacements | ListedOutputs, BeforeValidator(as_block)]
+    data: Annotated[DisplacementFile | OutputFile, BeforeValidator(as_block)]
     method: SelectSpecimens
+    measurements: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)
 
     costly: ClassVar[bool] = True
-    data_in_file: ClassVar[tuple[type[Settings], ...]] = (ListedDisplacements.in_file, ListedOutputs.in_file)
 
     @classmethod
     def forms(cls) -> Iterator[type[StudyKind]]:
@@ -73,26 +78,27 @@ class ModelSelection(OfCandidates, Comparison):
             raise StudyError(message)
         if "model" not in blocks:
             return Selection.model_validate(expanded(blocks, folder))
-        return cls.model_validate(cls._expanded(blocks, folder))
+        return cls.model_validate(blocks).with_data(folder)
 
-    @classmethod
-    def _expanded(cls, blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        data, candidates, listed = blocks.get("data"), blocks.get("candidates"), block_of(blocks.get("model"))
-        if not isinstance(data, Mapping) or not isinstance(candidates, Mapping) or not candidates:
-            return dict(blocks)
-        if next(iter(listed.model_fields)) in data:  # nothing is to be read any more
-            return dict(blocks)
+    @property
+    def recorded(self) -> bool:
+        """As in every study: its file is named, and not read."""
+        return self.measurements is None
+
+    def with_data(self, folder: Path) -> Self:
+        """Return the same with its data, read by the model of the first candidate; a StudyError for what is wrong."""
+        if self.data.digest:
+            return self
         try:
-            file: Any = listed.in_file.model_validate(dict(data))
-        except ValidationError as error:
-            raise StudyError(*lines(error, "data")) from None
-        name, first = next(iter(candidates.items()))
-        changes = first.get("model", {}) if isinstance(first, Mapping) else {}
-        try:
-            spec = spec_of(changed(blocks["model"], changes))
-        except ValidationError as error:
-            raise StudyError(*lines(error, f"candidates.{name}.model")) from None
-        return {**blocks, "data": file.read(folder, spec)}
+            found = self.data.read(folder, cast("Any", next(iter(self.of_candidates.values()))))
+        except DataError as error:
+            raise StudyError(*(f"data: {line}" for line in error.args)) from None
+        source = (*found.source, *(f"truth: {name} = {value}" for name, value in found.truth.items()))
+        digest = digest_of(folder / self.data.file) if self.data.file else ""
+        data = self.data.model_copy(update={"digest": digest, "source": source})
+        study = self.model_copy(update={"data": data, "measurements": found})
+        refused(type(self).__name__, [*study._unobserved(), *study.mistakes_of_data()])
+        return study
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
@@ -162,7 +168,9 @@ class ModelSelection(OfCandidates, Comparison):
 
     def _of_outputs(self) -> Iterator[Finding]:
         """Say of which measured outputs nothing tells the error of the mesh."""
-        never = (self.data.not_estimable(spec) for spec in self.of_candidates.values())
+        known = self.measurements is not None and self.measurements.some
+        measured = self.measurements.names.tolist() if known else ()
+        never = (never_estimable(spec, measured) for spec in self.of_candidates.values())
         names = tuple(dict.fromkeys(name for several in never for name in several))
         yield from not_estimable(names) if names and self.unchecked else ()
 
@@ -172,13 +180,16 @@ class ModelSelection(OfCandidates, Comparison):
         return {name: Candidate(inputs, self.candidates[name].weight) for name, inputs in self.priors.items()}
 
     @property
-    def data_groups(self) -> dict[str, Data]:
+    def data_groups(self) -> dict[str, Measurements]:
         """Data by group."""
-        return {WHOLE: self.data.data}
+        return {WHOLE: self.measurements}
 
     def measured_in(self, test: str) -> str:
         """Say what was measured in a test, in the unit of the first candidate."""
-        return self.data.measured_in(test, next(iter(self.of_candidates.values())))
+        if self.data.quantity == DisplacementFile.quantity:
+            return "displacement (m)"
+        outputs = next(iter(self.of_candidates.values())).returned
+        return next(named(output.name, output.unit) for output in outputs if output.name == test)
 
     @property
     def seconds_of_solves(self) -> float:
@@ -206,15 +217,17 @@ class ModelSelection(OfCandidates, Comparison):
     def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
         """Make the model of a candidate; collective."""
         spec = self.of_candidates[name]
-        return self.data.observed(spec, spec.build(comm, tuple(self.candidates[name].parameters)))
+        model, found = spec.build(comm, tuple(self.candidates[name].parameters)), self.measurements
+        if found.some:
+            derivable(model, spec.kind)
+            return selected(model, tuple(model.outputs.index(output) for output in found.names))
+        found = found.in_model(cast("Specimen", spec).observable)
+        return cast("SpecimenModel", model).observing(found.places, found.axes, found.cases, found.along)
 
     def shared(self, name: str, group: str) -> SharedMotion | None:
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
-        return self.data.shared(self.of_candidates[name])
-
-    def moved(self, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
-        """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
-        return cast("SpecimenModel", make()).observing(*motion.observed)
+        spec, found = cast("Specimen", self.of_candidates[name]), self.measurements
+        return None if found.some else motion_of(found.in_model(spec.observable), spec.body)
 
     def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
         """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
@@ -226,23 +239,40 @@ class ModelSelection(OfCandidates, Comparison):
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
-        return data_as(blocks, block_of(blocks.get("model"))) if isinstance(blocks, Mapping) else blocks
+        data = blocks.get("data") if isinstance(blocks, Mapping) else None
+        if isinstance(data, Mapping) and "measured" in data:  # results of earlier versions hold all numbers
+            blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": data.get("source", ())}}
+        return data_as(blocks, DisplacementFile, OutputFile)
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
-        if isinstance(self.data, ListedDisplacements) and self.method.check is not None:
+        if self.data.quantity == DisplacementFile.quantity and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
             yield ("method", "check"), message, self.method.check
-        for place, spec, mistakes in self.models_and_mistakes():
+        for _, spec, mistakes in self.models_and_mistakes():
             yield from mistakes
-            if spec is None:
-                continue
-            for where, message, given in self.data.unobserved(spec):
-                yield (*place, "model", *where), message, given
-            yield from self.mistakes_of_ranks(spec)
+            if spec is not None:
+                yield from self.mistakes_of_ranks(spec)
         yield from self.mistakes_of_method()
 
-
-def block_of(model: Any) -> type[ListedDisplacements | ListedOutputs]:
-    """Return the block of the data of a model."""
-    return ListedDisplacements if usual_kind(model) == SPECIMEN else ListedOutputs
+    def _unobserved(self) -> Iterator[Mistake]:
+        """Find what candidates do not have of what was measured."""
+        found = self.measurements
+        for name, spec in self.of_candidates.items():
+            place = ("candidates", name, "model")
+            if found.some:
+                known = [output.name for output in spec.returned]
+                lost = next((output for output in found.names.tolist() if output not in known), None)
+                if lost is not None:
+                    yield (*place, "outputs"), f"no output '{lost}', of which there are data", known
+            elif isinstance(spec, Specimen):
+                has = spec.observable
+                pairs = dict.fromkeys(zip(found.tests.tolist(), found.names.tolist(), strict=True))
+                case, what = next(((one, what) for one, what in pairs if what not in has.get(one, ())), ("", ""))
+                if case and case not in has:
+                    yield (*place, "cases"), f"no load case '{case}', of which there are data", list(has)
+                elif case:
+                    message = f"load case '{case}' has no output '{what}', of which there are data"
+                    yield (*place, "cases"), message, list(has[case][len(AXES) :])
+            else:
+                yield (*place, "kind"), "displacements were measured, expected 'specimen'", spec.kind

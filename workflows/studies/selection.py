@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,9 +18,10 @@ from forward.model import ForwardModel
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from inverse.criticism.assessment import NEEDED, own_seconds
-from inverse.criticism.comparison import Candidate, Data
+from inverse.criticism.comparison import Candidate
 from inverse.criticism.finer import Finer
-from inverse.methods.selection import Select
+from inverse.data.measurements import Measurements
+from inverse.methods.selection import Noise, Select
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate
 from uq.findings import add
@@ -28,7 +30,7 @@ from workflows.config.priors import findings_of_materials, mistakes_of_factor
 from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
 from workflows.studies.job import MOVED, MethodJob
-from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements
+from workflows.studies.material_tests import DataFile, MeasuredTest, MeasuredTests
 from workflows.studies.predictions import FINER, NOT_ASKED, duration, once_on_finer_meshes
 from workflows.studies.study import StudyKind
 
@@ -105,8 +107,9 @@ class Comparison(StudyKind):
         """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
         return []
 
-    def moved(self, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
-        """Return the model, given that of a candidate, that tells what they are; collective."""
+    @property
+    def data_groups(self) -> dict[str, Measurements]:
+        """Data by group."""
         raise NotImplementedError
 
     @property
@@ -114,14 +117,9 @@ class Comparison(StudyKind):
         """Names of the groups."""
         return tuple(self.data_groups)
 
-    @property
-    def data_groups(self) -> dict[str, Data]:
-        """Data by group."""
-        raise NotImplementedError
-
     def tests(self, group: str) -> tuple[str, ...]:
         """Names of the tests that were measured in a group."""
-        return self.data_groups[group].measured
+        return self.data_groups[group].measured_tests
 
     def measured_in(self, test: str) -> str:
         """Say what was measured in a test, with its unit."""
@@ -160,7 +158,7 @@ class Comparison(StudyKind):
         """Say what is compared, and how long that will take."""
         method = self.method
         evidences = self.evidences
-        sizes = {group: one.values.size for group, one in self.data_groups.items()}
+        sizes = {group: len(one.seen()) for group, one in self.data_groups.items()}
         own = sum(
             own_seconds(len(self.candidates[name].parameters), sizes[group], method.samples)
             for name, group in self.pairs
@@ -173,11 +171,10 @@ class Comparison(StudyKind):
             meshes = [(0.0, NOT_ASKED)]
         seconds += sum(once for once, _ in meshes)
         check = " and nested sampling, which takes minutes" if method.check else ""
-        data = self.data_groups.values()
         tests = sum(len(self.tests(group)) for group in self.group_names)
-        among = f" in {len(data)} groups" if len(data) > 1 else ""
+        among = f" in {len(sizes)} groups" if len(sizes) > 1 else ""
         kind, parts = DATA[self.data.quantity]
-        count = f"{sum(one.values.size for one in data)} {kind} of {tests} {parts}"
+        count = f"{sum(sizes.values())} {kind} of {tests} {parts}"
         return [
             f"method      {method.kind}",
             f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in self.candidates.items())}",
@@ -239,7 +236,7 @@ class Comparison(StudyKind):
 
         others: dict[str, Callable[[], ForwardModel]] = {"/".join(pair): make for pair, make in makers.items()}
         finer_ones = {f"{n}/{g}/{FINER}": partial(self.build_finer, n, makers[n, g]) for n, g in checked}
-        moved_ones = {f"{n}/{g}/{MOVED}": partial(self.moved, makers[n, g], one) for (n, g), one in motions.items()}
+        moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
         first = makers[self.pairs[0]]()
         return MethodJob(
             first,
@@ -265,27 +262,39 @@ class Comparison(StudyKind):
         if self.method.chains == "hmc" and self.parallel.ranks_per_model > 1:
             message = "chains = 'hmc' follow gradients on one rank, expected 1"
             yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
-        known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
-        for name, tests in self.method.subsets.items():
-            for test in tests:
-                if test not in known:
-                    yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
         for name, candidate in self.candidates.items():
             try:
                 candidate.inputs  # noqa: B018 - checks the correlations
             except ValueError as error:
                 yield ("candidates", name, "correlations"), str(error), name
-        for place, noise in (
-            (("noise",), self.method.noise),
-            *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
-        ):
+        for place, noise in self._noises:
             yield from mistakes_of_factor(noise.factor, "method", *place, "factor")
+
+    @property
+    def _noises(self) -> list[tuple[tuple[str, ...], Noise]]:
+        others = self.method.other_noises.items()
+        return [(("noise",), self.method.noise), *((("other_noises", name), noise) for name, noise in others)]
+
+    def mistakes_of_data(self) -> Iterator[Mistake]:
+        """Find what of the method does not fit the data."""
+        known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
+        for name, tests in self.method.subsets.items():
+            for test in tests:
+                if test not in known:
+                    yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
+        for place, noise in self._noises:
             for data in self.data_groups.values():
                 try:
-                    noise.sigma(data.values, data.sigma)
+                    noise.sigma_of(data.seen())
                 except ValueError as error:
                     yield ("method", *place), str(error), noise.model_dump(exclude_none=True)
                     break
+
+
+def _moved(make: Callable[[], Any], motion: SharedMotion) -> ForwardModel:
+    """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
+    found: ForwardModel = make().observing(*motion.observed)
+    return found
 
 
 class Selection(Comparison):
@@ -303,7 +312,7 @@ class Selection(Comparison):
         How the candidates are compared.
     """
 
-    data: Measurements
+    data: MeasuredTests
     candidates: dict[str, CandidateModel] = Field(min_length=1)
     predict: tuple[MaterialTest, ...] = ()
     method: Select
@@ -320,21 +329,19 @@ class Selection(Comparison):
         """Material of a candidate."""
         return self.candidates[name].kind
 
-    @property
-    def data_groups(self) -> dict[str, Data]:
+    @cached_property
+    def data_groups(self) -> dict[str, Measurements]:
         """Data by group."""
-        found = {}
+        found, predicted = {}, [(math.nan,) * len(test.at) for test in self.predict]
         for group in self.data.data_groups:
-            tests = self._measured(group)
-            known = all(test.sigma is not None for test in tests)
-            labels = [test.label for test in self._tests(group) for _ in test.at]
-            places = [(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]
-            found[group] = Data(
-                np.concatenate([test.measured for test in tests]),
-                np.concatenate([test.sigma for test in tests if test.sigma is not None]) if known else None,
-                tuple(labels),
-                np.concatenate([test.at for test in self._tests(group)]),
-                np.array(places),
+            measured, tests = self._measured(group), self._tests(group)
+            sigma = [test.sigma or (math.nan,) * len(test.at) for test in measured]
+            found[group] = Measurements.of_tests(
+                np.concatenate([*(test.measured for test in measured), *predicted]),
+                np.concatenate([*sigma, *predicted]),
+                [test.label for test in tests for _ in test.at],
+                np.concatenate([test.at for test in tests]),
+                np.array([(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]),
             )
         return found
 
@@ -372,3 +379,4 @@ class Selection(Comparison):
             if objection is not None:
                 yield ("candidates", name, "material"), objection, candidate.material
         yield from self.mistakes_of_method()
+        yield from self.mistakes_of_data()

@@ -60,6 +60,12 @@ class StudyKind(Settings):
     parallel: Parallel = Field(default=Parallel(), description="Use of ranks.")
     report: Report | None = Field(default=None, description="Your own sections of the report.")
 
+    def __eq__(self, other: object) -> bool:
+        """Whether the same is asked of the same files."""
+        return type(self) is type(other) and self.model_dump() == other.model_dump()
+
+    __hash__ = Settings.__hash__
+
     if TYPE_CHECKING:  # a field of every kind
 
         @property

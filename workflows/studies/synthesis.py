@@ -22,6 +22,7 @@ from workflows.config.priors import inputs_of, mistakes_of_priors, ranges
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
+from workflows.studies.synthetic import Synthetic, files_of, outputs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
-    from workflows.studies.synthetic import Synthetic
 
 
 class Synthesis(StudyKind):
@@ -101,7 +101,7 @@ class Synthesis(StudyKind):
             of_specimen = named("workflows.studies.synthetic_displacements:displacements")
             made: Synthetic = of_specimen(self.model, self.method, self.inputs, model, ensemble)
         else:
-            made = named("workflows.studies.synthetic_outputs:outputs")(self.model, self.method, self.inputs, model)
+            made = outputs(self.model, model)
         recorders: dict[str, Recorder] = {}
 
         def task(evaluate: Evaluate) -> xr.Dataset:
@@ -109,7 +109,8 @@ class Synthesis(StudyKind):
             return self.method.run(self.inputs, recorders["/"], made.groups, made.points)
 
         def texts(found: xr.Dataset) -> dict[str, str]:
-            return {f"data/{file}": text for file, text in made.files(name, found).items()}
+            texts = files_of(made, self.model, self.method, self.inputs, name, found)
+            return {f"data/{file}": text for file, text in texts.items()}
 
         return MethodJob(made.model, {}, task, recorders, labelled=made.labelled, texts=texts)
 

@@ -16,19 +16,22 @@ from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import log_factor
+from forward.bodies.surface import Surface
 from inverse.data.measurements import kinds
-from workflows.studies.synthetic import OF_TRUTH, Synthetic, head
-from workflows.studies.synthetic_surfaces import facets_among, surfaces
+from workflows.studies.synthetic import Synthetic
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.bodies.geometry import Body
     from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray
     from forward.specimen import Specimen
     from inverse.methods.synthesize import Synthesize
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
+
+SAME = 12  # decimals (m) of places that are the same
 
 
 def displacements(
@@ -38,7 +41,7 @@ def displacements(
     places, points = model.space.coordinates, points_of(model)
     if method.frame is not None:  # components along the axes of the scanner
         along = method.motion.rotation.T[model.axes]
-        model = model.observing(model.places, model.axes.tolist(), model.cases.tolist(), along)
+        model = model.observing(model.places, model.axes, model.cases, along)
     fields = np.ones((len(method.fraction), 1))
     if specimen.fields and ensemble.index == 0:
         drawn = model.space.factors(method.truths(inputs))
@@ -52,11 +55,12 @@ def displacements(
         table = np.concatenate([np.broadcast_to(places, (len(truths), *places.shape)), factor[:, :, None]], axis=2)
         return found.assign(factor=(("data_set", "place", "axis"), table))
 
-    def files(name: str, found: xr.Dataset) -> dict[str, str]:
-        return synthetic_files(specimen, method, inputs, name, found, (points, model.cases, model.axes, model.places))
+    def files(label: str, one: xr.Dataset, truth: dict[str, float], head: str) -> dict[str, str]:
+        where = points, model.cases, model.axes, model.places
+        return synthetic_files(specimen, method, label, one, truth, head, where)
 
     groups = np.where(points < 0, len(model.models) + kinds(model.cases, model.axes), model.cases)
-    return Synthetic(model, groups, points, labelled, files)
+    return Synthetic(model, groups, points, files, labelled)
 
 
 def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
@@ -71,63 +75,57 @@ def points_of(model: SpecimenModel) -> NDArray[np.int64]:
     It is -1 of outputs that are measured at no point.
     """
     found, at = np.full(len(model.axes), -1), model.axes < len(AXES)
-    found[at] = np.unique(np.round(model.places[at], 12), axis=0, return_inverse=True)[1].ravel()
+    found[at] = np.unique(np.round(model.places[at], SAME), axis=0, return_inverse=True)[1].ravel()
     return found
 
 
 def synthetic_files(
-    specimen: Specimen, method: Synthesize, inputs: Inputs, name: str, found: xr.Dataset, model: Any
+    specimen: Specimen,
+    method: Synthesize,
+    label: str,
+    one: xr.Dataset,
+    truth: dict[str, float],
+    head: str,
+    where: tuple[Any, ...],
 ) -> dict[str, str]:
-    """Return the texts of the files of synthetic data, by their names."""
-    texts = {}
-    points, cases, axes, places = model
-    rigid = method.motion
+    """Return the texts of the files of a data set, by their names; points, load cases, axes and places are given."""
+    points, cases, axes, places = where
+    rigid, texts = method.motion, {}
     frame = (places - rigid.shift) @ rigid.rotation  # where the scanner sees them
-    count = found.sizes["data_set"]
-    scalars = {path: scalar.value for path, scalar in specimen.scalars.items()}
-    varies = [path for path in scalars if path.startswith(OF_TRUTH) or path in inputs.names]
-    for k in range(count):
-        one = found.isel(data_set=k)
-        truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
-        label = name if count == 1 else f"{name}-{k + 1}"
-        file = io.StringIO()
-        file.write(head(specimen, method))
-        file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
-        if specimen.inclusions and not specimen.fields:
-            inclusions = [_with_values(inclusion, truth) for inclusion in specimen.inclusions]
-            file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
-        if specimen.fields:
-            file.write(f"# truth.stiffness = truth/{label}.csv\n")
-            lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
-            texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
-        unit = method.metres
-        values, sigma = one["values"].values / unit, one["sigma"].values / unit
-        if method.format != "csv":
-            arrays = _arrays(specimen, method, values, sigma, (points, cases, axes))
-            truths = {path: truth[path] for path in varies}
-            texts |= _described(specimen, method, label, (places, frame / unit), arrays, truths)
-            continue
-        said = "" if method.units == "m" else f" [{method.units}]"
-        heads = [f"{head}{said}" for head in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
-        apart = points < 0  # outputs of load cases, in units of their own
-        more = ["output", "value", "sigma_value"] if apart.any() else []
-        file.write(",".join([*heads, "case", *more] if not apart.all() else ["case", *more]) + "\n")
-        for case, case_name in enumerate(c.name for c in specimen.cases):
-            for point in np.unique(points[(cases == case) & (points >= 0)]):
-                rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
-                if len(rows) == 0:
-                    continue
-                motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
-                where = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
-                cells = ",".join(motion.get(axis, "") for axis in range(3))
-                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}{',' * len(more)}\n")
-            names = tuple(output.name for output in specimen.cases[case].outputs)
-            for row in np.flatnonzero((cases == case) & apart):
-                output, empty = names[axes[row] - len(AXES)], "" if apart.all() else "," * len(heads)
-                value, error = (float(one[key].values[row]) for key in ("values", "sigma"))
-                file.write(f"{empty}{case_name},{output},{value:.8g},{error:.4e}\n")
-        texts[f"{label}.csv"] = file.getvalue()
-    return texts
+    file = io.StringIO()
+    file.write(head)
+    if specimen.inclusions and not specimen.fields:
+        inclusions = [_with_values(inclusion, truth) for inclusion in specimen.inclusions]
+        file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
+    if specimen.fields:
+        file.write(f"# truth.stiffness = truth/{label}.csv\n")
+        lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
+        texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
+    unit = method.metres
+    values, sigma = one["values"].values / unit, one["sigma"].values / unit
+    if method.format != "csv":
+        arrays = _arrays(specimen, method, values, sigma, (points, cases, axes))
+        return texts | _described(specimen, method, label, (places, frame / unit), arrays, truth)
+    said = "" if method.units == "m" else f" [{method.units}]"
+    heads = [f"{column}{said}" for column in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
+    apart = points < 0  # outputs of load cases, in units of their own
+    more = ["output", "value", "sigma_value"] if apart.any() else []
+    file.write(",".join([*heads, "case", *more] if not apart.all() else ["case", *more]) + "\n")
+    for case, case_name in enumerate(c.name for c in specimen.cases):
+        for point in np.unique(points[(cases == case) & (points >= 0)]):
+            rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
+            if len(rows) == 0:
+                continue
+            motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
+            at = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
+            cells = ",".join(motion.get(axis, "") for axis in range(3))
+            file.write(f"{at},{cells},{sigma[rows[0]]:.4e},{case_name}{',' * len(more)}\n")
+        names = tuple(output.name for output in specimen.cases[case].outputs)
+        for row in np.flatnonzero((cases == case) & apart):
+            output, empty = names[axes[row] - len(AXES)], "" if apart.all() else "," * len(heads)
+            value, error = (float(one[key].values[row]) for key in ("values", "sigma"))
+            file.write(f"{empty}{case_name},{output},{value:.8g},{error:.4e}\n")
+    return texts | {f"{label}.csv": file.getvalue()}
 
 
 def _described(
@@ -196,3 +194,51 @@ def _cloud(places: FloatArray, arrays: Mapping[str, NDArray[Any]], form: str) ->
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # that text takes more room
             meshio.write(path, mesh, **how)
         return path.read_text(encoding="utf-8")
+
+
+def facets_among(body: Body, places: FloatArray) -> NDArray[np.int64]:
+    """Return triangles (n, 3) of the surface of a body whose corners are all among places (k, 3), as rows of these."""
+    rows = {tuple(place): i for i, place in enumerate((np.round(places, SAME) + 0.0).tolist())}
+    corners = (np.round(Surface.of(body).triangles, SAME) + 0.0).tolist()
+    found = [[rows.get(tuple(corner), -1) for corner in triangle] for triangle in corners]
+    return np.array([triangle for triangle in found if min(triangle) >= 0], dtype=np.int64).reshape(-1, 3)
+
+
+def surfaces(
+    label: str,
+    places: FloatArray,
+    motions: Mapping[str, FloatArray],
+    facets: NDArray[np.int64],
+    more: Mapping[str, Any],
+) -> dict[str, str]:
+    """Return the texts of the files of a pair of surfaces for each load case, by their names.
+
+    Parameters
+    ----------
+    label
+        With which names begin.
+    places, motions
+        Undeformed places (k, 3), and displacements (k, 3) by load case, in the unit of the files.
+    facets
+        Triangles (n, 3), as rows of these.
+    more
+        What else the description says.
+    """
+    names = {case: f"{label}-{case}.stl" for case in motions}
+    texts = {names[case]: _stl((places + motion)[facets]) for case, motion in motions.items()}
+    texts[f"{label}.stl"] = _stl(places[facets])
+    texts[f"{label}.toml"] = tomli_w.dumps({"reference": f"{label}.stl", "deformed": names, **more})
+    return texts
+
+
+def _stl(corners: FloatArray) -> str:
+    """Return the text of an STL file of triangles (n, 3, 3)."""
+    lines = ["solid surface"]
+    for triangle in corners:
+        a, b, c = triangle
+        normal = np.cross(b - a, c - a)
+        normal = normal / (np.linalg.norm(normal) or 1.0)
+        lines += [f"facet normal {normal[0]:.6g} {normal[1]:.6g} {normal[2]:.6g}", " outer loop"]
+        lines += [f"  vertex {x:.10g} {y:.10g} {z:.10g}" for x, y, z in triangle]
+        lines += [" endloop", "endfacet"]
+    return "\n".join([*lines, "endsolid surface", ""])

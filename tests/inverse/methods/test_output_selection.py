@@ -125,7 +125,7 @@ def test_a_candidate_with_a_wrong_jacobian_is_named(folder):
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("outputs = { w", "outputs = { q = 1.0, w", "no output 'q', of which there are data"),
+        ("outputs = { w", "outputs = { q = 1.0, w", "data: outputs.q: not an output of the model"),
         ("sigma = { u = 0.05, w = 0.3 }", "", "neither absolute nor relative noise, and no sigma"),
         ("parameters.b = {", "parameters.q = {", "not a number of the model"),
         ("outputs = { w = [3.1, 2.9], u = 0.4 }", "", "expected either a file or outputs"),

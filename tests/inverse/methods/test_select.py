@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from inverse.criticism.assessment import weighted
-from inverse.criticism.comparison import Candidate, Data, criticise, probabilities
+from inverse.criticism.comparison import Candidate, criticise, probabilities
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.evidence import evidence
@@ -58,7 +58,9 @@ def model(kind, tests=TESTS):
 
 def compare(values, kinds=tuple(FIVE), tests=TESTS, noise=None, **settings):
     labels = tuple(test.label for test in tests for _ in test.at)
-    data = Data(values, None, labels, np.concatenate([test.at for test in tests]))
+    data = Measurements.of_tests(
+        values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in tests])
+    )
     candidates = {kind: Candidate(Inputs(FIVE[kind])) for kind in kinds}
     method = Select(samples=settings.pop("samples", 64), noise=noise or Noise(relative=0.1, absolute=5e3), **settings)
     return method.run(candidates, {"all": data}, lambda kind, _: SerialEvaluate(model(kind, tests)))
@@ -134,7 +136,9 @@ def test_discrepancy_is_found_when_no_candidate_is_right():
 def doubts(values, kind, noise=None, **priors):
     inputs = Inputs(FIVE[kind] | priors)
     labels = tuple(test.label for test in TESTS for _ in test.at)
-    data = Data(values, None, labels, np.concatenate([test.at for test in TESTS]))
+    data = Measurements.of_tests(
+        values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in TESTS])
+    )
     noise = noise or Noise(relative=0.05, absolute=5e3)
     method = Select(samples=64, noise=noise)
     found = method.run({kind: Candidate(inputs)}, {"all": data}, lambda name, _: SerialEvaluate(model(name)))
@@ -174,7 +178,9 @@ def test_left_out_scores_of_a_linear_model():
     stress = it.stresses(np.array([[1.8e5, 1e4]]))[0]
     values = stress * (1 + 0.1 * rng.standard_normal(stress.size))
     labels = tuple(test.label for test in tests for _ in test.at)
-    data = Data(values, None, labels, np.concatenate([test.at for test in tests]))
+    data = Measurements.of_tests(
+        values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in tests])
+    )
     inputs = Inputs(priors)
     whole = posterior(Candidate(inputs), data, Noise(relative=0.1), SerialEvaluate(it))
     found = criticise(weighted(whole, evidence(whole, laplace(whole), 2048)), whole, data)
@@ -197,7 +203,9 @@ def test_whole_tests_are_held_out():
     stress = it.stresses(np.array([[1.8e5, 1e4]]))[0]
     values = stress * (1 + 0.1 * np.random.default_rng(0).standard_normal(stress.size))
     labels = tuple(test.label for test in TESTS for _ in test.at)
-    data = Data(values, None, labels, np.concatenate([test.at for test in TESTS]))
+    data = Measurements.of_tests(
+        values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in TESTS])
+    )
     method = Select(samples=32, noise=Noise(relative=0.1), held_out=True)
     found = method.run({"one": Candidate(inputs)}, {"all": data}, lambda *pair: SerialEvaluate(it))
     A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
@@ -389,7 +397,7 @@ def test_the_order_of_rows_says_nothing_of_neighbours():
     found = []
     for order in (np.arange(30), rng.permutation(30), np.lexsort(grid.T)):
         it = HomogeneousModel("neo-hookean", {}, [_biaxial(grid[order])], ("C1",))
-        data = Data(values[order], None, ("biaxial",) * 30, grid[order, 0], grid[order])
+        data = Measurements.of_tests(values[order], values * np.nan, ("biaxial",) * 30, grid[order, 0], grid[order])
         candidate = Candidate(Inputs({"C1": LogNormal(mean=2e5, std=1e5)}))
         one = posterior(candidate, data, Noise(absolute=2e4, factor=FACTOR), SerialEvaluate(it))
         found.append(criticise(weighted(one, evidence(one, laplace(one), 64)), one, data).correlation)
@@ -667,7 +675,7 @@ def of_bananas(pairs, bend=0.7, **settings):
     """What a comparison finds of a curved posterior; what makes an inversion of the same; and what is true."""
     model, curved, *truth = bananas(pairs, bend)
     d = 2 * pairs
-    data = Data(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
+    data = Measurements.of_tests(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
     method = Select(noise=Noise(), **settings)
     evaluate = SerialEvaluate(model)
     found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, model=lambda *_: model)
