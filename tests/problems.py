@@ -1,8 +1,11 @@
 """Problems of which several tests know the answer: posteriors of fields and of few parameters."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from forward.model import FunctionModel, SolveError
+from inverse.criticism.answer import quantiles
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -145,3 +148,12 @@ def bananas(pairs, bend=0.7, seed=0, wide=100.0):
     inputs = Inputs({name: Normal(mean=0.0, std=wide) for name in names})
     posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(d), np.ones(d))
     return model, posterior, centre, np.sqrt(np.diag(covariance)), log_evidence
+
+
+def summary(values, weights=None):
+    """Mean, standard deviation and quantiles of values (n, k) at points with weights (n,), by default equal ones."""
+    w = np.full(len(values), 1 / len(values)) if weights is None else weights
+    values, w = values[w > 0], w[w > 0]
+    mean = w @ values
+    bands = np.array([quantiles(column, w, (0.025, 0.5, 0.975)) for column in values.T]).T
+    return SimpleNamespace(mean=mean, std=np.sqrt(w @ (values - mean) ** 2), quantiles=bands)

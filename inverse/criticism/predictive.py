@@ -1,4 +1,4 @@
-"""Predictions of a posterior for other quantities and data, and tests of its residuals.
+"""Tests of a posterior by its residuals.
 
 If model, prior and noise are right and the model is linear, the normalised residuals r at the mode are normal with the
 covariance I − S, S = A(I + AᵀA)⁻¹Aᵀ (`inverse.fields.low_rank`): |r|² is a sum of squares weighted by 1/(1+λ), of the
@@ -9,110 +9,15 @@ test works even if the size of the noise was inferred.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.answer import quantiles
 from inverse.data.neighbours import DRAWS, Neighbours, agreement
-from inverse.fields.field_posterior import Point
-from inverse.fields.low_rank import LowRankPosterior, Spectrum
-from inverse.low_dimensional.evidence import Evidence
+from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-
-LEVELS = (0.025, 0.5, 0.975)
-Map = Callable[[FloatArray], FloatArray]
-
-
-# --- derived quantities ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What is known about k quantities.
-
-    Attributes
-    ----------
-    mean, std
-        (k,).
-    levels
-        Probabilities (q,).
-    quantiles
-        (q, k).
-    """
-
-    mean: FloatArray
-    std: FloatArray
-    levels: tuple[float, ...]
-    quantiles: FloatArray
-
-
-def summary(values: FloatArray, weights: FloatArray | None = None, levels: tuple[float, ...] = LEVELS) -> Summary:
-    """Summarise values (n, k) at points with weights (n,) of sum 1, by default equal ones.
-
-    Raises
-    ------
-    ValueError
-        If a value at a point that counts is not finite.
-    """
-    w = np.full(len(values), 1 / len(values)) if weights is None else weights
-    values, w = values[w > 0], w[w > 0]
-    if not np.isfinite(values).all():
-        message = f"{np.isnan(values).any(axis=1).sum()} of {len(values)} points have no value of a derived quantity"
-        raise ValueError(message)
-    mean = w @ values
-    std = np.sqrt(w @ (values - mean) ** 2)
-    return Summary(mean, std, levels, np.array([quantiles(column, w, levels) for column in values.T]).T)
-
-
-def derived_by_laplace(
-    posterior: Posterior, gaussian: Laplace, function: Map, *, draws: int = 4096, seed: int = 0
-) -> Summary:
-    """Summarise a function (n, c) → (n, k) of the physical parameters (and the noise) by Laplace's Gaussian."""
-    z = np.random.default_rng(seed).standard_normal((draws, len(gaussian.mode)))
-    return summary(function(posterior.physical(gaussian.mode + z @ gaussian.root.T)))
-
-
-def derived_by_weights(posterior: Posterior, found: Evidence, function: Map) -> Summary:
-    """Summarise a function (n, c) → (n, k) of the physical parameters (and the noise) by weighted points."""
-    return summary(function(posterior.physical(found.density.x)), found.weights)
-
-
-def derived_of_field(found: LowRankPosterior, function: Map, *, draws: int = 512, seed: int = 0) -> Summary:
-    """Summarise a function (n, N) → (n, k) of the values of a field, by samples; linear ones have `marginal`."""
-    normal = np.random.default_rng(seed).standard_normal((draws, len(found.mean)))
-    return summary(function(found.samples(normal)))
-
-
-# --- predictions -----------------------------------------------------------------------------------------------------
-
-
-def predictive_std(mode: Point, found: LowRankPosterior, which: NDArray[np.int64] | None = None) -> FloatArray:
-    """Return standard deviations (k,) of outputs, measured or not, without errors of measurement; an adjoint for each.
-
-    Parameters
-    ----------
-    mode
-        Where the posterior is linearised.
-    found
-        The Gaussian there.
-    which
-        Numbers (k,) of the outputs; by default those that were not measured.
-    """
-    numbers = np.flatnonzero(found.weights == 0) if which is None else which
-    unit = np.zeros((len(numbers), len(found.weights)))
-    unit[np.arange(len(numbers)), numbers] = 1
-    if not len(numbers):
-        return np.zeros(0)
-    pulled = found.prior.root_transposed(mode.solution.adjoint(unit))
-    return np.asarray(np.linalg.norm(found.spectrum.root(pulled), axis=1))
-
-
-# --- residuals -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

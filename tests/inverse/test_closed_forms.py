@@ -8,7 +8,6 @@ import pytest
 from scipy import integrate, stats
 
 from inverse.criticism.comparison import _chance_errors, probabilities, quantiles
-from inverse.criticism.predictive import summary
 from inverse.criticism.weights import (
     effective_sample_size,
     normalised,
@@ -198,11 +197,7 @@ def test_probabilities_of_models():
     np.testing.assert_allclose(_chance_errors(P, errors), 0.16 * math.hypot(0.1, 0.3))
 
 
-def test_summaries_of_weighted_points():
-    values, w = np.array([[1.0, 5.0], [2.0, 5.0], [4.0, 5.0]]), np.array([0.5, 0.25, 0.25])
-    found = summary(values, w)
-    np.testing.assert_allclose(found.mean, [2, 5])
-    np.testing.assert_allclose(found.std, [math.sqrt(1.5), 0])
+def test_quantiles_of_weighted_points():
     grid = np.arange(1000) / 1000 + 0.0005
     np.testing.assert_allclose(quantiles(grid[::-1], np.full(1000, 1e-3), (0.025, 0.5, 0.975)), [0.025, 0.5, 0.975])
     # twice the weight is twice the point

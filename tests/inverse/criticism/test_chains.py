@@ -8,7 +8,7 @@ import pytest
 from forward.model import FunctionModel, SolveError
 from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
 from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
-from inverse.criticism.predictive import examine, examine_few, summary
+from inverse.criticism.predictive import examine, examine_few
 from inverse.criticism.verdict import verdict_on_few, verdict_on_field
 from inverse.criticism.weights import enough
 from inverse.fields.field_posterior import FieldPosterior
@@ -18,7 +18,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.surrogate import fit
-from tests.problems import DensePrior, Linear, N, curved, few, ridge, solved
+from tests.problems import DensePrior, Linear, N, curved, few, ridge, solved, summary
 from uq.evaluation.evaluate import SerialEvaluate
 
 

@@ -1,4 +1,4 @@
-"""Derived quantities, predictions and residual tests of posteriors, against closed forms."""
+"""Residual tests of posteriors, against closed forms."""
 
 import numpy as np
 import pytest
@@ -6,61 +6,19 @@ from scipy import stats
 
 from forward.model import FunctionModel
 from inverse.criticism.predictive import (
-    derived_by_laplace,
-    derived_by_weights,
-    derived_of_field,
     examine,
     examine_few,
-    predictive_std,
-    summary,
 )
 from inverse.data.neighbours import neighbours
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
-from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from tests.problems import DATA, PLACES, G, Linear, N, few, solved
+from tests.problems import DATA, PLACES, G, Linear, N, few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-
-
-def test_derived_quantities_of_few_parameters():
-    posterior = few()
-    gaussian = laplace(posterior)
-    H = np.eye(3) + G.T @ G / 0.25
-    g = np.array([1.0, -2.0, 0.5])
-    mean, std = g @ np.linalg.solve(H, G.T @ posterior.data / 0.25), np.sqrt(g @ np.linalg.solve(H, g))
-
-    def function(points):
-        return np.column_stack([points @ g, np.exp(points @ g)])
-
-    by_laplace = derived_by_laplace(posterior, gaussian, function, draws=2**14)
-    by_weights = derived_by_weights(posterior, evidence(posterior, gaussian, 512), function)
-    log_normal = stats.lognorm(std, scale=np.exp(mean))
-    for found, allowed in ((by_laplace, 0.02), (by_weights, 0.1)):
-        np.testing.assert_allclose(found.mean, [mean, log_normal.mean()], rtol=allowed * std)
-        np.testing.assert_allclose(found.std, [std, log_normal.std()], rtol=2 * allowed)
-        bands = np.array([stats.norm(mean, std).ppf(found.levels), log_normal.ppf(found.levels)]).T
-        np.testing.assert_allclose((found.quantiles - bands) / [std, log_normal.std()], 0, atol=3 * allowed)
-    with pytest.raises(ValueError, match="1 of 2 points"):
-        summary(np.array([[1.0], [np.nan]]))
-    assert summary(np.array([[1.0], [np.nan]]), np.array([1.0, 0.0])).mean == 1.0
-
-
-def test_derived_quantities_and_predictions_of_fields():
-    problem = Linear(holes=7)
-    mode, found = solved(problem, cutoff=1e-12)
-    g = np.random.default_rng(1).standard_normal(N)
-    centre, width = found.marginal(g)
-    drawn = derived_of_field(found, lambda m: (m @ g)[:, None], draws=4000)
-    assert drawn.mean[0] == pytest.approx(centre, abs=4 * width / np.sqrt(4000))
-    assert drawn.std[0] == pytest.approx(width, rel=4 / np.sqrt(2 * 4000))
-    spread = np.sqrt(np.diag(problem.G @ problem.covariance @ problem.G.T))
-    np.testing.assert_allclose(predictive_std(mode.point, found), spread[:7], rtol=1e-7)
-    np.testing.assert_allclose(predictive_std(mode.point, found, np.arange(9, 20)), found.predictive_std[9:20])
 
 
 def test_residuals_of_a_right_model_pass_as_often_as_they_should():
