@@ -274,7 +274,8 @@ class SelectSpecimens(MeshTreatment, Select):
 def posterior(candidate: Candidate, data: Measurements, noise: Noise, evaluate: Evaluate) -> Posterior:
     """Return the posterior of a candidate."""
     seen = data.seen()
-    return Posterior(candidate.inputs, evaluate, seen.values, noise.sigma_of(seen), noise.factor, slice(len(seen)))
+    which = np.arange(len(seen))  # what is only predicted follows
+    return Posterior(candidate.inputs, evaluate, seen.values, noise.sigma_of(seen), noise.factor, which)
 
 
 def _without(
