@@ -29,7 +29,7 @@ from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.doubts_of_meshes import mesh_corrected, mesh_too_coarse
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import ApproximationError, Places, Whitening
+from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL
 from inverse.data.measurements import Measurements
 from inverse.methods.invert import Invert
@@ -272,13 +272,13 @@ def known(case: Case, truth: FloatArray) -> Known:
     look, why = case.finer.look(truth)
     if look is None:
         raise SolveError(why)
-    places = Places(3 * case.model.cases + case.model.axes, case.model.places)
     x = np.array(
         [_coordinate(prior, value) for prior, value in zip(case.inputs.marginals.values(), truth, strict=True)]
     )
     slopes = solution.tangent(np.eye(len(truth))).T @ case.inputs.from_normals(x[None])[1][0]
-    outputs = np.array(solution.outputs)
-    return Known(outputs, slopes, error_of(look, outputs, truth, places))
+    outputs, model = np.array(solution.outputs), case.model
+    data = Measurements.of(outputs, outputs, model.cases, model.axes, places=model.places)
+    return Known(outputs, slopes, error_of(look, outputs, truth, data))
 
 
 def _coordinate(prior: Distribution, value: float) -> float:

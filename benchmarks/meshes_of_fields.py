@@ -39,7 +39,7 @@ from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import ApproximationError, Places, Whitening, along
+from inverse.data.approximation_error import ApproximationError, Whitening, along
 from inverse.data.errors import NORMAL
 from inverse.data.measurements import Measurements
 from inverse.fields.field_posterior import FieldPosterior
@@ -150,7 +150,8 @@ def _linear(problem: Problem, truth: FloatArray, clean: FloatArray) -> dict[str,
         raise SolveError(why)
     slopes = solution.tangent(root.T).T  # by coordinates that are standard normal a priori
     outputs = np.array(solution.outputs)
-    plain = error_of(look, outputs, values, Places(3 * model.cases + model.axes, model.places))
+    where = Measurements.of(outputs, outputs, model.cases, model.axes, places=model.places)
+    plain = error_of(look, outputs, values, where)
     mass = problem.prior.matern.mass
     found: dict[str, Any] = {}
     for noise in NOISES:

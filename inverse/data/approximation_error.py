@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.data.errors import NormalErrors, StudentErrors
+from inverse.data.measurements import Measurements
 
 # Standard deviations of what finer meshes still miss: of the pattern of the difference between them and of the error
 # itself, over these, and datum by datum, over the difference (chosen by `python -m benchmarks meshes`).
@@ -68,23 +69,7 @@ class ApproximationError:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Where m data are, for what is uncertain of their mesh error.
-
-    Attributes
-    ----------
-    groups
-        Numbers (m,) of load case and component, or of the output.
-    points
-        Places (m, 3), NaN of data at no place; None where there are none.
-    """
-
-    groups: NDArray[np.int64]
-    points: FloatArray | None = None
-
-
-def uncertain(error: FloatArray, between: FloatArray, places: Places) -> FloatArray:
+def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> FloatArray:
     """Return Uᵀ (k, m): what finer meshes still miss, of the patterns of the error and of the difference between them.
 
     The rest is extrapolated by one factor; in truth the factor is another in each load case, for each component, and
@@ -96,17 +81,15 @@ def uncertain(error: FloatArray, between: FloatArray, places: Places) -> FloatAr
         δ (m,).
     between
         Difference (m,) between the two finer meshes.
-    places
-        Where the data are.
+    data
+        What the data are, and where.
     """
-    shapes, points, groups = [np.ones(len(between))], places.points, places.groups
-    if points is not None:
-        somewhere = np.isfinite(points).all(axis=1)
-        seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        across = np.zeros((len(between), 3))
-        across[somewhere] = 2 * (points[somewhere] - low) / np.where(high > low, high - low, 1.0) - (high > low)
-        shapes += list(across.T)
+    somewhere, points, groups = np.isfinite(data.places).all(axis=1), data.places, data.kinds
+    seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    across = np.zeros((len(between), 3))
+    across[somewhere] = 2 * (points[somewhere] - low) / np.where(high > low, high - low, 1.0) - (high > low)
+    shapes = [np.ones(len(between)), *across.T]
     patterns = (OF_DIFFERENCE * between, OF_ERROR * error)
     rows = [
         pattern * shape * (groups == group) for pattern in patterns for group in np.unique(groups) for shape in shapes

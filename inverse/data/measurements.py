@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from forward.findings import Finding
 from forward.model import FloatArray
 from forward.readable import told
-from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.data.registration import Registered
 from inverse.data.table import DataError, others
@@ -190,11 +189,6 @@ class Measurements:
     def kinds(self) -> Ints:
         """A number (m,) for each pair of a part and a component or output."""
         return kinds(self.cases, self.axes)
-
-    @property
-    def spread(self) -> Places:
-        """Where they are, by what they are."""
-        return Places(self.kinds, self.places)
 
     def neighbours(self) -> Neighbours:
         """Return pairs of neighbouring data that are the same, and of repeated measurements."""

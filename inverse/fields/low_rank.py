@@ -203,11 +203,6 @@ class LowRankPosterior:
         """
         return self.prior.root(self.spectrum.vectors)
 
-    @property
-    def narrowing(self) -> FloatArray:
-        """Posterior over prior standard deviation (r,) along the directions: (1+λ)^{−1/2}."""
-        return np.asarray((1 + self.spectrum.values) ** -0.5)
-
     @cached_property
     def variance(self) -> FloatArray:
         """Variances (N,)."""
@@ -218,10 +213,6 @@ class LowRankPosterior:
     def std(self) -> FloatArray:
         """Standard deviations (N,)."""
         return np.asarray(np.sqrt(np.maximum(self.variance, 0)))
-
-    def trace(self, weights: FloatArray | float = 1.0) -> float:
-        """Sum of the variances, weighted (N,): with volumes of the vertices, the integral over the body."""
-        return float((weights * self.variance).sum())
 
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply Γ_post with g (N,), or (k, N)."""
@@ -234,13 +225,6 @@ class LowRankPosterior:
     def marginal(self, g: FloatArray) -> tuple[float, float]:
         """Mean and standard deviation of the linear functional g·m (N,), for example the mean over a region."""
         return float(g @ self.mean), float(np.sqrt(g @ self.covariance(g)))
-
-    def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
-        """Ends (N,) and (N,) of the central credible intervals of the values."""
-        from scipy.special import ndtri
-
-        half = float(ndtri((1 + level) / 2)) * self.std
-        return self.mean - half, self.mean + half
 
     # --- numbers -----------------------------------------------------------------------------------------------------
 
@@ -273,26 +257,3 @@ class LowRankPosterior:
     def resolution(self) -> FloatArray:
         """Diagonal (n,) of S: from 0 (the datum adds nothing to the others) to 1 (it alone tells its prediction)."""
         return np.asarray((self.spectrum.images**2 / (1 + self.spectrum.values[:, None])).sum(axis=0))
-
-    @property
-    def predictive_std(self) -> FloatArray:
-        """Standard deviations (n,) of the predicted outputs, without measurement errors; NaN where not measured."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(self.weights > 0, np.sqrt(self.resolution) / self.weights, np.nan))
-
-    @property
-    def standardised(self) -> FloatArray:
-        """Residuals r/√(1 − S_ii) (n,), each standard normal if model, prior and σ are right."""
-        return np.asarray(self.residual / np.sqrt(1 - self.resolution))
-
-    @property
-    def residual_test(self) -> tuple[float, float]:
-        """χ² = |r|² + |ξ̂|² of the mode, and the probability of a larger one if model, prior and σ are right.
-
-        For linear models it has as many degrees of freedom as there are data. Small probabilities: the model does not
-        explain the data; near one: σ is too large.
-        """
-        from scipy.special import chdtrc
-
-        square = float(self.residual @ self.residual + self.whitened @ self.whitened)
-        return square, float(chdtrc((self.weights > 0).sum(), square))

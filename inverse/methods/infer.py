@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.assessment import Assessment, Kind, assess
 from inverse.criticism.finer import Finer, MeshFound
-from inverse.data.approximation_error import Places
+from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -26,13 +26,13 @@ Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what pred
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """How the error of the mesh is looked at: on finer meshes, of data at places, and what is done about it.
+    """How the error of the mesh is looked at: on finer meshes, of which data, and what is done about it.
 
     Without a treatment it is not looked at before the search, and only reported.
     """
 
     finer: Finer
-    places: Places
+    data: Measurements
     treatment: Treatment | None
 
 
@@ -112,7 +112,7 @@ def infer(
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     if look is not None:
         treatment = look.treatment or "report"
-        posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.places, treatment)
+        posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
     one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed)
     return Inferred(posterior, searched, one, mesh, before)
 

@@ -125,7 +125,7 @@ def invert_few(
     counted = Recorder(evaluate)
     of_data_set = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
-    looked = None if problem.finer is None else Looked(problem.finer, data.spread, method.treatment)
+    looked = None if problem.finer is None else Looked(problem.finer, data, method.treatment)
     inferred = infer(
         of_data_set,
         start or (lambda point: linearise(inputs, evaluate, point).prediction),

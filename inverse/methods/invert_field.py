@@ -113,7 +113,7 @@ def invert_field(
         return _solve(method, asked, first if start is None else start)
 
     treatment = method.treatment or "report"
-    solved, moved, mesh = corrected_field(posterior, solve, finer, data.spread, treatment, g)
+    solved, moved, mesh = corrected_field(posterior, solve, finer, data, treatment, g)
     mode, found, converged, factor = solved.mode, solved.found, solved.converged, solved.factor
     log_evidence = solved.log_evidence
     spectrum = found.spectrum

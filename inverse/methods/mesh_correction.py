@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
-from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, along, uncertain
+from inverse.data.approximation_error import OF_DATUM, ApproximationError, along, uncertain
+from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.request import Request
@@ -91,14 +92,14 @@ def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -
 
 
 def error_of(
-    look: Look, outputs: FloatArray, point: FloatArray, places: Places, tangents: FloatArray | None = None
+    look: Look, outputs: FloatArray, point: FloatArray, data: Measurements, tangents: FloatArray | None = None
 ) -> ApproximationError:
     """Return the error of a mesh on which a model has outputs (m,) at parameters (d,), and tangents (m, d)."""
     slopes = np.zeros((len(outputs), 0))
     if tangents is not None and look.tangents is not None:
         slopes = look.tangents - tangents
     error = look.outputs - outputs
-    root, apart = uncertain(error, look.between, places), OF_DATUM * np.abs(look.between)
+    root, apart = uncertain(error, look.between, data), OF_DATUM * np.abs(look.between)
     return ApproximationError(point, error, slopes, root, apart)
 
 
@@ -108,7 +109,7 @@ def part(look: Look, which: NDArray[np.int64] | slice) -> Look:
 
 
 def corrected_few(
-    posterior: Posterior, gaussian: Laplace, finer: Finer, places: Places, treatment: Treatment
+    posterior: Posterior, gaussian: Laplace, finer: Finer, data: Measurements, treatment: Treatment
 ) -> tuple[Posterior, Laplace, MeshFound]:
     """Look at the error of the mesh at the mode, and correct it where it is not small.
 
@@ -129,7 +130,7 @@ def corrected_few(
             break
         assert at.tangents is not None
         tangents = at.tangents[0, posterior.which]
-        found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, places, tangents)
+        found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, data, tangents)
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
         root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
@@ -181,7 +182,7 @@ def corrected_field(
     posterior: FieldPosterior,
     solve: Callable[[FieldPosterior, FloatArray | None], S],
     finer: Finer,
-    places: Places,
+    data: Measurements,
     treatment: Treatment,
     weights: FloatArray,
 ) -> tuple[S, FloatArray, MeshFound]:
@@ -193,7 +194,7 @@ def corrected_field(
         Not corrected.
     solve
         Finds the mode of a posterior, from ξ (N,) or from the centre of the prior, and the Gaussian there.
-    finer, places, treatment
+    finer, data, treatment
         As of few parameters.
     weights
         Of the vertices (N,) in the mean over the body.
@@ -206,7 +207,7 @@ def corrected_field(
         look, why = finer.look(point.values)
         if look is None:
             break
-        found = error_of(look, np.asarray(point.solution.outputs), point.values, places)
+        found = error_of(look, np.asarray(point.solution.outputs), point.values, data)
         found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.whitening)]))
         over = found.error * posterior.measured / point.posterior.sigma  # nothing is said of data that are not there
         rest = found.error if mesh is None else found.error - mesh.error

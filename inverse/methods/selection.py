@@ -24,7 +24,6 @@ from inverse.criticism.comparison import Candidate, comparison
 from inverse.criticism.finer import Finer
 from inverse.criticism.verdict import verdict_on_points
 from inverse.criticism.weights import fewest
-from inverse.data.approximation_error import Places
 from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST
@@ -187,7 +186,7 @@ class Select(Settings):
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
             starts[name, group] = by_tangents(one.inputs, one.evaluate)
             data = data_groups[group].seen()
-            places = Places(data.kinds, np.nan_to_num(data.places))
+            data = replace(data, places=np.nan_to_num(data.places))
             with _of((name, group)):
                 found[name, group] = infer(
                     one,
@@ -195,7 +194,7 @@ class Select(Settings):
                     self.samples,
                     starts=self.starts,
                     seed=self.seed,
-                    look=None if finer is None else Looked(finer(name, group), places, self.treatment),
+                    look=None if finer is None else Looked(finer(name, group), data, self.treatment),
                     shared=None if shared is None else shared.get((name, group)),
                     chains=self.chains,
                     model=None if model is None else model(name, group),

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from forward.model import FunctionModel, SolveError
 from inverse.criticism.doubts_of_meshes import certain, meshes_not_alike, meshes_too_coarse
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import Places
+from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import corrected_few
@@ -36,7 +36,8 @@ def solve(point, tangents):
 
 
 def reported(given, gaussian, finer):
-    return corrected_few(given, gaussian, finer, Places(np.zeros(7, dtype=int)), "report")[2]
+    data = Measurements.of(DATA, SIGMA, [0] * 7, [0] * 7)
+    return corrected_few(given, gaussian, finer, data, "report")[2]
 
 
 def exact(gap, scale=1.0):

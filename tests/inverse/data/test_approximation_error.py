@@ -12,12 +12,12 @@ from inverse.data.approximation_error import (
     OF_DIRECTION,
     OF_ERROR,
     ApproximationError,
-    Places,
     Whitening,
     along,
     uncertain,
 )
 from inverse.data.errors import NORMAL, StudentErrors
+from inverse.data.measurements import Measurements
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -40,18 +40,18 @@ SIGMA = 0.3 + 0.2 * RNG.uniform(size=M)
 PRIOR_MEAN, PRIOR = np.array([1.0, 0.0]), np.diag([0.25, 4.0])
 DATA = FINE @ [1.3, -0.8] + SHIFT + SIGMA * RNG.standard_normal(M)
 INPUTS = Inputs({"a": Normal(mean=1.0, std=0.5), "b": Normal(mean=0.0, std=2.0)})
-PLACES = Places(np.arange(M) % 2, RNG.uniform(size=(M, 3)))
+PLACES = Measurements.of(np.zeros(M), SIGMA, np.arange(M) % 2, [0] * M, places=RNG.uniform(size=(M, 3)))
 APART = OF_DATUM * np.abs(BETWEEN)
 
 
 def covariance_of(error, rows=slice(None)):
     """Covariance of what is uncertain of an error of the mesh, by its definition."""
-    shapes = [np.ones(M), *(2 * (PLACES.points - PLACES.points.min(0)) / np.ptp(PLACES.points, axis=0) - 1).T]
+    shapes = [np.ones(M), *(2 * (PLACES.places - PLACES.places.min(0)) / np.ptp(PLACES.places, axis=0) - 1).T]
     found = np.diag(APART**2)
     for pattern in (OF_DIFFERENCE * BETWEEN, OF_ERROR * error):
         for group in (0, 1):
             for shape in shapes:
-                column = pattern * shape * (PLACES.groups == group)
+                column = pattern * shape * (PLACES.cases == group)
                 found = found + np.outer(column, column)
     return found[rows][:, rows]
 
@@ -187,8 +187,8 @@ def test_what_is_uncertain_is_of_each_load_case():
     root = uncertain(SHIFT, BETWEEN, PLACES)
     covariance = root.T @ root
     np.testing.assert_allclose(covariance, covariance_of(SHIFT) - np.diag(APART**2), atol=1e-15)
-    assert not covariance[np.ix_(PLACES.groups == 0, PLACES.groups == 1)].any()
-    alone = uncertain(SHIFT, BETWEEN, Places(np.arange(M)))
+    assert not covariance[np.ix_(PLACES.cases == 0, PLACES.cases == 1)].any()
+    alone = uncertain(SHIFT, BETWEEN, Measurements.of(np.zeros(M), SIGMA, range(M), [0] * M))
     squares = (OF_DIFFERENCE * BETWEEN) ** 2 + (OF_ERROR * SHIFT) ** 2
     np.testing.assert_allclose(alone.T @ alone, np.diag(squares), atol=1e-15)
     assert len(uncertain(np.zeros(M), np.zeros(M), PLACES)) == 0
