@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
@@ -29,14 +29,16 @@ HALF = 8.0  # inches: wider pictures are not legible on half a page
 class Block:
     """Something on the page."""
 
-    macro: ClassVar[str]
+    @property
+    def macro(self) -> str:
+        """The name of what draws it in report.html.jinja: its own."""
+        return type(self).__name__.lower()
 
 
 @dataclass(frozen=True)
 class Heading(Block):
     """A heading; level 1 is the title of the page."""
 
-    macro = "heading"
     text: str
     level: Literal[1, 2, 3] = 2
 
@@ -45,7 +47,6 @@ class Heading(Block):
 class Text(Block):
     """A paragraph."""
 
-    macro = "text"
     text: str
     tone: Literal["", "lead", "warning", "error"] = ""
 
@@ -54,7 +55,6 @@ class Text(Block):
 class Pairs(Block):
     """Words, each with the lines that explain it."""
 
-    macro = "pairs"
     items: Sequence[tuple[str, Sequence[str]]]
 
     @classmethod
@@ -67,7 +67,6 @@ class Pairs(Block):
 class Table(Block):
     """A table; the columns `text` are flush left, and those of them in `long` are wrapped; row `strong` stands out."""
 
-    macro = "table"
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     text: frozenset[int] = frozenset({0})
@@ -117,7 +116,6 @@ class Picture:
 class Pictures(Block):
     """Pictures side by side; `small` ones are three in a row."""
 
-    macro = "pictures"
     items: Sequence[Picture]
     small: bool = False
 
@@ -173,7 +171,6 @@ class Answer:
 class Card(Block):
     """The question of a study in words, what forbids to believe the answers, and these side by side."""
 
-    macro = "card"
     question: str
     answers: Sequence[Answer] = ()
     errors: Sequence[str] = ()
@@ -193,7 +190,6 @@ class Viewer(Block):
         Pictures for paper, and for browsers that cannot turn it.
     """
 
-    macro = "viewer"
     label: str
     told: str
     data: str
@@ -204,7 +200,6 @@ class Viewer(Block):
 class Code(Block):
     """Text as it is in a file."""
 
-    macro = "code"
     text: str
 
 
@@ -212,7 +207,6 @@ class Code(Block):
 class Folded(Block):
     """Blocks that open when their title is clicked, and on paper if they are `printed`."""
 
-    macro = "folded"
     title: str
     blocks: Sequence[Block]
     printed: bool = True
@@ -225,7 +219,6 @@ class Html(Block):
     Whoever makes it escapes what is not markup (`html.escape`). Reports are one file: nothing may be fetched.
     """
 
-    macro = "html"
     markup: str
     style: str = ""
     script: str = ""

@@ -35,10 +35,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
     lines = _said(severe)
     before = len(lines)
     if not {"outputs", "methods", "local"} & summary.keys():
-        from workflows.report.section import Results
-        from workflows.report.sections.answer import in_lines
-
-        lines += in_lines(Results(dataset, summary, study))
+        lines += _answers(dataset, summary, study)
     lines += _outputs(dataset, summary.get("outputs", {}))
     lines += _bars(summary)
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
@@ -66,6 +63,16 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
 
 def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
     return [f"{one['severity']}: {one['text']}" for one in findings]
+
+
+def _answers(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind) -> Iterator[str]:
+    """Write the answers that the report begins with, a line each."""
+    from workflows.report.blocks import Card
+    from workflows.report.section import SECTIONS, Results
+
+    for block in SECTIONS["answer"]().content(Results(dataset, summary, study)):
+        for one in block.answers if isinstance(block, Card) else ():
+            yield "; ".join([f"{one.name}: {one.value}", *one.lines]).replace("\u00a0", " ")
 
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

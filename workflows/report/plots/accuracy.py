@@ -48,8 +48,6 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
         Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN where not estimated.
     of
         The estimate, in words.
-    ax
-        Where to draw.
     """
     from matplotlib.ticker import LogLocator, NullLocator
 
@@ -94,8 +92,6 @@ def tolerance_bars(told: Mapping[str, Any], ax: Axes | None = None) -> Axes:
     ----------
     told
         `accuracy` of summary.json.
-    ax
-        Where to draw.
     """
     found = {
         f"{name}, {WORDS[estimate]}": parts
@@ -257,8 +253,6 @@ def errors(
         The mean or the standard deviation.
     against
         The number of solves, or the processor time, with the plain method by the textbook solver too.
-    ax
-        Where to draw.
     """
     ax = ax or axes(height=4.2, width=8.6)
     of_output = dataset.sel(output=output)

@@ -174,8 +174,6 @@ def comparison(
         Name of the output; studies without an estimate of it are omitted.
     estimated
         The mean or the standard deviation.
-    ax
-        Where to draw.
     """
     shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
     ax = ax or axes(height=1.2 + 0.42 * len(shown))

@@ -116,8 +116,6 @@ def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, 
         Where on the path each output is, by its name.
     over, of
         What is drawn at the two axes, with its unit.
-    ax
-        Where to draw.
     """
     here = [k for k, test in enumerate(dataset["output_test"].values) if str(test) in places]
     one = dataset.isel(output=here)

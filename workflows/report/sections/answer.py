@@ -42,25 +42,13 @@ LAPLACE = 0  # value of `source`, see docs/results.md
 @section()
 def answer_first(results: Results) -> Iterator[Block]:
     """What was asked and found, for every kind of study."""
-    found = answers(results)
-    if found is not None:
+    dataset = results.dataset
+    card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
+    if card is not None:
+        found = card(results)
         yield Card(found.question, found.answers[:TILES], gravest(results))
         if len(found.answers) > TILES:
             yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
-
-
-def answers(results: Results) -> Card | None:
-    """Return the question of a study and its answers, or none of what asks nothing."""
-    dataset = results.dataset
-    card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
-    return None if card is None else card(results)
-
-
-def in_lines(results: Results) -> Iterator[str]:
-    """Write the answers for a terminal, a line each."""
-    found = answers(results)
-    for one in () if found is None else found.answers:
-        yield "; ".join([f"{one.name}: {one.value}", *one.lines]).replace("\u00a0", " ")
 
 
 def forward(results: Results) -> Card:

@@ -32,7 +32,12 @@ def error_against_cost(results: Results) -> Iterator[Block]:
         "textbook solver, on some draws); the error of the mesh, by estimate or (method.mesh_error) by a "
         "mesh of twice the cells in each direction at the mean parameters."
     )
-    yield references(results)
+    rows = []
+    for output in results.outputs:
+        of, unit = results.of(output), results.unit(output)
+        floors = (size(abs(float(of[f"{name}_error"])), unit) for name in ("solver", "mesh"))
+        rows.append((output, *(results.estimate(output, name) for name in WORDS), *floors))
+    yield Table(("output", *WORDS.values(), "error of the solver", "error of the mesh"), rows)
     yield Text(
         "RMSE is the root mean square error of the repeats against the reference, “claimed” the standard error "
         "that the method itself gives, coverage the share of its 95\u00a0% intervals that contain the reference. "
@@ -50,16 +55,6 @@ def error_against_cost(results: Results) -> Iterator[Block]:
                 *((ax, f"Error of the {word} of {output} against {costs[a]}.") for a, ax in drawn.items())
             )
             yield errors(results, output, estimated)
-
-
-def references(results: Results) -> Table:
-    """The references, and the errors of the solver and the mesh."""
-    rows = []
-    for output in results.outputs:
-        of_output, unit = results.of(output), results.unit(output)
-        floors = (size(abs(float(of_output[f"{name}_error"])), unit) for name in ("solver", "mesh"))
-        rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
-    return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
 
 
 def errors(results: Results, output: str, estimated: str) -> Table:
@@ -141,9 +136,8 @@ def models(results: Results) -> Table:
             f"({number(float(here['fidelity_remainder_correlation'].sel(output=o)), 5)})"
             for o in results.outputs
         ]
-        rows.append(
-            (str(label), number(float(here["fidelity_cost"]), 3), taken, f"{int(here['fidelity_samples']):,}", *related)
-        )
+        cost, samples = number(float(here["fidelity_cost"]), 3), f"{int(here['fidelity_samples']):,}"
+        rows.append((str(label), cost, taken, samples, *related))
     head = ("model", "a solve, predicted (1: the study's model)", "measured", "samples")
     return Table((*head, *(f"correlation, {output}" for output in results.outputs)), rows)
 
@@ -158,10 +152,9 @@ def groups(results: Results) -> Table:
         pilot = " (pilot, which does not count)" if bool(here["group_pilot"]) else ""
         if bool(here["group_chosen"]):
             pilot = " (chosen where two cheap models differ)" if len(members) == len(labels) else " (the other points)"
-        count, cost = int(here["group_samples"]), float(here["group_cost"])
-        rows.append(
-            (", ".join(members) + pilot, f"{count:,}", f"{int(here['group_failed']):,}", number(count * cost, 3))
-        )
+        count, failed = int(here["group_samples"]), f"{int(here['group_failed']):,}"
+        cost = number(count * float(here["group_cost"]), 3)
+        rows.append((", ".join(members) + pilot, f"{count:,}", failed, cost))
     return Table(("groups of models", "samples", "failed", "cost in solves of the study's model"), rows)
 
 
