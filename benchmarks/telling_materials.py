@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from forward.hyperelastic import Path
 from forward.model import FloatArray
-from forward.path import Path
 
 SIDE, RADIUS = 10e-3, 3e-3  # m
 OF_FORCE, STEPS, HALVED = 0.03, 8, 6  # errors of the root mean square of a curve; Gauss–Newton steps, how often halved

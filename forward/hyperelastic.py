@@ -1,15 +1,35 @@
-"""The specification of a hyperelastic body under loads; no FEniCSx until built."""
+"""The specifications of a hyperelastic body under loads, which may change step by step; no FEniCSx until built."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
+from pydantic import Field, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
 from forward.bodies.in_words import in_words
+from forward.fem.cost import Times, sum_of
+from forward.fem.mesh_error_cost import Estimate
+from forward.findings import Finding
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, ModelError
+from forward.observables.observable import Output
+from forward.readable import scale
 from forward.registry import named
+from forward.scalars import Mistake, Scalar
+from forward.settings import nearest, shown
 from forward.spec import UNREFINED
+from forward.terms.displacement import Block, label, lists, too_far
+from forward.words import number, with_unit
+
+LEAST = 2  # steps of a path
+LISTED = 6  # steps that are named
+BLOCKS: tuple[Block, ...] = ("loads", "displacements")  # whose numbers may have steps
 
 
 class Hyperelastic(LoadedBody):
@@ -79,5 +99,180 @@ class Hyperelastic(LoadedBody):
             message = f"model.adapt: {UNREFINED}"
             raise ModelError(message)
         alone = "path:built" if self.stepped else "model:HyperelasticModel"
-        model = "history:HistoryModel" if self.frictional else alone
+        model = "path:HistoryModel" if self.frictional else alone
         return named(f"forward.fem.{model}")(self, comm, parameters)
+
+
+class Path(Hyperelastic):
+    """A hyperelastic body in several steps, each solved from the one before: every output is a curve over the path.
+
+    Numbers of loads and prescribed displacements may be lists, with a value for each step
+    (``depth = [0.5e-3, 1e-3, 2e-3]``); the other numbers are the same in all steps and can be parameters. The material
+    has no memory, so that steps only say where the curve is known.
+
+    Parameters
+    ----------
+    steps
+        The lists by the paths of the numbers; lists in the loads and displacements themselves are added to it.
+    """
+
+    kind: Literal["path"] = "path"  # type: ignore[assignment]
+    steps: dict[str, tuple[float, ...]] = Field(default={})
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Loads and displacements whose numbers are lists are tables too."""
+        found = handler.resolve_ref_schema(handler(core))
+        lists_too = {"type": "object", "description": "as in kind = 'hyperelastic'; a number may be a list"}
+        for block in BLOCKS:
+            items = found["properties"][block]["items"]
+            found["properties"][block]["items"] = {"anyOf": [items, lists_too]}
+        return found
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists(cls, given: Any) -> Any:
+        """Collect the lists in loads and displacements, which keep their last values."""
+        if not isinstance(given, Mapping):
+            return given
+        stated = given.get("steps", {})
+        found: dict[str, Any] = dict(stated) if isinstance(stated, Mapping) else {}
+        changed: dict[str, Any] = {}
+        for block in BLOCKS:
+            items = given.get(block, ())
+            if not isinstance(items, list | tuple):
+                continue
+            of_items = [lists(block, item) for item in items]
+            for item, of_item in zip(items, of_items, strict=True):
+                found |= {f"{block}.{label(block, item)}.{name}": values for name, values in of_item.items()}
+            changed[block] = tuple(
+                {**item, **{name: values[-1] for name, values in of_item.items()}} if of_item else item
+                for item, of_item in zip(items, of_items, strict=True)
+            )
+        return {**given, **changed, "steps": stated if found == stated else found}
+
+    @property
+    def stepped(self) -> Mapping[str, tuple[float, ...]]:
+        """The lists by the paths of the numbers."""
+        return self.steps
+
+    @property
+    def count(self) -> int:
+        """Number of steps."""
+        return len(next(iter(self.steps.values())))
+
+    @property
+    def leading(self) -> str:
+        """Path of the number over which curves are drawn: the first that has steps."""
+        return next(iter(self.steps))
+
+    @property
+    def whole(self) -> Hyperelastic:
+        """The body at the last step, with the numbers that change among the others."""
+        return Hyperelastic(**{name: getattr(self, name) for name in Hyperelastic.model_fields if name != "kind"})
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Every number that can be made a parameter, by its path: not those that have steps."""
+        return {path: number for path, number in super().scalars.items() if path not in self.steps}
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths: they have steps."""
+        why = "has a value for each step, and what has steps cannot be random; expected one value, or another parameter"
+        return dict(super().unavailable) | dict.fromkeys(self.steps, why)
+
+    @property
+    def returned(self) -> tuple[Output, ...]:
+        """All outputs at the first step, then at the second, and so on: each with the number of the step, from 1."""
+        return tuple(one.model_copy(update={"name": f"{one.name}.{step}"}) for one, step in self._at_steps)
+
+    @property
+    def _at_steps(self) -> list[tuple[Output, int]]:
+        return [(output, step) for step in range(1, self.count + 1) for output in self.outputs]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Which step each is, and the numbers there."""
+        where = [", ".join(f"{p} = {v[k]:g}" for p, v in self.steps.items()) for k in range(self.count)]
+        return tuple(f"step {k} of {self.count} ({numbers})" for k, numbers in enumerate(where, 1))
+
+    @property
+    def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
+        """Which output and which step each of these is, and the numbers that have steps there."""
+        found: dict[str, tuple[str, list[Any]]] = {
+            "output_of": ("", [output.name for output, _ in self._at_steps]),
+            "step": ("1", [step for _, step in self._at_steps]),
+        }
+        for path, values in self.steps.items():
+            found[path] = self.unit_of(path), [values[step - 1] for _, step in self._at_steps]
+        return found
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings before anything is solved."""
+        ends = {path: (min(values), max(values)) for path, values in self.steps.items()}
+        return tuple(dict.fromkeys((*super().findings, *too_far(self.body, ends))))
+
+    def cost(self, factors: int = 1) -> Times:
+        """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
+        found = super().cost(factors)
+        return found if self.frictional else sum_of([replace(found, contact=False)] * self.count)
+
+    def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
+        """Predict what an estimate of the error of the mesh takes in all steps."""
+        return sum_of([super().mesh_error_cost(spare)] * self.count)
+
+    def described(self, ranges: Any) -> Iterator[tuple[str, str]]:
+        """Say what the body is, and which steps there are."""
+        yield from super().described(ranges)
+        for path in self.steps:
+            yield "steps", f"{path} = {self.in_words(path)}"
+
+    def unit_of(self, path: str) -> str:
+        """SI unit of a number that has steps."""
+        return super().scalars[path].unit
+
+    def in_words(self, path: str) -> str:
+        """The values of a number that has steps."""
+        values = self.steps[path]
+        one, unit = scale(max(map(abs, values)), self.unit_of(path))
+        said = [number(value / one) for value in values]
+        listed = ", ".join(said) if len(said) <= LISTED else f"from {said[0]} to {said[-1]}"
+        return f"{with_unit(listed, unit)} in {len(said)} steps"
+
+    def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
+        """Say for a report what was solved."""
+        return super().words(lambda path: self.in_words(path) if path in self.steps else said(path), where)
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        yield from super()._mistakes()
+        if not self.steps:
+            message = "no number has steps, expected a list for a number of a load or of a displacement"
+            yield ("steps",), message, {}
+            return
+        known = {path: one for path, one in super().scalars.items() if path.partition(".")[0] in BLOCKS}
+        for path, values in self.steps.items():
+            if path not in known:
+                yield ("steps", path), f"no number of a load or displacement; {nearest(path, tuple(known))}", path
+                continue
+            if len(values) < LEAST:
+                yield ("steps", path), f"{len(values)} values, expected at least {LEAST}", list(values)
+            for i, value in enumerate(values):
+                objection = known[path].objection(value) if math.isfinite(value) else "input should be a finite number"
+                if objection is not None:
+                    yield ("steps", path, i), objection, value
+            again = next((i for i, (a, b) in enumerate(itertools.pairwise(values), 1) if a == b), None)
+            if again is not None and len(self.steps) == 1:
+                yield ("steps", path, again), "the same as the step before, expected another value", values[again]
+        lengths = {path: len(values) for path, values in self.steps.items()}
+        if len(set(lengths.values())) > 1:
+            told = ", ".join(f"{path} {n}" for path, n in lengths.items())
+            yield (
+                ("steps",),
+                f"lists of different lengths ({told}), expected a value of each for every step",
+                shown(lengths),
+            )
+        if self.adapt is not None:
+            message = "a mesh is refined for one state, expected no steps (or the mesh that such a study leaves)"
+            yield ("adapt",), message, True

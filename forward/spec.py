@@ -265,7 +265,7 @@ MODELS = Kinds(
     "model",
     {
         "hyperelastic": "forward.hyperelastic:Hyperelastic",
-        "path": "forward.path:Path",
+        "path": "forward.hyperelastic:Path",
         "specimen": "forward.specimen:Specimen",
         "reduced": "forward.reduced.spec:Reduced",
         "python": "forward.external.models:PythonModel",

@@ -27,9 +27,7 @@ LONG = 450  # lines of a file that can be read as a whole
 CONTAINERS = ("Table", "Readings", "Scan", "Observations", "Placed", "Measurement", "Measurements", "Components")
 WRAPPERS = (
     "forward/combine.py",
-    "forward/path.py",
     "forward/fem/path.py",
-    "forward/fem/history.py",
     "forward/specimen.py",
     "forward/fem/specimen.py",
     "forward/fem/finer.py",

@@ -5,9 +5,8 @@ import pytest
 from mpi4py import MPI
 from pydantic import ValidationError
 
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import Hyperelastic, Path
 from forward.model import Guess, ReferenceSolution, SolveError, Stability
-from forward.path import Path
 from tests.bodies import loaded_body
 from tests.launch import run_script
 

@@ -8,8 +8,7 @@ from scipy.sparse import csr_matrix
 from forward.combine import Joined, Mapped, Rows, Sparse, selected
 from forward.conformance import check_derivatives
 from forward.fem.finer import FromStart, limit
-from forward.hyperelastic import Hyperelastic
-from forward.path import Path
+from forward.hyperelastic import Hyperelastic, Path
 from forward.specimen import Specimen
 from tests.launch import run_script
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from forward.fem.enriched import EnrichedState
-from forward.fem.history import HistorySolution, Increment, Passed
 from forward.fem.latest import Latest
+from forward.fem.path import HistorySolution, Increment, Passed
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
 

@@ -7,8 +7,8 @@ from pydantic import ValidationError
 
 from forward.conformance import check_derivatives
 from forward.fem.model import HyperelasticModel
+from forward.hyperelastic import Path
 from forward.model import SolveError
-from forward.path import Path
 from tests.forward.terms.test_indenter import SIDE, body, only, tool
 from tests.launch import run_script
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from forward.path import Path as Steps
+from forward.hyperelastic import Path as Steps
 from inverse.data.curves import steps_of
 from inverse.data.outputs import read_outputs
 from inverse.data.table import DataError

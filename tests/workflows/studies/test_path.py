@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
-from forward.path import Path
+from forward.hyperelastic import Path
 from inverse.data.curves import steps_of
 from inverse.data.outputs import read_outputs
 from tests.launch import TISSUQ, assert_same_bits, run

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.bodies.geometry import AXES
+from forward.hyperelastic import Path as PathOfLoads
 from forward.model import SolveError
-from forward.path import Path as PathOfLoads
 from forward.readable import and_error, size, spoken
 from forward.specimen import Specimen
 from forward.words import named, number
