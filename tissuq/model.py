@@ -158,17 +158,18 @@ class Solution(Mapping[str, float]):
         return np.zeros((0, 3)) if whole is None else whole[0, : self._of.nodes.size].reshape(-1, 3)
 
     def displacement_at(self, points: ArrayLike) -> FloatArray:
-        """Return the displacements (n, 3) at points (n, 3) of the undeformed body (m); on the first rank only.
+        """Return the displacements (n, 3) at points (n, 3) of the undeformed body (m); collective.
 
         Raises
         ------
         ValueError
             If a point is not in the body.
         """
+        from forward.fem.space import interpolation
+
         places = np.atleast_2d(np.asarray(points, dtype=float))
-        displacement = self.displacement
-        space: Any = self._of.model.space
-        around, _ = space.interpolation(places)
-        if not len(displacement):
-            return np.zeros((0, 3))
-        return np.array([weights @ displacement[nodes] for nodes, weights in around])
+        equations = self._of.model.equations  # type: ignore[attr-defined]
+        along = np.tile(np.eye(3), (len(places), 1))
+        rows = interpolation(equations, np.repeat(places, 3, axis=0), along)
+        found: FloatArray = equations.total(rows @ self.solved.state)
+        return found.reshape(-1, 3)

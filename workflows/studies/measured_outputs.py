@@ -166,5 +166,6 @@ class MeasuredOutputs(Settings):
 def check_signs(found: Measurements, model: ModelSpec) -> None:
     """Refuse measured outputs of a model whose sign cannot be right, over all steps of each, as `signs.check`."""
     outputs = [model.returned[axis] for axis in found.axes]
-    names = [getattr(output, "of", output.name) for output in outputs]
+    _, of = model.axes_of_outputs.get("output_of", ("", [output.name for output in model.returned]))
+    names = [of[axis] for axis in found.axes]
     signs.check(names, found.values, found.labels, [getattr(output, "negative", True) for output in outputs])

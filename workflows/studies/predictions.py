@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import REPORT, START
 from forward.settings import one_line
-from uq.accuracy.goal import SHARE
+from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times

@@ -17,7 +17,7 @@ from forward.model import ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from uq.accuracy.goal import FEWEST, OF_SOLVER, estimates_for, spare_for
+from uq.accuracy.budget import FEWEST, OF_SOLVER, estimates_for, spare_for
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method

@@ -11,7 +11,7 @@ import numpy as np
 
 from forward.model import SolveError, Stability
 from forward.registry import named
-from uq.accuracy.goal import spare_for
+from uq.accuracy.budget import spare_for
 from uq.estimators import branch
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge

@@ -19,7 +19,7 @@ from forward.machine import MIB
 from forward.model import ModelError
 from forward.scalars import Mistake
 from forward.words import number
-from uq.accuracy.goal import LEAST, OF_SOLVER
+from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
 from uq.methods.method import UNASKED
 from workflows.studies.predictions import times_of

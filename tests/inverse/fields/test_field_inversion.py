@@ -262,7 +262,9 @@ def recovered(fine, cells, **settings):
     )
     clean = maker.solve(truth(maker.space.coordinates)).outputs
     rng = np.random.default_rng(0)
-    sigma = NOISE * np.array([np.sqrt((values**2).mean()) for values in model.values(clean)])[model.cases]
+    sigma = (
+        NOISE * np.array([np.sqrt((clean[model.cases == k] ** 2).mean()) for k in np.unique(model.cases)])[model.cases]
+    )
     data = clean + sigma * rng.standard_normal(len(clean))
     posterior = FieldPosterior(model, data, sigma, FIELD.prior(model.spec.body))
     few = np.repeat(rng.uniform(size=len(data) // 3) < 0.05, 3)

@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
+from uq.accuracy.budget import FEWEST, MOST, estimates_for
 from uq.accuracy.doubts import Told
 from uq.accuracy.effects import CHANGED, DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors
-from uq.accuracy.goal import FEWEST, MOST, estimates_for
 from uq.accuracy.mesh_errors import design, estimate
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from scipy import integrate, optimize, signal, stats
 
-from uq.accuracy.goal import estimates_for, spare_for
+from uq.accuracy.budget import estimates_for, spare_for
 from uq.estimators.averaged import average
 from uq.estimators.blue import informations, weights
 from uq.estimators.indices import (
