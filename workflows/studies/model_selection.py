@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
@@ -31,9 +31,8 @@ from workflows.studies.candidates import OfCandidates, changed, spec_of
 from workflows.studies.material_tests import WHOLE, expanded
 from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of
 from workflows.studies.measured_outputs import OutputFile
-from workflows.studies.predictions import has_mesh, mesh_check, meshes_of, never_estimable, of_file
+from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
 from workflows.studies.selection import Comparison, Selection
-from workflows.studies.solves import of_answers
 from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
@@ -151,17 +150,6 @@ class ModelSelection(OfCandidates, Comparison):
         return ""
 
     @property
-    def of_files(self) -> frozenset[str]:
-        """Candidates whose meshes are those of files."""
-        return frozenset(name for name, spec in self.of_candidates.items() if of_file(spec))
-
-    @property
-    def mesh_checks(self) -> list[tuple[float, str]]:
-        """Processor time (s) of the solves on finer meshes of each candidate, and what is solved."""
-        checked: list[Any] = [one for one in self.of_candidates.values() if has_mesh(one)]
-        return [mesh_check(one) for one in checked]
-
-    @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the models before anything is solved, each once."""
         return tuple(dict.fromkeys([*self.findings_of_models, *super().findings, *self._of_outputs()]))
@@ -228,12 +216,6 @@ class ModelSelection(OfCandidates, Comparison):
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
         spec, found = cast("Specimen", self.of_candidates[name]), self.measurements
         return None if found.some else motion_of(found.in_model(spec.observable), spec.body)
-
-    def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
-        """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
-        if self.of_candidates[name].shareable:
-            return []
-        return [one.of(f"Candidate '{name}'") for one in of_answers(make(), self.candidates[name].inputs)]
 
     @model_validator(mode="before")
     @classmethod

@@ -31,12 +31,22 @@ from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
 from workflows.studies.job import MOVED, MethodJob
 from workflows.studies.material_tests import DataFile, MeasuredTest, MeasuredTests
-from workflows.studies.predictions import FINER, NOT_ASKED, duration, once_on_finer_meshes
+from workflows.studies.predictions import (
+    FINER,
+    NOT_ASKED,
+    duration,
+    has_mesh,
+    mesh_check,
+    of_file,
+    once_on_finer_meshes,
+)
+from workflows.studies.solves import of_answers
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.spec import ModelSpec
     from inverse.data.shared_motion import SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -78,14 +88,14 @@ class Comparison(StudyKind):
         return {}
 
     @property
-    def of_files(self) -> frozenset[str]:
-        """Candidates whose meshes are those of files."""
-        return frozenset()
+    def of_candidates(self) -> Mapping[str, ModelSpec]:
+        """Models of the candidates; none of materials."""
+        return {}
 
     @property
     def mesh_checks(self) -> list[tuple[float, str]]:
-        """Processor time (s) of a solve on a finer mesh of each candidate, and what is solved, where that is known."""
-        return []
+        """Processor time (s) of solves on finer meshes of each candidate that has a mesh, and what is solved."""
+        return [mesh_check(spec) for spec in self.of_candidates.values() if has_mesh(spec)]
 
     def described(self, name: str) -> str:
         """Describe a candidate."""
@@ -105,7 +115,10 @@ class Comparison(StudyKind):
 
     def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
         """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
-        return []
+        spec = self.of_candidates.get(name)
+        if spec is None or spec.shareable:
+            return []
+        return [one.of(f"Candidate '{name}'") for one in of_answers(make(), self.candidates[name].inputs)]
 
     @property
     def data_groups(self) -> dict[str, Measurements]:
@@ -222,7 +235,7 @@ class Comparison(StudyKind):
         def labelled(found: xr.Dataset) -> xr.Dataset:
             found = found.assign_attrs(quantity=self.data.quantity)
             if "mesh_checked" in found:
-                of_files = [str(name) in self.of_files for name in found.model.values]
+                of_files = [of_file(self.of_candidates[str(name)]) for name in found.model.values]
                 found = found.assign(mesh_of_file=("model", of_files))
             candidates = {name: candidate.inputs for name, candidate in self.candidates.items()}
             units = {name: self.units_of(name) for name in candidates}
