@@ -36,6 +36,8 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
     before = len(lines)
     if not {"outputs", "methods", "local"} & summary.keys():
         lines += _answers(dataset, summary, study)
+    sets = summary.get("data_sets", {}).items()
+    lines += [f"{name}: failed: {found['failed']}" for name, found in sets if "failed" in found]
     lines += _outputs(dataset, summary.get("outputs", {}))
     lines += _bars(summary)
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""

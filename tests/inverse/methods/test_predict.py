@@ -174,7 +174,7 @@ def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(fold
     assert told["mean"] == pytest.approx(float(one["prediction_mean"][1]))
     assert 0.9 < told["share"] < 1
     assert told["mesh_error"] is None
-    assert "outputs: v 0.8" in capsys.readouterr().out
+    assert "v, predicted: 0.8" in capsys.readouterr().out
     page = (out / "report.html").read_text()
     looked_at(out)
     assert "Predictions" in page
