@@ -61,7 +61,7 @@ def problem(cells: int) -> tuple[FieldPosterior, FloatArray]:
     model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
     true = truth(model.space.coordinates)
     clean = model.solve(true).outputs
-    sizes = [np.sqrt((part**2).mean()) for part in model.values(clean)]
+    sizes = [np.sqrt((part**2).mean()) for part in np.split(clean, np.flatnonzero(np.diff(model.cases)) + 1)]
     sigma = NOISE * np.array(sizes)[model.cases]
     data = clean + sigma * np.random.default_rng(0).standard_normal(len(clean))
     return FieldPosterior(model, data, sigma, FIELD.prior(spec.body)), true

@@ -332,7 +332,7 @@ def shares(
 
 def sigma_of(model: SpecimenModel, clean: FloatArray, noise: float) -> FloatArray:
     """Standard deviations (m,) of the errors: a share of the root mean square of each load case."""
-    sizes = np.array([np.sqrt((part**2).mean()) for part in model.values(clean)])
+    sizes = np.array([np.sqrt((part**2).mean()) for part in np.split(clean, np.flatnonzero(np.diff(model.cases)) + 1)])
     return noise * sizes[model.cases]
 
 

@@ -32,7 +32,7 @@ from workflows.report.sections.errors import finer_meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies.model_selection import ModelSelection
-from workflows.studies.predictions import meshes_of
+from workflows.studies.predictions import meshes_of, of_file
 from workflows.studies.selection_results import doubts_of_selection, trusted_on_meshes
 
 pytestmark = pytest.mark.fem
@@ -254,7 +254,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     texts = [one.text for one in doubts_of_selection(far, inputs, None) if "It decides on the result" in one.text]
     assert [text.partition(":")[0] for text in texts] == [str(found["model"].values[second])]
     # On meshes of files, corrections hold for errors up to twice the noise, as for inversions.
-    assert not it.of_files
+    assert not any(of_file(spec) for spec in it.of_candidates.values())
     error = xr.zeros_like(found["mesh_error"]) + 1.5
     of_files = far.assign(mesh_shift=found["mesh_shift"], mesh_error=error, mesh_of_file=("model", [True, True]))
     assert trusted_on_meshes(of_files)["trusted"].values.all()
