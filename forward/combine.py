@@ -288,7 +288,8 @@ class Joined(OneByOne):
         near, count = guess.reference, len(self.order)
         states = [None] * count if guess.state is None else self.states(guess.state)
         there = [None] * count if near is None else [replace(near, state=one) for one in self.states(near.state)]
-        return [replace(guess, state=u, reference=one) for u, one in zip(states, there, strict=True)]
+        known = replace(guess, audit=guess.audit and near is not None)  # nothing else is predicted
+        return [replace(known, state=u, reference=one) for u, one in zip(states, there, strict=True)]
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
         """Split states (…, U), or this rank's part of them, into those of the models."""
