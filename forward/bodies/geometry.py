@@ -27,6 +27,8 @@ AXES: tuple[Axis, ...] = ("x", "y", "z")
 Length = Annotated[float, Gt(0)]
 Count = Annotated[int, Gt(0)]
 Vector = tuple[float, float, float]
+ROUNDING = 1e-6  # of the distance that counts as inaccuracy: a distance that counts as rounding
+NEARBY = 1e-3  # of the diagonal of a body: distance from it that counts as inaccuracy of positions
 
 
 def _has_length(direction: Vector) -> Vector:
@@ -43,10 +45,6 @@ def unit_vector(direction: Vector) -> Vector:
     x, y, z = direction
     length = math.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
-
-
-ROUNDING = 1e-6  # of the distance that counts as inaccuracy: a distance that counts as rounding
-NEARBY = 1e-3  # of the diagonal of a body: distance from it that counts as inaccuracy of positions
 
 
 class _SixSided(Settings):
@@ -417,10 +415,10 @@ def tolerance(body: Body) -> float:
 
 def outside(body: Body, point: Vector) -> float:
     """How far (m) a point lies outside the undeformed body; for a mesh from a file, outside the box around it."""
-    if isinstance(body, Block) and body.contains(point):  # where its nearest place is less exact
+    if body.kind == "block" and body.contains(point):  # where its nearest place is less exact
         return 0.0
     at = np.array([point])
-    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, MeshFile) else body.nearest(at)
+    place = np.clip(at, *np.transpose(body.bounds)) if body.kind == "mesh" else body.nearest(at)
     gap = float(np.linalg.norm(place - at))
     return gap if gap > ROUNDING * tolerance(body) else 0.0
 

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.location import nearest_of
-from forward.bodies.mesh_file import MeshFile
 from forward.model import FloatArray
 
 NEAREST = 4  # triangles that are tried first
@@ -17,7 +16,7 @@ FINE = 12  # parts of the edge of a facet at which it is looked at closely
 
 def facets(body: Body, boundary: str) -> FloatArray:
     """Return the corners (n, 3 or 4, 3) (m) of the facets of a boundary, those of a quadrilateral one after another."""
-    if isinstance(body, MeshFile):
+    if body.kind == "mesh":
         mesh = body.load()
         return np.asarray(mesh.points[mesh.boundaries[boundary]])
     axis, end = AXES.index(boundary[0]), boundary.endswith("max")
@@ -90,7 +89,7 @@ class Surface:
     @classmethod
     def of(cls, body: Body) -> Surface:
         """Make that of a body."""
-        corners = [body.surface] if isinstance(body, MeshFile) else [facets(body, name) for name in body.boundaries]
+        corners = [body.surface] if body.kind == "mesh" else [facets(body, name) for name in body.boundaries]
         fan = [one[:, [0, k, k + 1]] for one in corners for k in range(1, one.shape[1] - 1)]
         return cls(np.concatenate(fan))
 

@@ -33,7 +33,7 @@ def tetrahedra(body: Body) -> tuple[Loaded, Callable[[FloatArray], FloatArray]]:
     Boxes and blocks have six tetrahedra around a diagonal of each cell, as DOLFINx makes them, in the box with equal
     cells, which `place` maps into the body. So what is put between vertices later follows faces that are not plane.
     """
-    if isinstance(body, MeshFile):
+    if body.kind == "mesh":
         return body.load(), lambda points: points
     lattice = np.stack(np.meshgrid(*(np.arange(n + 1) for n in body.cells), indexing="ij"), axis=-1).reshape(-1, 3)
     stride = np.array([(body.cells[1] + 1) * (body.cells[2] + 1), body.cells[2] + 1, 1])

@@ -23,6 +23,7 @@ NAN = re.compile(rb"(?<=\s)[-+]?nan(?:\([^)\s]*\))?(?=\s)", re.IGNORECASE)
 ASCII = re.compile(rb"[^\n]*\n[^\n]*\n\s*ASCII")
 WRONG = re.compile(rb"(ERR|WARN)\|")  # what VTK writes of itself, and then reads on with what it has
 BRICKS = {8: (9, [0, 1, 3, 2]), 11: (12, [0, 1, 3, 2, 4, 5, 7, 6])}  # pixels and voxels: as what, their corners how
+LISTED = {0, 4}  # what lists its cells: polygons, unstructured grids
 REFUSED = 4  # exit code
 DAMAGED = "it is cut off, or damaged"
 
@@ -78,9 +79,9 @@ def mesh(path: Path) -> meshio.Mesh:
 def _cells(data: Any) -> tuple[list[tuple[str, NDArray[np.int64]]], list[NDArray[np.int64]]]:
     """Return cells kind by kind, and their numbers in the file; none of a regular grid."""
     from meshio._vtk_common import vtk_to_meshio_type
-    from pyvista import PolyData, UnstructuredGrid, convert_array
+    from pyvista import convert_array
 
-    if not isinstance(data, PolyData | UnstructuredGrid) or not data.n_cells:
+    if data.GetDataObjectType() not in LISTED or not data.n_cells:
         return [], []
     grid = data.cast_to_unstructured_grid()
     kinds, cells = grid.celltypes, grid.GetCells()

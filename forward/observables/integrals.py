@@ -9,7 +9,6 @@ import numpy as np
 from annotated_types import Gt
 
 from forward.bodies.geometry import AXES, Axis, Vector, tolerance
-from forward.bodies.mesh_file import MeshFile
 from forward.model import FloatArray, ModelError
 from forward.observables.functionals import Integral, Linear
 from forward.observables.observable import Equations, Functional, Observable
@@ -30,7 +29,7 @@ class PointDisplacement(Observable):
         (found,), (distance,) = spaces.point_weights(equations.space, np.array([self.at]))
         spec = equations.spec.body
         # Points outside boxes and blocks were refused before; the mesh may cut their curved faces.
-        most = tolerance(spec) if isinstance(spec, MeshFile) else max(tolerance(spec), spec.longest_edge)
+        most = tolerance(spec) if spec.kind == "mesh" else max(tolerance(spec), spec.longest_edge)
         if distance > most:
             where = ", ".join(f"{x:g}" for x in self.at)
             raise ModelError(

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.bodies.geometry import Body
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for, signature
 from forward.fem.dolfinx.lanes import Kernel, Numbers
@@ -239,7 +238,7 @@ def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
     """
     from scipy.sparse import csr_matrix
 
-    boxed = body if isinstance(body, MeshFile) else body.model_copy(update={"cell": "hexahedron"})
+    boxed = body if body.kind == "mesh" else body.model_copy(update={"cell": "hexahedron"})
     msh, _ = mesh_body(MPI.COMM_SELF, boxed)
     space = scalar_space(msh, 1)
     v, w = ufl.TestFunction(space), ufl.TrialFunction(space)

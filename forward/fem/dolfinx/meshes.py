@@ -23,7 +23,7 @@ _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.t
 def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
     require(BYTES_PER_UNKNOWN * body.nodes / comm.size + SPARE, "the mesh")
-    if isinstance(body, MeshFile):
+    if body.kind == "mesh":
         return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     version.name_variant(msh)
