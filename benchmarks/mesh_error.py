@@ -21,8 +21,8 @@ from mpi4py import MPI
 from benchmarks.beams import beam
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray
+from uq.accuracy.budget import estimates_for, spare_for
 from uq.accuracy.effects import UNCALIBRATED, unknown_of
-from uq.accuracy.goal import estimates_for, spare_for
 from uq.accuracy.mesh_errors import estimate
 from uq.estimators.moments import Z
 from uq.evaluation.evaluate import SerialEvaluate

@@ -265,7 +265,7 @@ import sys
 from pathlib import Path
 from workflows.config.study import load
 load(Path({str(TINY)!r}), {[OFF, "model.body.cells=[2,1,1]", "method.samples=2"]!r}).run()
-assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and name != "uq.accuracy.goal"]
+assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and name != "uq.accuracy.budget"]
 """
     done = run_script(None, script)
     assert done.returncode == 0, done.stderr
