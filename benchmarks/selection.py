@@ -16,7 +16,8 @@ import numpy as np
 from benchmarks.beams import CONFIG
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
-from inverse.criticism.comparison import Candidate, Data
+from inverse.criticism.comparison import Candidate
+from inverse.data.measurements import Measurements
 from inverse.methods.selection import Noise, Select
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
@@ -59,7 +60,7 @@ def main() -> None:
     def compared(stress: FloatArray, noise: float) -> tuple[FloatArray, bool]:
         """Probabilities given stresses with errors, and whether the most probable model is in conflict with them."""
         sigma = np.maximum(noise * np.abs(stress), 5e3 * noise / NOISE)
-        data = Data(stress + sigma * rng.standard_normal(stress.size), sigma, labels, at)
+        data = Measurements.of_tests(stress + sigma * rng.standard_normal(stress.size), sigma, labels, at)
         found = method.run(candidates, {"all": data}, lambda name, _: SerialEvaluate(models[name]))
         best = ranking(found["log_evidence"])[0]
         return found["probability"].to_numpy(), bool(conflicts(found, best))
