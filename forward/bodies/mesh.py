@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, field, replace
 from math import comb
 from typing import Literal
@@ -111,7 +112,7 @@ class Contents(Settings):
     boundaries: dict[str, tuple[Point, ...]]
     areas: dict[str, float]
     regions: dict[str, float]
-    slits: dict[str, float] = Field(default={})
+    slits: dict[str, float] = Field(default={}, exclude_if=operator.not_)
 
 
 def places_of(points: FloatArray) -> IntArray:

@@ -9,6 +9,7 @@ without the file; a hash tells whether it is the same file.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -86,7 +87,7 @@ class MeshFile(Settings):
     tags: str | None = None
     levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0
     divide: tuple[str, ...] | None = None
-    slits: tuple[str, ...] = ()
+    slits: tuple[str, ...] = Field(default=(), exclude_if=operator.not_)
     contents: Contents | None = None
 
     @model_validator(mode="after")
