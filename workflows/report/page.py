@@ -21,7 +21,7 @@ from workflows.config.blocks import Report, located
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse
 from workflows.report import plots
-from workflows.report.blocks import Block, Folded, Heading, Html, Pictures, Table, Text, Viewer
+from workflows.report.blocks import Block, Folded, Heading, Html, Pictures, Table, Text
 from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 from workflows.run import own_code
@@ -168,7 +168,7 @@ def render(title: str, parts: Parts) -> str:
         title=title,
         groups=_grouped(parts),
         asset=lambda name: markupsafe.Markup((HERE / "assets" / name).read_text(encoding="utf-8")),
-        turning=any(isinstance(block, Viewer) for block in blocks),
+        turning=any(block.macro == "viewer" for block in blocks),
         styles=dict.fromkeys(block.style for block in markup if block.style),
         scripts=dict.fromkeys(block.script for block in markup if block.script),
     )
@@ -183,7 +183,7 @@ class _Group:
 
     @property
     def two(self) -> bool:
-        return any(isinstance(block, Viewer) for name, blocks in self.sections if name == "body" for block in blocks)
+        return any(block.macro == "viewer" for name, blocks in self.sections if name == "body" for block in blocks)
 
 
 def _grouped(parts: Parts) -> list[_Group]:
