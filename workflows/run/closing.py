@@ -69,12 +69,14 @@ def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
 
 def _answers(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind) -> Iterator[str]:
     """Write the answers that the report begins with, a line each."""
-    from workflows.report.blocks import Card
+    from workflows.report.blocks import Card, Text
     from workflows.report.section import SECTIONS, Results
 
     for block in SECTIONS["answer"]().content(Results(dataset, summary, study)):
         for one in block.answers if isinstance(block, Card) else ():
             yield "; ".join([f"{one.name}: {one.value}", *one.lines]).replace("\u00a0", " ")
+        if isinstance(block, Text):  # how many others there are
+            yield block.text
 
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

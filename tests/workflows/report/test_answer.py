@@ -13,6 +13,7 @@ from tests.workflows.report.test_report import SVG, solve, study, study_of, writ
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
+from workflows.run import closing
 from workflows.studies import findings_inversion
 
 
@@ -155,6 +156,15 @@ def test_numbers_that_nothing_stands_in_place_of_are_said_to_be_by_laplace(trust
     one = xr.Dataset(dict.fromkeys(names, 1.0) | {"std": 0.1, "prior_std": 1.0, "true": np.nan})
     found = answer._unknown(one.assign(trust=trust, source=source), "material.C1", "Pa")
     assert (found.name, found.value) == (f"C1{by}", "1.00\u00a0Pa")
+
+
+def test_the_terminal_says_how_many_answers_it_leaves_to_the_report(monkeypatch):
+    found = blocks.Card("How?", [blocks.Answer(f"a{k}", "1 m", ()) for k in range(answer.TILES + 3)])
+    monkeypatch.setitem(answer.CARDS, "many", lambda results: found)
+    monkeypatch.setattr(answer, "gravest", lambda results: None)
+    *listed, last = closing._answers(xr.Dataset({"many": 1.0}), {}, None)
+    assert listed == [f"a{k}: 1 m" for k in range(answer.TILES)]
+    assert last == "The other 3 are in the tables of the report."
 
 
 def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():

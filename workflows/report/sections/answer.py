@@ -48,7 +48,7 @@ def answer_first(results: Results) -> Iterator[Block]:
         found = card(results)
         yield Card(found.question, found.answers[:TILES], gravest(results))
         if len(found.answers) > TILES:
-            yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
+            yield Text(f"The other {len(found.answers) - TILES} are in the tables of the report.")
 
 
 def forward(results: Results) -> Card:
