@@ -121,8 +121,13 @@ def places_of(points: FloatArray) -> IntArray:
     return np.asarray(np.unique(grid, axis=0, return_inverse=True)[1].ravel())
 
 
-def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, IntArray]:
-    """Draw the lips of closed slits apart; return the points, and the faces (k, 3 or 4) of the lips.
+def twins_of(points: FloatArray) -> int:
+    """Return how many of points (n, 3) lie where others lie."""
+    return len(points) - int(places_of(points).max()) - 1
+
+
+def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, IntArray, int]:
+    """Draw the lips of closed slits apart; return the points, the faces (k, 3 or 4) of the lips, and twins that stay.
 
     Lips are faces of the surface that lie on each other, corner on corner. Of points at one place, that of the cell
     which comes first stays; others move a little into their cells. So each node has a place of its own: the canonical
@@ -131,7 +136,7 @@ def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, 
     """
     places = places_of(points)
     if places.max() + 1 == len(points):
-        return points, np.zeros((0, len(FACES[cell][0])), dtype=np.int64)
+        return points, np.zeros((0, len(FACES[cell][0])), dtype=np.int64), 0
     faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     outer = faces[first[count == 1]]
@@ -150,7 +155,7 @@ def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, 
         shortest = np.linalg.norm(edges[its != point], axis=-1).min()
         step = min(APART[0] * np.ptp(points, axis=0).max(), APART[1] * shortest)
         moved[point] += step * inwards / np.linalg.norm(inwards)
-    return moved, lips
+    return moved, lips, twins_of(moved)
 
 
 def slits_of(points: FloatArray, lips: IntArray, boundaries: dict[str, IntArray]) -> dict[str, float]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh import CORNERS, FACES, IntArray, Loaded, opened, places_of, slits_of
+from forward.bodies.mesh import CORNERS, FACES, IntArray, Loaded, opened, slits_of, twins_of
 from forward.files import meshes
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
@@ -72,8 +72,8 @@ def load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...]
     if points.shape[1] != 3 or not np.isfinite(points).all():
         refuse("its points are not finite ones in three dimensions")
     given = points
-    points, lips = opened(points, cells, cell)
-    _check_geometry(points, cells, cell, refuse)
+    points, lips, twins = opened(points, cells, cell)
+    _check_geometry(points, cells, cell, twins, refuse)
     _check_joints(given, cells, cell, refuse)
     new = np.full(len(mesh.points), -1)
     new[used] = np.arange(len(used))
@@ -100,7 +100,7 @@ def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
             boundaries = {
                 name.removeprefix(BOUNDARY): arrays[name] for name in arrays.files if name.startswith(BOUNDARY)
             }
-            _check_geometry(points, cells, "tetrahedron", refuse)
+            _check_geometry(points, cells, "tetrahedron", twins_of(points), refuse)
     except ModelError:
         raise
     except Exception as error:  # a file may be anything
@@ -193,7 +193,7 @@ def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str, refuse: Any
     return cells, np.concatenate(found)
 
 
-def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
+def _check_geometry(points: FloatArray, cells: IntArray, cell: str, twins: int, refuse: Any) -> None:
     """Refuse cells without volume, and parts that only appear to be joined."""
     corners = [[0, 1, 2, 3]] if cell == "tetrahedron" else CORNERS
     edges = points[cells[:, corners]]  # cells, corners, 4, 3
@@ -203,12 +203,11 @@ def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any)
     flat = ~((volumes > FLAT * size[:, None]).all(axis=1) | (volumes < -FLAT * size[:, None]).all(axis=1))
     if flat.any():
         refuse(f"{flat.sum()} of {len(cells)} cells have no volume or are turned inside out")
-    _check_twins(points, refuse)
+    _check_twins(twins, refuse)
 
 
-def _check_twins(points: FloatArray, refuse: Any) -> None:
+def _check_twins(twins: int, refuse: Any) -> None:
     """Refuse points that lie where others lie."""
-    twins = len(points) - places_of(points).max() - 1
     if twins:
         refuse(
             f"{twins} points lie where others lie: its parts are not joined, expected a mesh without double points, "
@@ -233,7 +232,7 @@ def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -
     a, b = owners[inner].T
     parts, part = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(len(cells),) * 2), directed=False)
     if parts > 1:
-        _check_twins(points, refuse)
+        _check_twins(twins_of(points), refuse)
         sizes = ", ".join(f"{n:,}" for n in sorted(np.bincount(part).tolist(), reverse=True)[:5])
         refuse(f"its cells are {parts} parts that share no face (of {sizes} cells), expected one body")
     corners = points[faces[inner[:, 0]]]
