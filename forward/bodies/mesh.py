@@ -126,6 +126,13 @@ def twins_of(points: FloatArray) -> int:
     return len(points) - int(places_of(points).max()) - 1
 
 
+def surface_faces(cells: IntArray, cell: str) -> IntArray:
+    """Return the faces (n, 3 or 4) that belong to one cell, by their vertices."""
+    faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return np.asarray(faces[first[count == 1]])
+
+
 def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, IntArray, int]:
     """Draw the lips of closed slits apart; return the points, the faces (k, 3 or 4) of the lips, and twins that stay.
 
@@ -137,9 +144,7 @@ def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, 
     places = places_of(points)
     if places.max() + 1 == len(points):
         return points, np.zeros((0, len(FACES[cell][0])), dtype=np.int64), 0
-    faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = faces[first[count == 1]]
+    outer = surface_faces(cells, cell)
     _, which, count = np.unique(np.sort(places[outer], axis=1), axis=0, return_inverse=True, return_counts=True)
     lips = outer[count[which.ravel()] > 1]
     holder = np.full(len(points), len(cells))  # of each point, the cell that comes first
@@ -147,19 +152,26 @@ def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, 
     staying = np.full(len(points), len(cells))
     np.minimum.at(staying, places, holder)
     moving = np.intersect1d(lips, np.flatnonzero(holder > staying[places]))
+    number = np.full(len(points), -1)  # of each point among those that move
+    number[moving] = np.arange(len(moving))
+    holds, corner = np.nonzero(number[cells] >= 0)
+    which = number[cells[holds, corner]]
+    edges = points[cells[holds]] - points[cells[holds, corner]][:, None]
+    lengths = np.linalg.norm(edges, axis=-1)
+    lengths[np.arange(len(holds)), corner] = np.inf
+    inwards, shortest = np.zeros((len(moving), 3)), np.full(len(moving), np.inf)
+    np.add.at(inwards, which, edges.sum(axis=1))
+    np.minimum.at(shortest, which, lengths.min(axis=1))
+    steps = np.minimum(APART[0] * np.ptp(points, axis=0).max(), APART[1] * shortest)
     moved = points.copy()
-    for point in moving:
-        its = cells[(cells == point).any(axis=1)]
-        edges = points[its] - points[point]
-        inwards = edges.mean(axis=(0, 1))
-        shortest = np.linalg.norm(edges[its != point], axis=-1).min()
-        step = min(APART[0] * np.ptp(points, axis=0).max(), APART[1] * shortest)
-        moved[point] += step * inwards / np.linalg.norm(inwards)
+    moved[moving] += (steps / np.linalg.norm(inwards, axis=1))[:, None] * inwards
     return moved, lips, twins_of(moved)
 
 
 def slits_of(points: FloatArray, lips: IntArray, boundaries: dict[str, IntArray]) -> dict[str, float]:
     """Return the area (m²) of the slits between lips, by the names of boundaries that they are in; "" for none."""
+    if not len(lips):
+        return {}
     places = places_of(points)
     faces = {tuple(sorted(places[face].tolist())): face for face in lips}
     found, left = {}, set(faces)

@@ -22,7 +22,6 @@ from pydantic import Field, model_validator
 from forward.bodies.location import nearest_of
 from forward.bodies.mesh import (
     CLOSE,
-    FACES,
     TETRAHEDRA,
     Contents,
     Loaded,
@@ -32,6 +31,7 @@ from forward.bodies.mesh import (
     divided,
     divided_contents,
     node_count,
+    surface_faces,
 )
 from forward.bodies.mesh_reading import digest_of, load
 from forward.findings import Finding
@@ -249,9 +249,7 @@ class MeshFile(Settings):
     def surface(self) -> FloatArray:
         """Corners (n, 3 or 4, 3) of all faces that belong to one cell (m)."""
         mesh = self.load()
-        faces = mesh.cells[:, FACES[mesh.cell]].reshape(-1, len(FACES[mesh.cell][0]))
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return np.asarray(mesh.points[faces[first[count == 1]]])
+        return np.asarray(mesh.points[surface_faces(mesh.cells, mesh.cell)])
 
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
