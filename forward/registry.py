@@ -189,11 +189,14 @@ class OfKind:
         The kind if none is given, or what tells it from the block; None if it is required.
     make
         Returns the block of a kind, if the kinds are not blocks themselves.
+    but
+        A kind that is none here.
     """
 
     kinds: Kinds
     default: str | Callable[[Mapping[str, Any]], str] | None = None
     make: Callable[[str], type[Settings]] | None = None
+    but: str = ""
 
     def block(self, kind: str) -> Any:
         """Return the class of the blocks of a kind."""
@@ -211,6 +214,8 @@ class OfKind:
             raise _mistake("missing", "missing", value)
         if not isinstance(kind, str):
             raise _mistake("no_word", "expected a word", kind)
+        if kind == self.but:
+            raise _mistake("not_here", "not here, expected another kind", kind)
         try:
             block = self.block(kind)
         except KindError as error:
@@ -223,8 +228,8 @@ class OfKind:
 
     def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
         """Any of the named kinds that can be used here, or a block of a dotted kind, about which nothing is known."""
-        known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.own]
-        for kind in self.kinds.names[len(known) :]:
+        known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.own if kind != self.but]
+        for kind in self.kinds.names[len(self.kinds.own) :]:
             with suppress(KindError):
                 known.append(handler(_with_reference(self.block(kind))) | {"properties": {"kind": {"const": kind}}})
         other = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}}

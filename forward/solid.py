@@ -116,6 +116,11 @@ class Solid(ModelSpec):
         return found
 
     @property
+    def bodies(self) -> tuple[Solid, ...]:
+        """Itself."""
+        return (self,)
+
+    @property
     def energy(self) -> str:
         """Kind of the material."""
         return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind

@@ -161,6 +161,20 @@ class ModelSpec(Settings):
         return ""
 
     @property
+    def parts(self) -> Mapping[str, ModelSpec]:
+        """The models that it joins, by name; none by default."""
+        return {}
+
+    def path_of(self, name: str, path: str) -> str:
+        """Return the path of a number of one of these, by its name, among those of all."""
+        return path
+
+    @property
+    def bodies(self) -> tuple[Any, ...]:
+        """The bodies with meshes that it consists of."""
+        return ()
+
+    @property
     def touched(self) -> bool:
         """Whether tools touch it: richer elements seldom follow the edge of the area in contact."""
         return False
@@ -267,6 +281,8 @@ MODELS = Kinds(
         "hyperelastic": "forward.hyperelastic:Hyperelastic",
         "path": "forward.hyperelastic:Path",
         "specimen": "forward.specimen:Specimen",
+        "material-tests": "forward.material_tests:MaterialTests",
+        "joined": "forward.joined:JoinedModels",
         "reduced": "forward.reduced.spec:Reduced",
         "python": "forward.external.models:PythonModel",
         "um-bridge": "forward.external.models:UmBridgeModel",

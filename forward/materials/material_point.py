@@ -102,7 +102,7 @@ class HomogeneousModel(OneByOne):
     tests
         What is measured.
     parameters
-        Names of the constants that vary; the others keep their values.
+        Names of the constants that vary, or their paths in a model; the others keep their values.
     fibres
         Directions of one or two families of fibres, if the material has them: components along the stretch x, along the
         direction across (in simple shear, x moves along the first, more so along the second), and along y.
@@ -129,7 +129,8 @@ class HomogeneousModel(OneByOne):
         if objection is not None:
             raise ValueError(objection)
         known = constants(energy)
-        given = dict.fromkeys([*values, *parameters])
+        varied = [path.rpartition(".")[2] for path in parameters]
+        given = dict.fromkeys([*values, *varied])
         left_out = of_volume(energy) if incompressible(energy, given) else ()
         unknown, missing = set(given) - set(known), set(known) - set(given) - set(left_out)
         if unknown or missing:
@@ -139,14 +140,16 @@ class HomogeneousModel(OneByOne):
         self._energy = energy
         self._free = not incompressible(energy, given)  # free faces, whose displacement has to be found
         self._values = np.array([values.get(name, np.nan) for name in self._names])
-        self._varied = [self._names.index(name) for name in parameters]
+        self._varied = [self._names.index(name) for name in varied]
         self._tests = tuple(tests)
         self._readings = [
             reading(energy, test.mode, self._names, units, test.component, test.stress == "cauchy") for test in tests
         ]
         many = {test.label for test in tests if len(test.at) > 1}
         self.outputs = tuple(
-            f"{test.label}[{i}]" if test.label in many else test.label for test in tests for i in range(len(test.at))
+            f"{test.label}.{i}" if test.label in many else test.label
+            for test in tests
+            for i in range(1, len(test.at) + 1)
         )
 
     def stresses(self, points: FloatArray) -> FloatArray:
@@ -182,8 +185,9 @@ class HomogeneousModel(OneByOne):
         return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
 
     def _one(self, parameters: FloatArray) -> FloatArray:
-        here = dict(zip(self._names, self._values, strict=True))
-        said = objection(self._energy, here | dict(zip(self.parameters, map(float, parameters), strict=True)))
+        here = self._values.copy()
+        here[self._varied] = parameters
+        said = objection(self._energy, dict(zip(self._names, here.tolist(), strict=True)))
         if said is not None:
             raise InadmissibleError(said)
         values = np.asarray(self.stresses(parameters[None, :])[0])

@@ -237,8 +237,10 @@ class Measurements:
         return replace(self, **{name: vars(self)[name][rows] for name in COLUMNS})
 
     def with_rows(self, more: Measurements) -> Measurements:
-        """Return them with others of the same parts."""
-        return replace(self, **{name: np.concatenate([vars(one)[name] for one in (self, more)]) for name in COLUMNS})
+        """Return them with others of the same parts, and what is true of both."""
+        rows = {name: np.concatenate([vars(one)[name] for one in (self, more)]) for name in COLUMNS}
+        source = tuple(dict.fromkeys((*self.source, *more.source)))
+        return replace(self, **rows, source=source, truth={**self.truth, **more.truth})
 
     def with_sigma(self, usual: FloatArray) -> Measurements:
         """Return the same with standard deviations (m,) where the file states none."""

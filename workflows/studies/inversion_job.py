@@ -34,7 +34,7 @@ from workflows.studies.solves import of_answers
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.finer import FinerMeshes
+    from forward.fem.finer import FinerMeshes, JoinedMeshes
     from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
     from forward.specimen import Specimen
@@ -132,7 +132,7 @@ def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
     return _Made(model, observed, vertices, look)
 
 
-def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked

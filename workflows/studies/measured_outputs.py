@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import reduce
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -20,9 +22,10 @@ from inverse.data.measurements import Measurements
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError, others
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import DataSet, FileNames, Found, Positive, read_files
+from workflows.studies.measured import DataSet, FileNames, Found, Positive, digest_of, read_files
 
 Stated = dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]]  # one or several, by output
+TABLES = "tables"  # name of the data set of several tables
 STATED = "outputs"  # name of the data set given in the study itself
 
 
@@ -92,6 +95,9 @@ class MeasuredOutputs(Settings):
         Tables with the columns output, value and, where it is known, sigma: names of files, folders, or patterns such
         as ``data/*.csv``, beside the study or else in the working directory. Each file is a data set and is inverted
         separately.
+    tables
+        Instead of files, of joined models: the table of each model by its name, which together are one data set. A
+        table of one has the names of its own outputs, or is a curve.
     outputs
         Instead of files: measurements by output, a number or a list of repeated measurements.
     sigma
@@ -109,6 +115,7 @@ class MeasuredOutputs(Settings):
     quantity: ClassVar[str] = "output"
 
     files: FileNames = ()
+    tables: dict[str, str] = Field(default={})
     outputs: Stated = Field(default={})
     sigma: dict[str, Positive] = Field(default={})
     noise: OutputNoise = OutputNoise()
@@ -118,8 +125,8 @@ class MeasuredOutputs(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> MeasuredOutputs:
-        if bool(self.files) == bool(self.outputs):
-            message = "expected either files or outputs"
+        if bool(self.files) + bool(self.tables) + bool(self.outputs) != 1:
+            message = "expected either files or outputs, or tables of joined models"
             raise ValueError(message)
         return self
 
@@ -133,6 +140,8 @@ class MeasuredOutputs(Settings):
         names, steps = tuple(output.name for output in model.returned), steps_of(model)
         if self.files:
             sets, found = read_files(self.files, folder, lambda path: known(read_outputs(path, names, steps)))
+        elif self.tables:
+            sets, found = self._of_tables(folder, model, known)
         else:
             try:
                 sets, found = (DataSet(name=STATED, file=""),), (known(stated(self.outputs, names)),)
@@ -140,6 +149,37 @@ class MeasuredOutputs(Settings):
                 raise StudyError(*(f"data: {line}" for line in error.args)) from None
         seen = np.unique(np.concatenate([one.axes for one in found if one is not None]))
         return sets, tuple(None if one is None else one.by_part(seen) for one in found)
+
+    def _of_tables(self, folder: Path, model: ModelSpec, known: Callable[[Measurements], Measurements]) -> Found:
+        """Read the tables of joined models, one of each at most, as one data set."""
+        names, parts, paths, wrong = tuple(output.name for output in model.returned), [], [], list[str]()
+        for name, file in self.tables.items():
+            if name not in model.parts:
+                wrong.append(f"data.tables.{name}: no model of this name; {nearest(name, tuple(model.parts))}")
+                continue
+            own, path = model.parts[name], next((one / file for one in (folder, Path()) if (one / file).exists()), None)
+            if path is None:
+                wrong.append(f"data.tables.{name}: {file}: no such file")
+                continue
+            outputs = tuple(output.name for output in own.returned)
+            try:
+                found = read_outputs(path, outputs, steps_of(own))
+            except DataError as error:
+                wrong += [f"data: {line}" for line in error.args]
+                continue
+            whole = np.array([names.index(f"{name}.{output}") for output in outputs], dtype=np.int64)[found.axes]
+            truth = {model.path_of(name, path): value for path, value in found.truth.items()}
+            rows = {"axes": whole, "cases": whole, "names": np.array(names)[whole], "parts": names}
+            parts.append(replace(found, **rows, truth=truth))
+            paths.append(path)
+        if wrong:
+            raise StudyError(*wrong)
+        try:
+            measured = known(reduce(Measurements.with_rows, parts))
+        except DataError as error:
+            raise StudyError(*(f"data: {line}" for line in error.args)) from None
+        digest = sha256("".join(map(digest_of, paths)).encode()).hexdigest()[:16]
+        return (DataSet(name=TABLES, file=", ".join(self.tables.values()), digest=digest),), (measured,)
 
     def with_errors(self, found: Measurements) -> Measurements:
         """Return data with standard deviations and what is true; a DataError if one is unknown."""

@@ -13,7 +13,7 @@ from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
-    from forward.fem.finer import FinerMeshes
+    from forward.fem.finer import FinerMeshes, JoinedMeshes
     from forward.fem.locking import Decision
     from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
@@ -51,12 +51,12 @@ LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and 
 
 def has_mesh(spec: ModelSpec) -> bool:
     """Whether a model has a mesh."""
-    return spec.meshed or hasattr(spec, "body")
+    return bool(spec.bodies)
 
 
 def of_file(spec: ModelSpec) -> bool:
     """Whether the mesh of a model, if it has one, is that of a file."""
-    return getattr(getattr(spec, "body", None), "kind", "") == "mesh"
+    return any(isinstance(one.body, MeshFile) for one in spec.bodies)
 
 
 def never_estimable(spec: ModelSpec, names: Collection[str]) -> tuple[str, ...]:
@@ -65,8 +65,8 @@ def never_estimable(spec: ModelSpec, names: Collection[str]) -> tuple[str, ...]:
     return tuple(one.name for one in outputs if one.name in names and not getattr(one, "estimable", True))
 
 
-def meshes_of(spec: Any) -> tuple[Any, ...]:
-    """Return a body on the finer meshes that it is looked at on, where these are known before a run.
+def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
+    """Return the bodies of a model on the finer meshes that they are looked at on, where these are known before a run.
 
     Raises
     ------
@@ -75,14 +75,13 @@ def meshes_of(spec: Any) -> tuple[Any, ...]:
     """
     from forward.fem.finer import finer, graded
 
-    if isinstance(spec.body, MeshFile):
-        return ()
-    beside = graded(spec)
-    return (finer(spec),) if beside is None else (finer(spec), beside)
+    made = (one for one in spec.bodies if not isinstance(one.body, MeshFile))
+    both = ((finer(one), graded(one)) for one in made)
+    return tuple(mesh for pair in both for mesh in pair if mesh is not None)
 
 
-def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | None, str]:
-    """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
+    """Return a model on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     from forward.fem.finer import extrapolated
 
     try:
@@ -101,17 +100,16 @@ def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) ->
     return extrapolated(body, start).of(own)
 
 
-def mesh_check(spec: Any) -> tuple[float, str]:
+def mesh_check(spec: ModelSpec) -> tuple[float, str]:
     """Predict the processor time (s) of solves on finer meshes, and say what is solved."""
     try:
-        if isinstance(spec.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
-            unknowns, once = 8 * spec.unknowns, 8**2 * times_of(spec).textbook
-        else:
-            fine = meshes_of(spec)
-            unknowns = fine[0].unknowns
-            once = sum(times_of(one).textbook for one in fine)
+        fine = meshes_of(spec)
     except ValueError as error:
         return 0.0, f"not possible: {error}; no result will be called trusted"
+    unknowns, once = max((one.unknowns for one in fine), default=0), sum(times_of(one).textbook for one in fine)
+    for one in spec.bodies:
+        if isinstance(one.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
+            unknowns, once = max(unknowns, 8 * one.unknowns), once + 8**2 * times_of(one).textbook
     longest = duration(HOPELESS * once)
     each = f"each about {duration(once)}; up to {longest} if it has no answer"
     return LOOKS * once, f"about {LOOKS} solves of {unknowns:,} displacements on finer meshes, {each}"

@@ -1,0 +1,203 @@
+"""Several models of a study as one, with numbers that they share: such as a body and tests of its material."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.sparse import csr_matrix
+
+from forward.combine import Joined, Mapped, Sparse
+from forward.fem.cost import Times, sum_of
+from forward.findings import Finding
+from forward.materials.admissible import Materials
+from forward.model import NamedOutput
+from forward.registry import OfKind
+from forward.scalars import Mistake, Scalar, refuse
+from forward.settings import nearest
+from forward.spec import MODELS, ModelSpec
+
+if TYPE_CHECKING:
+    from forward.fem.locking import Ranges
+
+Name = Annotated[str, Field(pattern=r"^[^.\s]+$")]
+
+
+class Named(NamedTuple):
+    """An output of one of the models, by its name among those of all."""
+
+    name: str
+    unit: str
+    estimable: bool
+    negative: bool
+
+
+class JoinedModels(ModelSpec):
+    """Several models, whose outputs and numbers are called NAME.OUTPUT and NAME.PATH by the names of the models.
+
+    Parameters
+    ----------
+    models
+        The models by name, without random fields.
+    shared
+        Paths of numbers that are one number in all models that have them, and keep their path: ``["material.C1"]``.
+    """
+
+    kind: Literal["joined"] = "joined"
+    models: dict[Name, Annotated[ModelSpec, OfKind(MODELS, "hyperelastic", but="joined")]] = Field(min_length=2)
+    shared: tuple[str, ...] = ()
+
+    def path_of(self, name: str, path: str) -> str:
+        """Return the path of a number of one of the models among those of all."""
+        return path if path in self.shared else f"{name}.{path}"
+
+    def own(self, name: str, ranges: Ranges) -> dict[str, Any]:
+        """Return what is said by paths of numbers of all models, of those of one, by its own paths."""
+        paths = {path: self.path_of(name, path) for path in self.models[name].scalars}
+        return {path: ranges[whole] for path, whole in paths.items() if whole in ranges}
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """The numbers of all models, those that are shared once."""
+        found: dict[str, Scalar] = {}
+        for name, model in self.models.items():
+            for path, scalar in model.scalars.items():
+                found.setdefault(self.path_of(name, path), scalar)
+        return found
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths."""
+        pairs = ((name, model.unavailable.items()) for name, model in self.models.items())
+        return {self.path_of(name, path): why for name, every in pairs for path, why in every}
+
+    @cached_property
+    def outputs(self) -> tuple[NamedOutput, ...]:
+        """What all models return, of one after that of the other."""
+        return tuple(
+            Named(f"{name}.{one.name}", one.unit, getattr(one, "estimable", True), getattr(one, "negative", True))
+            for name, model in self.models.items()
+            for one in model.returned
+        )
+
+    @property
+    def parts(self) -> Mapping[str, ModelSpec]:
+        """The models by name."""
+        return self.models
+
+    @property
+    def bodies(self) -> tuple[Any, ...]:
+        """The bodies with meshes of all models."""
+        return tuple(body for model in self.models.values() for body in model.bodies)
+
+    @property
+    def hidden(self) -> str:
+        """That errors of meshes are not estimated where it is sampled."""
+        of = [f"'{name}'" for name, model in self.models.items() if model.bodies]
+        return f"the error of the mesh of {', '.join(of)} is not estimated where models are joined" if of else ""
+
+    @property
+    def touched(self) -> bool:
+        """Whether tools touch any of the models."""
+        return any(model.touched for model in self.models.values())
+
+    @property
+    def unrefined(self) -> bool:
+        """Whether the mesh of any is still to be refined."""
+        return any(model.unrefined for model in self.models.values())
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that the user has written for any of them."""
+        return tuple(dict.fromkeys(module for model in self.models.values() for module in model.modules))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of the equations of all models."""
+        return sum(model.unknowns for model in self.models.values())
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials | None:
+        """Return the materials of all models, which are of one kind, as functions of some numbers, by their paths."""
+        energy, places = "", dict[str, Mapping[str, float | str]]()
+        for name, model in self.models.items():
+            found = model.materials([path for path in model.scalars if self.path_of(name, path) in parameters])
+            if found is None:
+                continue
+            energy = found.energy
+            for place, values in found.constants.items():
+                renamed = {k: self.path_of(name, v) if isinstance(v, str) else v for k, v in values.items()}
+                places[f"models.{name}.{place}"] = renamed
+        return Materials(energy, places) if places else None
+
+    def over(self, ranges: Ranges) -> JoinedModels:
+        """Return the same models in the forms that suit all values of parameters within ranges, by their paths."""
+        models = {name: model.over(self.own(name, ranges)) for name, model in self.models.items()}
+        return self.model_copy(update={"models": models})
+
+    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
+        """Findings about each model before anything is solved."""
+        every = ((name, model.findings_over(self.own(name, ranges))) for name, model in self.models.items())
+        return tuple(one.of(f"Model '{name}'") for name, found in every for one in found)
+
+    def mistakes_of_samples(self) -> Iterator[Mistake]:
+        """Find what is impossible with random parameters in any of the models."""
+        for name, model in self.models.items():
+            for (_, *place), message, given in model.mistakes_of_samples():
+                yield ("model", "models", name, *place), message, given
+
+    @property
+    def description(self) -> str:
+        """The models in words."""
+        return "; ".join(f"{name}: {model.description}" for name, model in self.models.items())
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Describe each model."""
+        for name, model in self.models.items():
+            for what, words in model.described(self.own(name, ranges)):
+                yield what, f"{name}: {words}"
+
+    def cost(self) -> Times | None:
+        """Predict the cost of a solve of all models of which it is known."""
+        known = [cost for model in self.models.values() if (cost := model.cost()) is not None]
+        return sum_of(known) if known else None
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that results depend on, as a table."""
+        return super().identity() | {"models": {name: model.identity() for name, model in self.models.items()}}
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> Joined:
+        """Make all models; collective."""
+        made = []
+        for name, model in self.models.items():
+            own = [(path, self.path_of(name, path)) for path in model.scalars]
+            acting = [(path, parameters.index(whole)) for path, whole in own if whole in parameters]
+            columns = [column for _, column in acting]
+            part = model.build(comm, tuple(path for path, _ in acting))
+            A = csr_matrix((np.ones(len(acting)), columns, np.arange(len(acting) + 1)), (len(acting), len(parameters)))
+            made.append(Mapped(part, Sparse(A, np.zeros(len(acting))), parameters))
+        return Joined(tuple(made), tuple(one.name for one in self.outputs), tuple(f"model '{n}'" for n in self.models))
+
+    @model_validator(mode="after")
+    def _check(self) -> JoinedModels:
+        refuse(type(self).__name__, self._mistakes())
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        for i, path in enumerate(self.shared):
+            values = {name: one.scalars[path].value for name, one in self.models.items() if path in one.scalars}
+            if len(values) < 2:
+                known = [path for model in self.models.values() for path in model.scalars]
+                twice = tuple(dict.fromkeys(path for path in known if known.count(path) > 1))
+                yield ("shared", i), f"not a number of two models; {nearest(path, twice)}", path
+            elif len(set(values.values())) > 1:
+                listed = ", ".join(f"{value:g} in {name}" for name, value in values.items())
+                yield ("shared", i), f"{listed}, expected one value", path
+        kinds = dict.fromkeys(found.energy for one in self.models.values() if (found := one.materials()) is not None)
+        if len(kinds) > 1:
+            yield ("models",), f"materials of kinds {', '.join(kinds)}, expected one kind", list(kinds)
+        for name, model in self.models.items():
+            if model.coefficients:
+                yield ("models", name, "fields"), "random fields, expected numbers only", len(model.coefficients)

@@ -1,0 +1,159 @@
+"""Homogeneous tests of a material as a model of a study: its outputs are stresses, its numbers constants."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import Field, model_validator
+
+from forward.bodies.geometry import Vector
+from forward.materials.admissible import Materials
+from forward.materials.material import MATERIALS, constants, incompressible, of_volume
+from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
+from forward.registry import KindError
+from forward.scalars import Mistake, Scalar, refuse
+from forward.settings import Settings, nearest, shown
+from forward.solid import block
+from forward.spec import ModelSpec
+
+if TYPE_CHECKING:
+    from forward.fem.locking import Ranges
+
+PATH = "material."  # before the name of a constant, as in the model of a body
+
+
+class Stress(NamedTuple):
+    """A stress that a test measures."""
+
+    name: str
+    unit: str = "Pa"
+
+
+class TestedMaterial(Settings):
+    """A kind of material with constants; without those of the volume (D1), an energy is incompressible.
+
+    Parameters
+    ----------
+    material
+        Its kind, its constants, and fibres where it has them, by their components along the first stretch, along the
+        second one and across both.
+    """
+
+    material: dict[str, float | str | tuple[Vector, ...]]
+
+    @property
+    def energy(self) -> str:
+        """Kind of the material."""
+        return str(self.material["kind"])
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Constants by name."""
+        return {name: value for name, value in self.material.items() if isinstance(value, float)}
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Directions of the families of fibres."""
+        found = self.material.get("fibres", ())
+        return found if isinstance(found, tuple) else ()
+
+    def mistakes_of_material(self, varied: Collection[str] = ()) -> Iterator[str]:
+        """Find what is wrong with the kind or the constants, some of which are `varied` and need not be stated."""
+        kind = self.material.get("kind")
+        if kind is None:
+            yield "material.kind: missing"
+            return
+        try:
+            MATERIALS[str(kind)]
+        except KindError as error:
+            yield f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
+            return
+        words = [name for name in self.material if name not in {"kind", "fibres", *self.fixed}]
+        if words:
+            yield f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
+        known = constants(self.energy)
+        given = dict.fromkeys([*self.fixed, *varied])
+        for name in given:
+            if name not in known:
+                yield f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+            if name in self.fixed and name in varied:
+                yield f"'{name}' is given in material and in parameters, expected one of them"
+        left_out = of_volume(self.energy) if incompressible(self.energy, given) else ()
+        missing = [name for name in known if name not in given and name not in left_out]
+        if missing:
+            yield f"missing: {', '.join(missing)}, expected in material{' or parameters' if varied else ''}"
+
+
+class MaterialTests(TestedMaterial, ModelSpec):
+    """Stresses of homogeneous tests of a material.
+
+    Parameters
+    ----------
+    tests
+        What is prescribed, and which stress is measured.
+    """
+
+    kind: Literal["material-tests"] = "material-tests"
+    tests: tuple[MaterialTest, ...] = Field(min_length=1)
+
+    @cached_property
+    def outputs(self) -> tuple[Stress, ...]:
+        """The stresses of all tests, one after the other."""
+        return tuple(Stress(name) for name in self.build(None, ()).outputs)
+
+    @property
+    def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
+        """Of a single test at several places, which is a curve: its name, and where each stress is."""
+        if len(self.tests) > 1 or len(self.tests[0].at) == 1:
+            return {}
+        (test,) = self.tests
+        over = "shear" if test.mode == "simple-shear" else "stretch"
+        steps = list(range(1, len(test.at) + 1))
+        return {"output_of": ("", [test.label] * len(steps)), "step": ("1", steps), over: ("1", list(test.at))}
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """The constants, by their paths in the model of a body."""
+        made = block(self.energy)
+        return {f"{PATH}{name}": Scalar(value, made, name) for name, value in self.fixed.items()}
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials:
+        """Return the material as a function of some constants, by their paths."""
+        own = {name: f"{PATH}{name}" for name in self.fixed}
+        stated = {name: own[name] if own[name] in parameters else value for name, value in self.fixed.items()}
+        return Materials(self.energy, {"material": stated})
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        return f"{self.energy}, in {', '.join(test.label for test in self.tests)}"
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Say what is tested."""
+        yield "material", self.description
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> HomogeneousModel:
+        """Make the model; constants that are no parameters keep their values."""
+        return HomogeneousModel(self.energy, self.fixed, self.tests, parameters, self.fibres)
+
+    @model_validator(mode="after")
+    def _check(self) -> MaterialTests:
+        refuse(type(self).__name__, self._mistakes())
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        wrong = next(self.mistakes_of_material(), None)
+        if wrong is not None:
+            yield ("material",), wrong, self.material
+            return
+        labels = [test.label for test in self.tests]
+        for i, test in enumerate(self.tests):
+            if labels.index(test.label) < i:
+                yield ("tests", i, "name"), "the name of a test before, expected another one", test.label
+            said = unfit(self.energy, test.mode, self.fibres)
+            if said is not None:
+                yield ("tests", i, "mode"), said, test.mode
+        for _, said in self.materials().objections({}):
+            yield ("material",), said, dict(self.fixed)
