@@ -132,7 +132,8 @@ class Refinable(Solid):
             If the file cannot be read.
         """
         elements = {"degree": self.body.degree, "quadrature_degree": self.body.quadrature_degree}
-        body = MeshFile.model_validate({"file": file, "contents": contents, **elements})
+        known = {} if contents is None else {"contents": contents}
+        body = MeshFile.model_validate({"file": file, **known, **elements})
         adapt = None if self.adapt is None else self.adapt.model_copy(update={"refined": True})
         return self.model_copy(update={"body": body, "adapt": adapt})
 

@@ -110,7 +110,9 @@ _PATTERNS = {  # of texts, by how they begin
 
 
 def _follows(line: Any) -> bool:
-    """Whether a list counts as too short only because there are mistakes in its items."""
+    """Whether a list is too short, or a value not found out, only because there are mistakes in what it consists of."""
+    if line["type"] == "default_factory_not_called":
+        return True
     return line["type"] == "too_short" and len(line["input"]) >= int(
         line["ctx"].get("min_length", len(line["input"]) + 1)
     )

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
@@ -42,6 +42,20 @@ from forward.settings import Settings
 LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
 MOST_LEVELS = 6  # 262 144 cells for each of the file
 MOST_NODES = 20_000_000
+
+
+def _loaded(digest: str, known: Mapping[str, Any]) -> Loaded:
+    """Read the file of a body, of known hash, and divide its cells as the fields of the body say."""
+    mesh = load(known["file"], digest, known["unit"], tuple(known["names"].items()), known["tags"])
+    for _ in range(known["levels"]):
+        mesh = divided(mesh, ())
+    return mesh if known["divide"] is None else divided(mesh, known["divide"])
+
+
+def _contents(known: dict[str, Any]) -> Contents:
+    """Read what a study does not say of a file; a mistake in it is one of the body."""
+    digest = digest_of(known["file"])
+    return contents(_loaded(digest, known), digest)
 
 
 class MeshFile(Settings):
@@ -88,15 +102,13 @@ class MeshFile(Settings):
     levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0
     divide: tuple[str, ...] | None = None
     slits: tuple[str, ...] = Field(default=(), exclude_if=operator.not_)
-    contents: Contents | None = None
+    contents: Contents = Field(default_factory=_contents)
 
     @model_validator(mode="after")
-    def _read(self) -> MeshFile:
-        if self.contents is None:
-            object.__setattr__(self, "contents", contents(self.load(), digest_of(self.file)))
-        wrong = [name for name in self.slits if name not in self.found.slits]
+    def _check(self) -> MeshFile:
+        wrong = [name for name in self.slits if name not in self.contents.slits]
         if wrong:
-            there = ", ".join(filter(None, self.found.slits)) or "none in this file"
+            there = ", ".join(filter(None, self.contents.slits)) or "none in this file"
             message = f"slits: '{wrong[0]}' is no boundary whose faces lie on each other, expected such a one: {there}"
             raise ValueError(message)
         lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
@@ -118,13 +130,10 @@ class MeshFile(Settings):
             If that is not possible, or if the file is not the one that the study was made for.
         """
         digest = digest_of(self.file)
-        if self.contents is not None and digest != self.contents.digest:
+        if digest != self.contents.digest:
             message = f"model.body.file: {self.file} is not the file that the study was made for: it has changed"
             raise ModelError(message)
-        loaded = load(self.file, digest, self.unit, tuple(self.names.items()), self.tags)
-        for _ in range(self.levels):
-            loaded = divided(loaded, ())
-        return loaded if self.divide is None else divided(loaded, self.divide)
+        return _loaded(digest, vars(self))
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
         """Return the body with every cell divided into eight, thinner ones at some boundaries.
@@ -139,20 +148,14 @@ class MeshFile(Settings):
         return self.model_validate(self.model_dump(exclude={"contents"}) | {"divide": towards})
 
     @property
-    def found(self) -> Contents:
-        """What the file holds."""
-        assert self.contents is not None
-        return self.contents
-
-    @property
     def cell(self) -> Literal["tetrahedron", "hexahedron"]:
         """Shape of the cells."""
-        return self.found.cell
+        return self.contents.cell
 
     @property
     def cell_count(self) -> int:
         """Number of cells."""
-        return self.found.cells
+        return self.contents.cells
 
     @property
     def cells_in_words(self) -> str:
@@ -162,23 +165,23 @@ class MeshFile(Settings):
     @property
     def boundaries(self) -> tuple[str, ...]:
         """Names of the boundaries."""
-        return tuple(self.found.boundaries)
+        return tuple(self.contents.boundaries)
 
     @property
     def regions(self) -> tuple[str, ...]:
         """Names of the regions."""
-        return tuple(self.found.regions)
+        return tuple(self.contents.regions)
 
     @property
     def nodes(self) -> int:
         """Number of nodes of the displacement."""
-        found = self.found
+        found = self.contents
         return node_count(found.cell, self.degree, found.vertices, found.edges, found.faces, found.cells)
 
     @property
     def vertex_count(self) -> int:
         """Number of vertices of the mesh."""
-        return self.found.vertices
+        return self.contents.vertices
 
     @property
     def quadrature(self) -> int:
@@ -188,7 +191,7 @@ class MeshFile(Settings):
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
         """Smallest and largest coordinate (m) along each axis."""
-        return self.found.bounds
+        return self.contents.bounds
 
     @property
     def vertices(self) -> tuple[Point, ...]:
@@ -198,7 +201,7 @@ class MeshFile(Settings):
     @property
     def longest_edge(self) -> float:
         """Length (m) of the longest edge of a cell."""
-        return self.found.longest_edge
+        return self.contents.longest_edge
 
     @property
     def description(self) -> str:
@@ -211,8 +214,8 @@ class MeshFile(Settings):
         extents = " × ".join(f"{high - low:.3g}" for low, high in self.bounds)
         return {
             "body": f"mesh {Path(self.file).name} of {extents} m",
-            "boundaries": ", ".join(f"{name} ({area:.3g} m²)" for name, area in self.found.areas.items()),
-            "regions": ", ".join(f"{name} ({volume:.3g} m³)" for name, volume in self.found.regions.items()),
+            "boundaries": ", ".join(f"{name} ({area:.3g} m²)" for name, area in self.contents.areas.items()),
+            "regions": ", ".join(f"{name} ({volume:.3g} m³)" for name, volume in self.contents.regions.items()),
         }
 
     @property
@@ -221,7 +224,7 @@ class MeshFile(Settings):
         extent = max(high - low for low, high in self.bounds)
         if not SMALL <= extent <= LARGE:
             yield Finding("body-size", "warning", {"unit": self.unit, "extent": told(extent, "m", 3)})
-        for name, area in self.found.slits.items():
+        for name, area in self.contents.slits.items():
             if name not in self.slits:
                 named = f" on '{name}'" if name else ""
                 yield Finding("slit", "warning", {"area": f"{area:.3g} m²", "named": named})
@@ -253,7 +256,7 @@ class MeshFile(Settings):
 
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
-        return list(self.found.boundaries[boundary])
+        return list(self.contents.boundaries[boundary])
 
     def enriched(self) -> Self:
         """Return the same body on the same mesh with elements of one degree more, for estimates of its error."""
@@ -295,7 +298,7 @@ class MeshFile(Settings):
         if self.divide is not None:
             message = "its mesh is divided already, expected a body of kind 'box' or 'block', or one without 'divide'"
             raise ModelError(message)
-        found = self.found
+        found = self.contents
         for _ in range(level):
             found = divided_contents(found)
         blocks = self.model_dump() | {"levels": self.levels + level, "contents": found}

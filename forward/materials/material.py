@@ -13,7 +13,6 @@ from __future__ import annotations
 import cmath
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
@@ -30,15 +29,12 @@ TINY = 1e-30  # step of a derivative by complex numbers
 REST = 1e-6  # of the moduli: energy and stress of the undeformed body that count as zero
 
 
-@dataclass(frozen=True)
 class Split:
     """An energy that is the sum of an isochoric and a volumetric part; made by `with_volume`."""
 
-    shape: Energy
-    volume: Energy
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "__doc__", self.shape.__doc__)
+    def __init__(self, shape: Energy, volume: Energy) -> None:
+        self.shape, self.volume = shape, volume
+        self.__doc__ = shape.__doc__
 
     def __call__(self, ops: Any, *measures: Any, **values: Any) -> Any:
         """Return the sum; the last measure is J − 1."""

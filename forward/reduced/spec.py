@@ -6,12 +6,12 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
@@ -41,6 +41,17 @@ class _About(NamedTuple):
     upper: FloatArray
     told: dict[str, Any]
     digest: str
+
+
+def _content(file: str) -> bytes:
+    try:
+        return Path(file).read_bytes()
+    except OSError as error:
+        raise ModelError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+def _digest(content: bytes) -> str:
+    return sha256(content).hexdigest()[:LETTERS]
 
 
 class Reduced(ModelSpec):
@@ -78,43 +89,34 @@ class Reduced(ModelSpec):
     accept_unstable: bool = False
     unbalanced: Annotated[float, Field(gt=0, lt=1)] = 1e-9
     within: bool = False
-    digest: str | None = None
+    digest: str = Field(default_factory=lambda known: _digest(_content(known["file"])))
 
     @model_validator(mode="after")
     def _check(self) -> Reduced:
-        try:
-            about = self._about
-        except ModelError as error:
-            raise PydanticCustomError("model", "{message}", {"message": str(error)}) from None
-        if self.digest is not None and self.digest != about.digest:
-            message = f"{self.file} has changed since the study was begun: hash {self.digest} → {about.digest}"
-            raise PydanticCustomError("model", "{message}", {"message": message})
+        now = self._about.digest
+        if self.digest != now:
+            raise ModelError(f"{self.file} has changed since the study was begun: hash {self.digest} → {now}")
         if self.larger and self.tolerance is not None:
-            message = (
+            raise ModelError(
                 "larger = true with a tolerance, expected one of them: nothing estimates errors of the larger model"
             )
-            raise PydanticCustomError("model", "{message}", {"message": message})
-        object.__setattr__(self, "digest", about.digest)
         return self
 
     @cached_property
     def _about(self) -> _About:
-        path = Path(self.file)
+        content = _content(self.file)
         try:
-            content = path.read_bytes()
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(BytesIO(content), allow_pickle=False) as file:
                 parts = json.loads(str(file["table"]))["model"]["parts"]
                 told, body = parts["about"]["table"], parts["spec"]["table"]
                 names = tuple(parts["parameters"]["tuple"])
                 arrays = [file[f".{name}"] for name in ("nominal", "spread", "lower", "upper")]
-        except OSError as error:
-            raise ModelError(f"{self.file}: cannot be read: {error.strerror or 'it is no reduced model'}") from None
-        except (KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError, OSError):
             message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
             raise ModelError(message) from None
         nominal, spread, lower, upper = arrays
-        digest = sha256(content).hexdigest()[:LETTERS]
-        return _About(Hyperelastic.model_validate(body), names, nominal, spread, lower, upper, told, digest)
+        spec = Hyperelastic.model_validate(body)
+        return _About(spec, names, nominal, spread, lower, upper, told, _digest(content))
 
     @property
     def outputs(self) -> Sequence[Any]:

@@ -41,15 +41,15 @@ class Inputs:
 
     Parameters
     ----------
-    marginals
-        Distribution of each parameter by name; the order is that of the parameter vectors. Those of `draws` follow.
+    own
+        Distribution of each parameter without draws by name; the order is that of the parameter vectors.
     correlations
         Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
         mapped through the marginals. Other pairs are uncorrelated.
     admissible
         Where the model is defined. Densities are restricted to it by dividing by `admitted`; points are not restricted.
     draws
-        Parameters of which there are draws, dependent as these are, and independent of the others.
+        Parameters of which there are draws, dependent as these are, and independent of the others, which they follow.
 
     Raises
     ------
@@ -57,15 +57,12 @@ class Inputs:
         If the correlations have unknown names, or names of draws, or do not form a positive definite matrix.
     """
 
-    marginals: dict[str, Distribution]
+    own: dict[str, Distribution]
     correlations: tuple[tuple[str, str, float], ...] = ()
     admissible: Restriction | None = field(default=None, compare=False)
     draws: Draws | None = None
 
     def __post_init__(self) -> None:
-        if self.draws is not None:
-            own = {name: one for name, one in self.marginals.items() if name not in self.draws.names}
-            object.__setattr__(self, "marginals", own | self.draws.marginals)
         for a, b, rho in self.correlations:
             for name in (a, b):
                 if self.draws is not None and name in self.draws.names:
@@ -83,6 +80,11 @@ class Inputs:
             message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
             raise ValueError(message)
 
+    @cached_property
+    def marginals(self) -> dict[str, Distribution]:
+        """Distribution of each parameter by name."""
+        return self.own if self.draws is None else self.own | self.draws.marginals
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
@@ -96,8 +98,7 @@ class Inputs:
     @property
     def joint(self) -> range:
         """Places of the parameters that are given by draws."""
-        d = len(self.marginals)
-        return range(d, d) if self.draws is None else range(d - len(self.draws.names), d)
+        return range(len(self.own), len(self.marginals))
 
     @property
     def largest_degree(self) -> int:
@@ -118,7 +119,7 @@ class Inputs:
     def _columns(self) -> dict[Distribution, list[int]]:
         """Positions of the parameters of each distribution."""
         columns: dict[Distribution, list[int]] = {}
-        for i, marginal in enumerate(list(self.marginals.values())[: self.joint.start]):
+        for i, marginal in enumerate(self.own.values()):
             columns.setdefault(marginal, []).append(i)
         return columns
 
@@ -149,7 +150,7 @@ class Inputs:
         """Correlation (d, d) of the coordinates, by Gauss–Hermite quadrature for correlated pairs; draws have none."""
         correlation = np.eye(len(self.marginals))
         if self.draws is not None:
-            correlation[: self.joint.start, : self.joint.start] = self._own.correlation
+            correlation[: self.joint.start, : self.joint.start] = self._alone.correlation
             return correlation
         nodes, weights = np.polynomial.hermite_e.hermegauss(64)  # type: ignore[no-untyped-call]
         weights = weights / weights.sum()
@@ -171,7 +172,7 @@ class Inputs:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
         if self.draws is not None:
             own, of_draws = np.split(uniforms, [self.joint.start], axis=1)
-            return np.hstack([self._own.points(own), self.draws.points(of_draws)])
+            return np.hstack([self._alone.points(own), self.draws.points(of_draws)])
         if not self.correlations:
             points = np.empty_like(uniforms)
             for marginal, columns in self._columns.items():  # many parameters have few distributions
@@ -192,9 +193,9 @@ class Inputs:
         return points
 
     @cached_property
-    def _own(self) -> Inputs:
+    def _alone(self) -> Inputs:
         """The parameters that have distributions of their own."""
-        return Inputs(dict(list(self.marginals.items())[: self.joint.start]), self.correlations)
+        return Inputs(self.own, self.correlations)
 
     def from_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map independent standard normal coordinates x (n, d) to the parameters ω (n, d).
@@ -233,7 +234,7 @@ class Inputs:
         first = self.joint.start
         points, slopes = self.points(uniforms), np.zeros((*uniforms.shape, uniforms.shape[1]))
         if first:
-            slopes[:, :first, :first] = self._own.from_normals(ndtri(uniforms[:, :first]))[1]
+            slopes[:, :first, :first] = self._alone.from_normals(ndtri(uniforms[:, :first]))[1]
         of_draws = self.coordinates
         size = np.where(of_draws.logarithmic, points, 1.0)[:, first:] * of_draws.scale[first:]
         slopes[:, first:, first:] = size[:, :, None] * self.draws.mixing
@@ -277,7 +278,7 @@ class Inputs:
         if self.admissible is None or not self.admissible.names:
             return 1.0
         if self.draws is not None:
-            own = self._own.points(
+            own = self._alone.points(
                 sobol_points(0, 0, 0, len(self.draws.values), len(self.marginals))[:, : self.joint.start]
             )
             return float(self.draws.weights @ self.allowed(np.hstack([own, self.draws.values])))

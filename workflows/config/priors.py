@@ -36,10 +36,12 @@ def inputs_of(
     materials: Materials | None = None,
     draws: Draws | None = None,
 ) -> Inputs:
-    """Return random parameters: those that are given, and then standard normal coefficients of random fields."""
-    standard = dict.fromkeys(coefficients, Normal(mean=0.0, std=1.0))
+    """Return random parameters: given ones, then standard normal coefficients of random fields; then those of draws."""
+    own = {**parameters, **dict.fromkeys(coefficients, Normal(mean=0.0, std=1.0))}
+    if draws is not None:
+        own = {name: one for name, one in own.items() if name not in draws.names}
     pairs = tuple((*one.between, one.value) for one in correlations)
-    return Inputs({**parameters, **standard}, pairs, materials, draws=draws)
+    return Inputs(own, pairs, materials, draws=draws)
 
 
 def admissible(inputs: Inputs, rng: np.random.Generator, count: int) -> FloatArray:

@@ -113,8 +113,8 @@ def test_a_refined_mesh_is_a_body_from_a_file(tmp_path):
     assert (again.points == mesh.points).all()
     assert (again.cells == mesh.cells).all()
     assert again.regions == ("left", "right")
-    assert body.found.areas == pytest.approx(MeshFile(file=str(tmp_path / "box.msh")).found.areas)
-    assert body.found.regions == pytest.approx({"left": 0.28, "right": 0.28})
+    assert body.contents.areas == pytest.approx(MeshFile(file=str(tmp_path / "box.msh")).contents.areas)
+    assert body.contents.regions == pytest.approx({"left": 0.28, "right": 0.28})
     (tmp_path / "other.npz").write_bytes(b"no mesh")
     with pytest.raises(ValueError, match=r"other.npz: cannot be read as a mesh"):
         MeshFile(file=str(tmp_path / "other.npz"))

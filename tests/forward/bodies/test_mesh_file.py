@@ -71,7 +71,7 @@ def test_what_is_found_is_that_of_the_box(file):
     assert own.longest_edge == pytest.approx(boxed.longest_edge)
     np.testing.assert_allclose(own.bounds, boxed.bounds)
     np.testing.assert_allclose(own.vertices, boxed.vertices)
-    assert own.found.regions == pytest.approx({"left": 0.28, "right": 0.28})
+    assert own.contents.regions == pytest.approx({"left": 0.28, "right": 0.28})
     for name in NAMES:
         spanned = np.array(own.corners_of(name))
         assert len(spanned) == 3
@@ -242,7 +242,7 @@ def test_groups_of_gmsh(tmp_path):
     for form in (2.2, 4.1):
         own = MeshFile(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
         assert set(own.boundaries) == {"held", "pulled", "whole-liver", "skin"}
-        assert own.found.areas == pytest.approx({"held": 0.01, "pulled": 0.01, "whole-liver": 0.04, "skin": 0.04})
+        assert own.contents.areas == pytest.approx({"held": 0.01, "pulled": 0.01, "whole-liver": 0.04, "skin": 0.04})
         assert own.regions == ("whole-liver",)
     for name, message in (
         ("twice", r"cells are in several groups of volumes \(whole-liver, again\), expected one region for each"),
@@ -250,7 +250,7 @@ def test_groups_of_gmsh(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             MeshFile(file=str(tmp_path / f"{name}.msh"))
-    assert own.found.regions["whole-liver"] == pytest.approx(2e-3)
+    assert own.contents.regions["whole-liver"] == pytest.approx(2e-3)
     np.testing.assert_allclose(np.array(own.corners_of("held"))[:, 0], 0, atol=1e-12)
     np.testing.assert_allclose(np.array(own.corners_of("pulled"))[:, 0], 0.2)
 
@@ -329,9 +329,9 @@ def test_files_that_are_no_meshes(tmp_path, capsys):
 
 def test_numbers_of_an_xdmf_file_count(tmp_path):
     meshio.write(tmp_path / "box.xdmf", numbered(box()))
-    before = MeshFile(file=str(tmp_path / "box.xdmf")).found.digest
+    before = MeshFile(file=str(tmp_path / "box.xdmf")).contents.digest
     meshio.write(tmp_path / "box.xdmf", numbered(box(scale=2.0)))  # the same text, other numbers beside it
-    assert MeshFile(file=str(tmp_path / "box.xdmf")).found.digest != before
+    assert MeshFile(file=str(tmp_path / "box.xdmf")).contents.digest != before
 
 
 ABAQUS = """*HEADING
@@ -361,8 +361,8 @@ def test_sets_of_abaqus(tmp_path):
     path = tmp_path / "a.inp"
     path.write_text(ABAQUS)
     body = MeshFile(file=str(path))
-    assert body.found.regions == pytest.approx({"body": 1 / 6, "LUMP": 1 / 3}, rel=1e-5)
-    assert body.found.areas == pytest.approx({"BOTTOM": 0.5, "SIDES": 1.5}, rel=1e-5)
+    assert body.contents.regions == pytest.approx({"body": 1 / 6, "LUMP": 1 / 3}, rel=1e-5)
+    assert body.contents.areas == pytest.approx({"BOTTOM": 0.5, "SIDES": 1.5}, rel=1e-5)
     path.write_text(ABAQUS.replace("ELSET=LUMP\n 11", "ELSET=BOTTOM\n 10, 11").replace(", ELSET=ALL", ""))
     body = MeshFile(file=str(path))
     assert (body.regions, body.boundaries) == (("BOTTOM",), ("BOTTOM-nodes", "SIDES"))

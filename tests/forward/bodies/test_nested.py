@@ -57,10 +57,10 @@ def test_fields_between_vertices_are_the_same(name, cell):
         assert set(named) == outer
     assert (body_within.degree, body_within.cell) == (body.degree, cell)
     if name == "box":
-        assert body_within.found.areas == pytest.approx(
+        assert body_within.contents.areas == pytest.approx(
             {"x-min": 1.0, "x-max": 1.0, "y-min": 2.0, "y-max": 2.0, "z-min": 2.0, "z-max": 2.0}
         )
-        assert sum(body_within.found.regions.values()) == pytest.approx(2.0)
+        assert sum(body_within.contents.regions.values()) == pytest.approx(2.0)
 
 
 def test_cells_are_thinner_at_the_rims_of_what_is_held():

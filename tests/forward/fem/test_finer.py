@@ -81,7 +81,7 @@ def test_tetrahedra_are_divided_into_eight(tmp_path):
             assert {tuple(sorted(facet)) for facet in facets.tolist()} <= outer
     body = whole.finer(1.5, (held,), 8.0, 4.0)
     assert body.cell_count == 8 * whole.cell_count
-    assert sum(body.found.areas.values()) == pytest.approx(sum(whole.found.areas.values()))
+    assert sum(body.contents.areas.values()) == pytest.approx(sum(whole.contents.areas.values()))
     with pytest.raises(ModelError, match="divided already"):
         body.finer(1.5, (held,), 8.0, 4.0)
 
@@ -128,10 +128,10 @@ def test_hexahedra_are_divided_into_eight(tmp_path):
     nearest = [inside(m.points, m.cells)[0][np.isin(m.cells, m.boundaries[held]).any(axis=1)].sum() for m in thin]
     assert 0.4 < nearest[1] / nearest[0] < 0.6  # of half the thickness
     twice = whole.refined(2)
-    made = contents(twice.load(), twice.found.digest)
+    made = contents(twice.load(), twice.contents.digest)
     left_out = {"longest_edge", "boundaries", "areas", "regions"}
-    assert twice.found.model_dump(exclude=left_out) == made.model_dump(exclude=left_out)
-    assert made.longest_edge <= twice.found.longest_edge * (1 + 1e-12)
+    assert twice.contents.model_dump(exclude=left_out) == made.model_dump(exclude=left_out)
+    assert made.longest_edge <= twice.contents.longest_edge * (1 + 1e-12)
     assert whole.finer(2.0, (held,), 8.0, 4.0).cell_count == 8 * whole.cell_count
 
 
@@ -148,14 +148,14 @@ def test_finer_meshes_of_a_file(tmp_path):
     assert body.refined(0) is body
     fine = body.refined(1).refined(2)
     assert fine == body.refined(3)
-    mesh, made = fine.load(), contents(fine.load(), fine.found.digest)
+    mesh, made = fine.load(), contents(fine.load(), fine.contents.digest)
     # What is said before anything is divided is so.
-    assert fine.found.model_dump(exclude={"longest_edge", "boundaries", "areas", "regions"}) == made.model_dump(
+    assert fine.contents.model_dump(exclude={"longest_edge", "boundaries", "areas", "regions"}) == made.model_dump(
         exclude={"longest_edge", "boundaries", "areas", "regions"}
     )
     assert body.longest_edge / 8 <= made.longest_edge <= fine.longest_edge
-    assert made.areas == pytest.approx(body.found.areas)
-    assert made.regions == pytest.approx(body.found.regions)
+    assert made.areas == pytest.approx(body.contents.areas)
+    assert made.regions == pytest.approx(body.contents.regions)
     assert made.cells == 512 * body.cell_count
     assert quality(mesh).min() > quality(body.load()).min() / 2
     assert MeshFile.model_validate(fine.model_dump()) == fine

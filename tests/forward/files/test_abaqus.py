@@ -94,8 +94,8 @@ def body_of(path, text):
 def test_models_of_abaqus_itself(tmp_path):
     """Parts and instances (shifted, then turned), hybrid elements, surfaces of sides, reference points and tools."""
     body = body_of(tmp_path / "cae.inp", CAE)
-    assert body.found.regions == approx({"body": 1000, "stiff-lump": 1000})
-    assert body.found.areas == approx({"top": 200, "skin": 1000, "side": 100, "Set-1": 1000, "bottom": 200})
+    assert body.contents.regions == approx({"body": 1000, "stiff-lump": 1000})
+    assert body.contents.areas == approx({"top": 200, "skin": 1000, "side": 100, "Set-1": 1000, "bottom": 200})
     np.testing.assert_allclose(body.bounds, [(-5, 5), (0, 20), (0, 10)], atol=1e-12)
     loaded = body.load()
     assert np.ptp(loaded.points[np.unique(loaded.boundaries["top"])][:, 2]) == 0
@@ -142,15 +142,15 @@ TETRAHEDRA = """*NODE, NSET=ALL
 def test_models_of_gmsh(tmp_path):
     """Sets of the user win over those of the entities; triangles are boundaries; types in any case."""
     body = body_of(tmp_path / "a.inp", TETRAHEDRA)
-    assert body.found.regions == approx({"lump": 1 / 3, "tissue": 1 / 6})
-    assert {name: body.found.areas[name] for name in ("bottom", "Surface1")} == {"bottom": 0.5, "Surface1": 0.5}
+    assert body.contents.regions == approx({"lump": 1 / 3, "tissue": 1 / 6})
+    assert {name: body.contents.areas[name] for name in ("bottom", "Surface1")} == {"bottom": 0.5, "Surface1": 0.5}
     body = body_of(tmp_path / "a.inp", TETRAHEDRA.partition("*ELSET")[0])
     assert set(body.regions) == {"Volume1", "Volume2"}
     for one in (1, 2):  # the same set in two blocks
         text = TETRAHEDRA.partition("*ELSET")[0].replace(f"Volume{3 - one}", f"Volume{one}")
-        assert body_of(tmp_path / "a.inp", text).found.regions == approx({f"Volume{one}": 0.5})
+        assert body_of(tmp_path / "a.inp", text).contents.regions == approx({f"Volume{one}": 0.5})
     text = TETRAHEDRA.replace("ELSET=Volume2", "OFFSET=0").replace(", ELSET=Surface1", "")
-    assert body_of(tmp_path / "a.inp", text.partition("*ELSET")[0]).found.regions == approx(
+    assert body_of(tmp_path / "a.inp", text.partition("*ELSET")[0]).contents.regions == approx(
         {"Volume1": 1 / 6, "body": 1 / 3}
     )
 
@@ -171,7 +171,7 @@ def test_files_that_are_included_count(tmp_path):
         "elset=Volume1\n 10, 1, 2, 3, 4\n", "elset=Volume1,\ninput=rows.txt\n"
     )
     body = body_of(tmp_path / "a.inp", whole)
-    assert body.found.regions == approx({"lump": 1 / 3, "tissue": 1 / 6})
+    assert body.contents.regions == approx({"lump": 1 / 3, "tissue": 1 / 6})
     before = digest_of(str(tmp_path / "a.inp"))
     (tmp_path / "nodes.inp").write_text(head.replace(" 5, 1, 1, 1", " 5, 1, 1, 2"))
     assert digest_of(str(tmp_path / "a.inp")) != before
@@ -219,5 +219,5 @@ def test_what_meshio_writes(tmp_path):
         point_sets={"bottom": np.array([0, 1, 2])},
     ).write(tmp_path / "a.inp")
     body = MeshFile(file=str(tmp_path / "a.inp"))
-    assert body.found.regions == approx({"body": 1 / 6, "lump": 1 / 3})
+    assert body.contents.regions == approx({"body": 1 / 6, "lump": 1 / 3})
     assert body.boundaries == ("bottom",)

@@ -51,8 +51,8 @@ def test_bodies_that_dolfinx_wrote(folder, kind, form):
     """Also on two ranks, in an order of their own; a part has tags, the rest has none."""
     body = MeshFile(file=str(folder / f"{kind}-{form}.xdmf"), names={"right": 11, "top": 22}, degree=1)
     assert body.cell == kind
-    assert body.found.regions == pytest.approx({"0": 6e-6, "right": 6e-6}, rel=1e-5)
-    assert body.found.areas == pytest.approx({"right": 6e-4, "top": 6e-4}, rel=1e-5)
+    assert body.contents.regions == pytest.approx({"0": 6e-6, "right": 6e-6}, rel=1e-5)
+    assert body.contents.areas == pytest.approx({"right": 6e-4, "top": 6e-4}, rel=1e-5)
     loaded = body.load()
     right = loaded.points[loaded.cells[loaded.region == loaded.regions.index("right")]]
     assert right[..., 0].min() == pytest.approx(0.015)

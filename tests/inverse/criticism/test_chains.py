@@ -266,7 +266,7 @@ def test_verdicts_on_fields():
 def test_a_posterior_of_one_parameter():
     model = FunctionModel(lambda p: [p[0]], ("a",), ("u",), lambda p: [[1.0]])
     base = few()
-    inputs = replace(base.inputs, marginals={"a": base.inputs.marginals["a"]})
+    inputs = replace(base.inputs, own={"a": base.inputs.marginals["a"]})
     posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0]), np.array([1.0]))
     found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=500))
     agrees(found, np.array([0.5]), np.array([np.sqrt(0.5)]))

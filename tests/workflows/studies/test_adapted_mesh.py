@@ -136,7 +136,7 @@ def test_the_mesh_serves_other_studies(study, finished):
     body = parse(blocks).model.body
     assert isinstance(body, MeshFile)
     assert set(body.boundaries) == {"top", "right"}
-    assert body.found.regions == pytest.approx({"body": 0.1875})
+    assert body.contents.regions == pytest.approx({"body": 0.1875})
 
 
 def test_a_limit_that_is_reached_is_a_warning(study):
