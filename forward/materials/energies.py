@@ -2,10 +2,11 @@
 
 A function takes the operators `ops` (``ln``, ``log1p``, ``exp``, ``expm1``, ``sinh``, ``sqrt``; ``positive``: the
 larger of x and 0; ``near``: one of two expressions, depending on whether |z| is below a limit), measures of deformation
-by name, and its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The
-names of the keyword-only arguments *are* the names of the parameters in studies and results; their annotations give the
-units and the values for which the energy is defined. Which constants together are stable at rest is stated in
-`forward.materials.admissible`. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
+by name, and its constants as keyword-only arguments. UFL reads it for finite elements, a `forward.graph` for closed
+forms. The names of the keyword-only arguments *are* the names of the parameters in studies and results; their
+annotations give the units and the values for which the energy is defined. Which constants together are stable at rest
+is stated in `forward.materials.admissible`. All energies are in J/m³ and vanish, with their stress, in the undeformed
+body.
 
 Measures vanish in the undeformed body, and `forward.materials.kinematics` computes them from ∇u without subtracting
 numbers near one. Energies are written without such differences too: they keep their digits however small the strains.

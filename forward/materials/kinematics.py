@@ -1,4 +1,4 @@
-"""Measures of a deformation from the displacement gradient, for UFL and SymPy alike."""
+"""Measures of a deformation from the displacement gradient, for UFL and a `forward.graph` alike."""
 
 from __future__ import annotations
 

@@ -7,9 +7,9 @@ With the energy W(x, z, y) of the specimen per volume, the nominal stresses that
 
 with k = 2 where two equal stretches are prescribed. An incompressible specimen has y from J = 1; a compressible one has
 ∂W/∂y = 0, and then dW/dx = ∂W/∂x. Cauchy stresses are P1 x/J and P2 z/J. Fibres lie such that no shear is needed for
-that. SymPy reads the energy and differentiates it, so that stresses and their derivatives with respect to the constants
-are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics
-(2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
+that. A `forward.graph` of the energy is differentiated, so that stresses and their derivatives with respect to the
+constants are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid
+Mechanics (2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
 
 All test modes are one system of equations with different unknowns, hence one file.
 """
@@ -17,7 +17,7 @@ All test modes are one system of equations with different unknowns, hence one fi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -25,15 +25,26 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
+from forward.graph import SELECT, Graph, Scalar, Tape
 from forward.materials.admissible import objection
-from forward.materials.kinematics import dilation_of, of_stretches
-from forward.materials.material import Energy, constants, energy_of, incompressible, isochoric, measures, of_volume
+from forward.materials.kinematics import dilation_of
+from forward.materials.material import (
+    Energy,
+    constants,
+    energy_of,
+    incompressible,
+    isochoric,
+    measured,
+    measures,
+    of_volume,
+)
 from forward.model import FloatArray, FunctionModel, FunctionSolution, Guess, InadmissibleError, OneByOne, SolveError
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
 Component = Literal["P1", "P2", "P1-P2"]
 HELD: tuple[Mode, ...] = ("biaxial", "pure-shear")  # modes with a load across
+Fibre = tuple[float, float, float]
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
@@ -122,7 +133,7 @@ class HomogeneousModel(OneByOne):
         values: dict[str, float],
         tests: Sequence[MaterialTest],
         parameters: Sequence[str],
-        fibres: Sequence[tuple[float, float, float]] = (),
+        fibres: Sequence[Fibre] = (),
     ) -> None:
         units = tuple(tuple((np.array(fibre) / np.linalg.norm(fibre)).tolist()) for fibre in fibres)
         objection = next(filter(None, (unfit(energy, test.mode, fibres) for test in tests)), None)
@@ -211,8 +222,8 @@ class _Kinematics(NamedTuple):
     All stretches stand less one, so that small ones keep their digits; in simple shear, x is the amount of shear.
     """
 
-    stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of sympy, x, z, y
-    incompressible: Callable[[Any, Any, Any], Any] | None  # of sympy, x, z; nothing is free where there is none
+    stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of ops, x, z, y
+    incompressible: Callable[[Any, Any, Any], Any] | None  # of ops, x, z; nothing is free where there is none
     share: int = 1  # prescribed stretches that are x
     alike: tuple[tuple[int, int], ...] = ()  # directions in which the specimen is stretched alike, and so must be made
 
@@ -241,7 +252,7 @@ def _sheared(ops: Any, gamma: Any) -> Any:
 Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray, FloatArray]]
 
 
-def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
+def unfit(energy: str, mode: Mode, fibres: Sequence[Fibre]) -> str | None:
     """Say why fibres do not fit a material and a mode, or None if they do.
 
     If a face is free, the material must be symmetric about each plane of the mode (reflections leave the families of
@@ -268,7 +279,7 @@ def reading(
     energy: str,
     mode: Mode,
     names: tuple[str, ...],
-    fibres: tuple[tuple[float, float, float], ...] = (),
+    fibres: tuple[Fibre, ...] = (),
     component: Component = "P1",
     cauchy: bool = False,
 ) -> Reading:
@@ -289,8 +300,7 @@ def reading(
     confined = kinematics.incompressible is None
     kept = incompressible(energy, names)  # the volume
     free = not kept and not confined
-    energies = _of_measures(energy_of(energy), names, len(fibres))
-    ways = [_of_stretches(mode, name, incompressible=kept, fibres=fibres) for name in measures(energy)]
+    forms = _forms(energy_of(energy), mode, names, fibres)
     share = {"P1": (1, 0), "P2": (0, 1), "P1-P2": (1, -1)}[component]
 
     def shares(x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[Any, Any, Any]:
@@ -302,14 +312,6 @@ def reading(
         both = 2 if mode == "uniaxial" else 1  # number of free directions
         return along * (1 + x) / J, across * (1 + z) / J, 0.0 if kept else -both / (1 + y)
 
-    def balance(x: FloatArray, z: FloatArray, y: FloatArray, theta: FloatArray) -> tuple[Any, Any]:
-        """∂W/∂y and ∂²W/∂y²."""
-        m, _, _, by_y = _joined([way.first(x, z, y) for way in ways])
-        *_, by_yy = _joined([way.second(x, z, y) for way in ways])
-        _, by_m = energies.first(m, theta)
-        turned = [_sum(row, by_y) for row in energies.second(m, theta)]
-        return _sum(by_m, by_y), _sum(turned, by_y) + _sum(by_m, by_yy)
-
     def read(
         at: FloatArray, across: FloatArray, constants_: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray]:
@@ -320,132 +322,65 @@ def reading(
             if kinematics.incompressible is not None:
                 y = np.broadcast_to(kinematics.incompressible(np, x, z), shape)
             if free:
-                y = _lateral(lambda y: balance(x, z, y, constants_), y)
-            m, by_x, by_z, by_y = _joined([way.first(x, z, y) for way in ways])
-            W, by_m = energies.first(m, constants_)
+                y = _lateral(lambda y: forms.balance([x, z, y, *constants_]), y)
+            here = [x, z, y, *constants_]
+            W, by_x, by_z = forms.first(here)
             a, b, slope = shares(x, z, y)
-            stress = a * _sum(by_m, by_x) + b * _sum(by_m, by_z)
+            stress = a * by_x + b * by_z
             # Beyond the limit of an energy, its derivatives may still be finite.
             stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
             if not derivatives:
                 return stress, np.zeros((0, *shape))
-            mixed = energies.mixed(m, constants_)
-            found = [a * _sum(row, by_x) + b * _sum(row, by_z) for row in mixed]
+            (*of_x, by_xy), (*of_z, by_zy), (*of_y, by_yy) = np.split(_broadcast(forms.mixed(here), shape), 3)
+            found = [a * one + b * other for one, other in zip(of_x, of_z, strict=True)]
             if free:
-                by_xy, by_zy, by_yy = _joined([way.second(x, z, y) for way in ways])
-                turned = [_sum(row, by_y) for row in energies.second(m, constants_)]
-                g_y = _sum(turned, by_y) + _sum(by_m, by_yy)
-                along, aside = _sum(turned, by_x) + _sum(by_m, by_xy), _sum(turned, by_z) + _sum(by_m, by_zy)
-                by_lateral = a * along + b * aside + slope * stress
-                found = [one - by_lateral * _sum(row, by_y) / g_y for one, row in zip(found, mixed, strict=True)]
-            by_constant = np.array([np.broadcast_to(one, shape) for one in found]).reshape(len(names), *shape)
+                by_lateral = a * by_xy + b * by_zy + slope * stress
+                found = [one - by_lateral * side / by_yy for one, side in zip(found, of_y, strict=True)]
+            by_constant = np.array(found).reshape(len(names), *shape)
         return stress, np.where(np.isfinite(stress), by_constant, np.nan)
 
     return read
 
 
-def _sum(left: Sequence[Any], right: Sequence[Any]) -> Any:
-    """Σ_i left_i right_i."""
-    return sum(a * b for a, b in zip(left, right, strict=True))
+def _broadcast(values: Sequence[Any], shape: tuple[int, ...]) -> FloatArray:
+    return np.array([np.broadcast_to(one, shape) for one in values])
 
 
-class _Energies(NamedTuple):
-    """An energy W of measures m and constants θ: functions of (m, θ)."""
+class _Forms(NamedTuple):
+    """The energy W of a mode as functions of its stretches less one and the constants, (x, z, y, *θ)."""
 
-    first: Callable[[Any, Any], tuple[Any, list[Any]]]  # W and ∂W/∂m
-    second: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂m∂m
-    mixed: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂θ∂m, for each θ
-
-
-@cache
-def _of_measures(energy: Energy, names: tuple[str, ...], families: int) -> _Energies:
-    import sympy
-
-    m: list[Any] = []
-    given: list[Any] = []
-    for name in measures(energy):
-        own = sympy.symbols([f"{name}_{k}" for k in range(families if name == "i4" else 1)])
-        m += own
-        given.append(tuple(own) if name == "i4" else own[0])
-    theta = sympy.symbols(names)
-    values = dict(zip(names, theta, strict=True))
-    W = (isochoric(energy) if incompressible(energy, names) else energy)(_operators(), *given, **values)
-    slopes = [sympy.diff(W, one) for one in m]
-    first = _compiled([*m, *theta], [W, *slopes], 1 + len(m))
-    second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m], len(m))
-    mixed = _compiled([*m, *theta], [slope.diff(one) for one in theta for slope in slopes], len(m))
-
-    def value_and_slopes(m: Any, theta: Any) -> tuple[Any, list[Any]]:
-        ((value, *by_m),) = first(*m, *theta)
-        return value, by_m
-
-    return _Energies(value_and_slopes, lambda m, theta: second(*m, *theta), lambda m, theta: mixed(*m, *theta))
-
-
-class _Paths(NamedTuple):
-    """Measures m of a mode, as functions of its stretches minus one (x, z, y)."""
-
-    first: Callable[[Any, Any, Any], list[list[Any]]]  # m, and its derivatives by x, z and y
-    second: Callable[[Any, Any, Any], list[list[Any]]]  # derivatives of that by y, by x, z and y
-
-
-def _joined(parts: Sequence[list[list[Any]]]) -> list[list[Any]]:
-    """Join the lists of several measures elementwise."""
-    return [[one for found in same for one in found] for same in zip(*parts, strict=True)]
+    first: Tape  # W, ∂W/∂x and ∂W/∂z
+    balance: Tape  # ∂W/∂y and ∂²W/∂y²
+    mixed: Tape  # derivatives of ∂W/∂x by all θ and y, then of ∂W/∂z and of ∂W/∂y
 
 
 @cache
-def _of_stretches(
-    mode: Mode, name: str, *, incompressible: bool, fibres: tuple[tuple[float, float, float], ...]
-) -> _Paths:
-    import sympy
-
-    kinematics, ops = _MODES[mode], _operators()
-    x, z, y = symbols = sympy.symbols("x z y")
-    across = y
-    if incompressible and kinematics.incompressible is not None:
-        across = kinematics.incompressible(sympy, x, z)
-    confined = kinematics.incompressible is None
-    e, f, g = stretches = kinematics.stretches(sympy, x, z, across)
-    dilation = sympy.Integer(0) if incompressible or confined else dilation_of(stretches)
+def _forms(energy: Energy, mode: Mode, names: tuple[str, ...], fibres: tuple[Fibre, ...]) -> _Forms:
+    graph, kinematics = Graph(3 + len(names)), _MODES[mode]
+    ops = _operators(graph)
+    x, z, y, *theta = (Scalar(graph, i) for i in range(graph.inputs))
+    kept, confined = incompressible(energy, names), kinematics.incompressible is None
+    across = kinematics.incompressible(ops, x, z) if kept and kinematics.incompressible is not None else y
+    e, f, g = stretches = kinematics.stretches(ops, x, z, across)
     longer = tuple(
         2 * x * a * b + x**2 * b**2 if confined else e * (2 + e) * a**2 + f * (2 + f) * b**2 + g * (2 + g) * c**2
         for a, b, c in fibres
     )
-    known = of_stretches(ops, stretches, dilation, longer)
-    m = list(known[name]) if name == "i4" else [known[name]]
-    by_y = [sympy.diff(one, y) for one in m]
-    first = [*m, *(sympy.diff(one, way) for way in (x, z) for one in m), *by_y]
-    second = [one.diff(way) for way in (x, z, y) for one in by_y]
-    return _Paths(_compiled(symbols, first, len(m)), _compiled(symbols, second, len(m)))
+    at = measured(energy, ops, stretches, 0.0 if kept or confined else dilation_of(stretches), longer)
+    values = dict(zip(names, theta, strict=True))
+    W = graph.node((isochoric(energy) if kept else energy)(ops, *at.values(), **values))
+    slopes = [graph.tangent([W], way)[0] for way in range(3)]
+    along = [graph.tangent(slopes, way) for way in (*range(3, graph.inputs), 2)]
+    mixed = [row[way] for way in range(3) for row in along]
+    return _Forms(graph.tape([W, *slopes[:2]]), graph.tape([slopes[2], mixed[-1]]), graph.tape(mixed))
 
 
-def _compiled(symbols: Sequence[Any], expressions: Sequence[Any], width: int) -> Callable[..., list[list[Any]]]:
-    """Return expressions as a function of numbers, whose values come in rows of a width."""
-    import sympy
-
-    function = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
-
-    def rows(*at: Any) -> list[list[Any]]:
-        found = function(*at)
-        return [list(found[i : i + width]) for i in range(0, len(found), width)]
-
-    return rows
-
-
-def _operators() -> SimpleNamespace:
-    import sympy
-    from sympy.codegen.cfunctions import expm1, log1p
-
+def _operators(graph: Graph) -> SimpleNamespace:
+    names = ("ln", "log1p", "exp", "expm1", "sinh", "sqrt")
     return SimpleNamespace(
-        ln=sympy.log,
-        log1p=log1p,
-        exp=sympy.exp,
-        expm1=expm1,
-        sinh=sympy.sinh,
-        sqrt=sympy.sqrt,
-        positive=lambda x: sympy.Piecewise((x, x > 0), (0, True)),
-        near=lambda z, limit, inside, outside: sympy.Piecewise((inside, z**2 < limit**2), (outside, True)),
+        **{name: partial(graph.formula, name) for name in names},
+        positive=lambda x: graph.formula(SELECT, 0, x, x, 0),
+        near=lambda z, limit, inside, outside: graph.formula(SELECT, z**2, limit**2, inside, outside),
     )
 
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.graph import Tape, from_arrays, to_arrays
 from forward.machine import write_whole
 from forward.model import FloatArray, ModelError
-from forward.reduced.graph import Tape, from_arrays, to_arrays
 
 FORMAT = 1
 

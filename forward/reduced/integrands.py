@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
+from forward.graph import SELECT, Graph, Node, Tape
 from forward.model import FloatArray
 from forward.reduced.data import Points, Written
-from forward.reduced.graph import SELECT, Graph, Node, Tape
 
 # Returns the node of a component of what has a value of its own: a function, its gradient, a constant, a place.
 Known = Callable[[Any, tuple[int, ...]], Node]

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from forward.graph import CODES, SELECT, Tape
 from forward.model import FloatArray
 from forward.native import library
 from forward.reduced.data import Points, Written
-from forward.reduced.graph import CODES, SELECT, Tape
 
 _INFIX = {"add": "+", "mul": "*", "div": "/"}
 _NAMES = {"ln": "log", "abs": "fabs"}

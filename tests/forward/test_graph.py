@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import sympy
 
+from forward.graph import OPERATIONS, SELECT, Graph, from_arrays, to_arrays
 from forward.reduced import kernels
-from forward.reduced.graph import SELECT, UNARY, Graph, from_arrays, to_arrays
 from forward.reduced.kernels import Kernel, spread
+
+UNARY = [name for name, (count, _) in OPERATIONS.items() if count == 1]
 
 
 def expression(graph, ops):
@@ -19,7 +21,13 @@ def expression(graph, ops):
     total = graph.add(total, graph.apply("atan2", x, graph.add(y, z)))
     total = graph.add(total, graph.apply("pow", y, z))
     a, b, c = sympy.symbols("a b c", positive=True)
-    of = sum(getattr(sympy, {"ln": "log", "abs": "Abs"}.get(name, name))(a * b) for name in UNARY)
+    other = {
+        "ln": sympy.log,
+        "abs": sympy.Abs,
+        "log1p": lambda x: sympy.log(1 + x),
+        "expm1": lambda x: sympy.exp(x) - 1,
+    }
+    of = sum((other[name] if name in other else getattr(sympy, name))(a * b) for name in UNARY)
     of += b**3 / c ** sympy.Float(-0.7) + sympy.atan2(a, b + c) + b**c
     return total, of, (a, b, c)
 

@@ -2,13 +2,14 @@
 
 A `Graph` is built by operations that simplify and never repeat a node; `tangent` adds derivatives of nodes. A `Tape` is
 the part of it that some outputs need, as arrays: it is what files hold (data, not code), NumPy evaluates it, and
-`forward.reduced.kernels` compiles it.
+`forward.reduced.kernels` compiles it. A `Scalar` is a node that Python's formulas, as energies are, build upon.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,27 +17,33 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
-UNARY: dict[str, Callable[[Any], Any]] = {
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "ln": np.log,
-    "sin": np.sin,
-    "cos": np.cos,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "atan": np.arctan,
-    "abs": np.abs,
-}
-BINARY: dict[str, Callable[[Any, Any], Any]] = {
-    "add": np.add,
-    "mul": np.multiply,
-    "div": np.divide,
-    "pow": np.power,
-    "atan2": np.arctan2,
-}
+
+def _select(a: Any, b: Any, c: Any, d: Any) -> Any:
+    return np.where(a < b, c, d)
+
+
 SELECT = "select"  # of (a, b, c, d): c where a < b, d elsewhere
-CODES = (*UNARY, *BINARY, SELECT)
+OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {  # how many nodes each takes; files know it by its place here
+    "sqrt": (1, np.sqrt),
+    "exp": (1, np.exp),
+    "ln": (1, np.log),
+    "sin": (1, np.sin),
+    "cos": (1, np.cos),
+    "sinh": (1, np.sinh),
+    "cosh": (1, np.cosh),
+    "tanh": (1, np.tanh),
+    "atan": (1, np.arctan),
+    "abs": (1, np.abs),
+    "add": (2, np.add),
+    "mul": (2, np.multiply),
+    "div": (2, np.divide),
+    "pow": (2, np.power),
+    "atan2": (2, np.arctan2),
+    SELECT: (4, _select),
+    "log1p": (1, np.log1p),
+    "expm1": (1, np.expm1),
+}
+CODES = (*OPERATIONS,)
 Node = int
 
 
@@ -68,14 +75,14 @@ class Tape:
         """Return the outputs (m, n), or numbers, at inputs: arrays (n,) or numbers."""
         values: list[Any] = [*inputs, *self.constants.tolist()]
         with np.errstate(all="ignore"):
-            for code, arguments in zip(self.codes, self.arguments, strict=True):
-                name = CODES[code]
-                given = [values[i] for i in arguments if i >= 0]
-                if name == SELECT:
-                    values.append(np.where(given[0] < given[1], given[2], given[3]))
-                else:
-                    values.append((UNARY[name] if name in UNARY else BINARY[name])(*given))
+            for function, arguments in self._steps:
+                values.append(function(*[values[i] for i in arguments]))
         return [values[i] for i in self.outputs]
+
+    @cached_property
+    def _steps(self) -> list[tuple[Callable[..., Any], list[int]]]:
+        rows = zip(self.codes, self.arguments.tolist(), strict=True)
+        return [(OPERATIONS[CODES[code]][1], [i for i in arguments if i >= 0]) for code, arguments in rows]
 
     def graph(self) -> tuple[Graph, list[Node]]:
         """Return a graph with the same inputs, and the outputs in it."""
@@ -132,10 +139,16 @@ class Graph:
             return arguments[2]
         if all(value is not None for value in values):
             with np.errstate(all="ignore"):
-                if name == SELECT:
-                    return arguments[2] if values[0] < values[1] else arguments[3]  # type: ignore[operator]
-                return self.constant(float((UNARY[name] if name in UNARY else BINARY[name])(*values)))
+                return self.constant(float(OPERATIONS[name][1](*values)))
         return self._node(name, *arguments)
+
+    def formula(self, name: str, *arguments: Any) -> Scalar:
+        """Return an operation of numbers and scalars as a scalar."""
+        return Scalar(self, self.apply(name, *map(self.node, arguments)))
+
+    def node(self, value: Any) -> Node:
+        """Return the node of a number or of a scalar."""
+        return value.node if isinstance(value, Scalar) else self.constant(value)
 
     def add(self, a: Node, b: Node) -> Node:
         """Return a + b."""
@@ -240,30 +253,22 @@ class Graph:
         return self.mul(self._unary_slope(name, node, a), da)
 
     def _unary_slope(self, name: str, node: Node, a: Node) -> Node:
-        one, zero = self.constant(1), self.constant(0)
-        match name:
-            case "exp":
-                return node
-            case "ln":
-                return self.apply("div", one, a)
-            case "sqrt":
-                return self.apply("div", self.constant(0.5), node)
-            case "sin":
-                return self.apply("cos", a)
-            case "cos":
-                return self.mul(self.constant(-1), self.apply("sin", a))
-            case "sinh":
-                return self.apply("cosh", a)
-            case "cosh":
-                return self.apply("sinh", a)
-            case "tanh":
-                return self.minus(one, self.mul(node, node))
-            case "atan":
-                return self.apply("div", one, self.add(one, self.mul(a, a)))
-            case "abs":
-                return self.apply(SELECT, a, zero, self.constant(-1), one)
-            case _:
-                raise ValueError(f"no derivative of '{name}'")
+        one = self.constant(1)
+        slopes: dict[str, Callable[[], Node]] = {
+            "exp": lambda: node,
+            "expm1": lambda: self.add(node, one),
+            "ln": lambda: self.apply("div", one, a),
+            "log1p": lambda: self.apply("div", one, self.add(one, a)),
+            "sqrt": lambda: self.apply("div", self.constant(0.5), node),
+            "sin": lambda: self.apply("cos", a),
+            "cos": lambda: self.mul(self.constant(-1), self.apply("sin", a)),
+            "sinh": lambda: self.apply("cosh", a),
+            "cosh": lambda: self.apply("sinh", a),
+            "tanh": lambda: self.minus(one, self.mul(node, node)),
+            "atan": lambda: self.apply("div", one, self.add(one, self.mul(a, a))),
+            "abs": lambda: self.apply(SELECT, a, self.constant(0), self.constant(-1), one),
+        }
+        return slopes[name]()
 
     def tape(self, outputs: Sequence[Node]) -> Tape:
         """Return the operations that outputs need."""
@@ -284,6 +289,50 @@ class Graph:
             rows,
             np.array([places[node] for node in outputs], dtype=np.int64),
         )
+
+
+class Scalar:
+    """A node of a graph as a number in formulas.
+
+    Parameters
+    ----------
+    graph
+        The graph.
+    node
+        The node.
+    """
+
+    def __init__(self, graph: Graph, node: Node) -> None:
+        self.graph, self.node = graph, node
+
+    def __add__(self, other: Any) -> Scalar:
+        return self.graph.formula("add", self, other)
+
+    def __mul__(self, other: Any) -> Scalar:
+        return self.graph.formula("mul", self, other)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self) -> Scalar:
+        return self * -1
+
+    def __sub__(self, other: Any) -> Scalar:
+        return self + -other
+
+    def __rsub__(self, other: Any) -> Scalar:
+        return -self + other
+
+    def __truediv__(self, other: Any) -> Scalar:
+        return self.graph.formula("div", self, other)
+
+    def __rtruediv__(self, other: Any) -> Scalar:
+        return self.graph.formula("div", other, self)
+
+    def __pow__(self, other: Any) -> Scalar:
+        return self.graph.formula("pow", self, other)
+
+    def __rpow__(self, other: Any) -> Scalar:
+        return self.graph.formula("pow", other, self)
 
 
 def to_arrays(tape: Tape) -> dict[str, NDArray[Any]]:
@@ -308,7 +357,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Tape:
     inputs = int(arrays["inputs"])
     constants, codes, rows, outputs = (arrays[name] for name in ("constants", "codes", "arguments", "outputs"))
     before = inputs + len(constants) + np.arange(len(codes))
-    taken = np.array([1] * len(UNARY) + [2] * len(BINARY) + [4])
+    taken = np.array([count for count, _ in OPERATIONS.values()])
     good = rows.shape == (len(codes), 4) and bool(np.isin(codes, np.arange(len(CODES))).all())
     good = good and bool(((rows >= 0).sum(axis=1) == taken[codes]).all() and (rows < before[:, None]).all())
     last = inputs + len(constants) + len(codes)
