@@ -47,7 +47,7 @@ class Model:
             comm = MPI.COMM_SELF
         self.spec = spec
         names = tuple(spec.scalars if parameters is None else parameters)
-        self._model = spec.build(comm, names)
+        self._model: contract.ForwardModel = spec.build(comm, names)
         self.parameters = {name: spec.scalars[name].value for name in names}
         self.units = {output.name: output.unit for output in spec.returned}
         self.nodes = None if self._model.space is None else self._model.space.coordinates
@@ -82,7 +82,7 @@ class Model:
     @property
     def model(self) -> contract.ForwardModel:
         """The model as methods see it: vectors in, vectors out."""
-        return self._model  # type: ignore[no-any-return]
+        return self._model
 
 
 class Solution(Mapping[str, float]):

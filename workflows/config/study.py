@@ -319,7 +319,7 @@ def _path(key: str, blocks: Mapping[str, Any]) -> list[str]:
 def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     for i, item in enumerate(items):
         if isinstance(item, dict) and name in (*map(item.get, ("name", "kind", "on", "of")), str(i)):
-            items[i] = item.copy()
-            return items[i]  # type: ignore[no-any-return]
+            items[i] = found = item.copy()
+            return found
     message = f"--set {key}: no element is called '{name}'"
     raise StudyError(message)

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
-
-from forward.words import number, with_unit
-
-if TYPE_CHECKING:
-    from workflows.studies.sampling import Study
+from collections.abc import Mapping
+from typing import Any
 
 
 def stability(counts: dict[str, int]) -> str:
@@ -53,15 +48,3 @@ def solves(summary: Mapping[str, Any]) -> int:
 def counted(solves: int) -> str:
     """Write a number of solves."""
     return "1 solve" if solves == 1 else f"{solves:,} solves"
-
-
-def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
-    """Say what was solved: headings, each with its lines."""
-    scalars = study.model.scalars
-
-    def said(path: str) -> str:
-        if path in getattr(study, "given", study.parameters):
-            return "random"
-        return with_unit(number(scalars[path].value, 6), scalars[path].unit)
-
-    return study.spec.words(said, " on the coarsest mesh" if len(study.meshes) > 1 else "")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 N = 3  # axes of displacements
 VERTEX = 1  # of VTK
+COLUMNS = ("measured", "predicted", "residuals", "residual_over_error", "moved")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +90,7 @@ def points_grid(one: xr.Dataset) -> Grid:
     """Return the points of all load cases: a vertex for each point and load case."""
     parts = [part for part in measured_points(one) if len(part.places)]
     places = np.concatenate([part.places for part in parts])
-    data = {
-        "residual_over_error" if name == "over" else name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("measured", "predicted", "residuals", "over", "moved")
-    }
+    columns = zip(*((one.measured, one.predicted, one.residuals, one.over, one.moved) for one in parts), strict=True)
+    data = dict(zip(COLUMNS, map(np.concatenate, columns), strict=True))
     data["load_case"] = np.repeat(np.arange(len(parts)), [len(part.places) for part in parts])
     return Grid(places, np.arange(len(places))[:, None], VERTEX, data)

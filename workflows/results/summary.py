@@ -195,10 +195,8 @@ class _Told:
             names[short] = name
             names |= {part(first, which): part(name, which) for which in parts if holds(dataset, name, which)}
         dims = sorted(dataset[name].dims, key=lambda dimension: dimension != "output")
-        labels = [
-            (str(one), [f"{x:g}" if isinstance(x, float) else str(x) for x in dataset[one].to_numpy().tolist()])
-            for one in dims
-        ]
+        number = {str(one): "{:g}" if dataset[one].dtype.kind == "f" else "{}" for one in dims}
+        labels = [(one, [*map(shown.format, dataset[one].to_numpy().tolist())]) for one, shown in number.items()]
         values = {short: dataset[name].transpose(*dims).to_numpy() for short, name in names.items()}
         return dict(_nested(labels, values))
 

@@ -18,9 +18,10 @@ from uq.estimators.indices import field_indices
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from workflows.config.study import dump, parse
-from workflows.report import bodies, plots, words
+from workflows.report import bodies, plots
 from workflows.report.page import compare, write_report
 from workflows.report.plots.figure import png_of
+from workflows.report.sections.frame import model_in_words
 from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, write_dataset
 from workflows.results.summary import summarise
 
@@ -62,7 +63,7 @@ def test_inclusions_in_words():
     ball = {"name": "tumour", "x": 0.5, "y": 0.5, "z": 0.5, "radius": 0.2, "contrast": 4.0, "width": 0.1}
     blocks["model"]["inclusions"] = [ball]
     blocks["parameters"] = {"inclusions.tumour.radius": {"kind": "uniform", "lower": 0.1, "upper": 0.3}}
-    said = dict(words.model_in_words(parse(blocks)))["inclusions"]
+    said = dict(model_in_words(parse(blocks)))["inclusions"]
     assert said == ["tumour (sphere): x = 0.5 m, y = 0.5 m, z = 0.5 m, radius = random, contrast = 4, width = 0.1 m"]
     assert numbers.per("m", "1") == "m"
 

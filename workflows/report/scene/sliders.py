@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from uq.inputs.distributions import Distribution
+    from workflows.studies.sampling import Study
 
 MOST = 160  # parameters
 MANY = 24  # parameters from which on each is told with fewer numbers
@@ -199,14 +200,14 @@ class Sliders:
         return np.random.default_rng(i).permutation(np.linspace(told["fitted"][0], told["fitted"][1], CHECKED))
 
 
-def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
+def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
     """Return the sliders of a study; None without an expansion, or of too many parameters.
 
     A reduced model is cheap enough to make an expansion of, where the study has none. Of parameters that depend on each
     other by a copula there are no sliders: expansions are not of these.
     """
-    given: Mapping[str, Distribution | None] | None = getattr(study, "given", None)
-    if given is None or dataset.sizes["parameter"] > MOST or bool(getattr(study, "correlations", False)):
+    given: Mapping[str, Distribution | None] = study.given
+    if dataset.sizes["parameter"] > MOST or study.correlations:
         return None
     if "multi_index" not in dataset:
         of = of_reduced(study)
@@ -235,10 +236,10 @@ def sliders(dataset: xr.Dataset, study: Any) -> Sliders | None:
     )
 
 
-def of_reduced(study: Any) -> xr.Dataset | None:
+def of_reduced(study: Study) -> xr.Dataset | None:
     """Fit an expansion to the reduced model that a study samples; None if it samples another, or this cannot be."""
-    spec: Any = getattr(study, "spec", None)
-    if getattr(spec, "kind", "") != "reduced":
+    spec: Any = study.spec
+    if spec.kind != "reduced":
         return None
     try:
         return expanded(Path(spec.file), study, alone=spec.larger)
@@ -246,7 +247,7 @@ def of_reduced(study: Any) -> xr.Dataset | None:
         return None
 
 
-def expanded(file: Path, study: Any, *, alone: bool = False) -> xr.Dataset:
+def expanded(file: Path, study: Study, *, alone: bool = False) -> xr.Dataset:
     """Return the expansion of a reduced model over the inputs of a study, with its mesh, as `chaos` returns one.
 
     `own_error` (output,) is the root mean square error of the model itself on samples that it was not made of; NaN if

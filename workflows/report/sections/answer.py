@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -68,8 +68,8 @@ def forward(results: Results) -> Card:
         question = f"How large {be} {asked}{path}, if {uncertain}?"
     else:
         question = f"How do {listed(names)} change {asked}{path}?"
-    spec: Any = getattr(results.study, "spec", None)
-    counts = counting(results) if getattr(spec, "meshed", False) else np.ones(len(results.outputs))
+    spec = results.study.spec
+    counts = counting(results) if spec.meshed else np.ones(len(results.outputs))
     own = getattr(spec, "errors", {})  # of a reduced model itself: what a mean may be off by at most
     name, answers = "mean" if sampled else "nominal", []
     sources = parts_of(results, name)

@@ -12,7 +12,6 @@ from forward.bodies.geometry import AXES
 from forward.hyperelastic import Path as PathOfLoads
 from forward.model import SolveError
 from forward.readable import and_error, size, spoken
-from forward.specimen import Specimen
 from forward.words import named, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
 from workflows.report.plots import moments
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from forward.model import FloatArray
+    from forward.specimen import Specimen
     from workflows.report.scene.scene import Scene
 
 DRAWN = 8  # data sets that have more than a row in the table
@@ -165,13 +165,8 @@ def curve(results: Results) -> Iterator[Block]:
 LEAST = 3  # places that make a map
 
 
-def _places_applies(results: Results) -> bool:
-    """Whether outputs of load cases of a specimen were inverted."""
-    there = results.dataset.get("datum_axis")
-    return there is not None and isinstance(results.study.model, Specimen) and bool((there >= len(AXES)).any())
-
-
-@section(when=_places_applies)
+# If outputs of load cases of a specimen were inverted.
+@section("datum_axis", when=lambda results: bool((results.dataset["datum_axis"] >= len(AXES)).any()))
 def places(results: Results) -> Iterator[Block]:
     """Measured and predicted forces, and a map of what each place tells."""
     model: Specimen = results.study.model

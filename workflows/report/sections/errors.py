@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,6 @@ from uq.findings import NOT_KNOWN, only_rounding
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.section import Results, section, written
-
-if TYPE_CHECKING:
-    pass
 
 MANY = 10.0  # times a value: percentages beyond say nothing
 LISTED = 8  # outputs that the sentence names
@@ -55,7 +51,7 @@ def error_budget(results: Results) -> Iterator[Block]:
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
     """Return the errors of an estimate by source, for each output (m,); NaN where they are not estimated."""
     one = estimate_of(results.dataset, name)
-    tolerance = getattr(getattr(results.study.model, "solver", None), "tolerance", None)
+    tolerance = results.study.model.solver_tolerance
     doubt = one.doubt if holds(results.dataset, name, "doubt") else 0.0
     found = {
         "sampling": one.error if holds(results.dataset, name, "error") else None,
@@ -86,7 +82,7 @@ def sentence(results: Results, name: str) -> str:
     total = found.pop("total", None)
     if "mesh" not in found:
         why = "is not known here"
-        if not getattr(results.study, "accuracy", None) or not results.study.accuracy.mesh_error:
+        if not results.study.accuracy.mesh_error:
             why = "was not estimated, as asked (accuracy.mesh_error = false)"
         return f"The error of the mesh {why}: the numbers after ± do not include it."
     words, zero = [], []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,6 @@ from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.plots.moments import WORDS
 from workflows.report.section import Results, section
-
-if TYPE_CHECKING:
-    pass
 
 
 @section("mean", "nominal")

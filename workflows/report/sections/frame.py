@@ -6,13 +6,17 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from forward.readable import size
-from forward.words import NONE, duration, number, settings
+from forward.words import NONE, duration, number, settings, with_unit
 from uq import findings as of_results
 from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text
 from workflows.report.section import Results, section
-from workflows.report.words import counted, joined, model_in_words, stability
+from workflows.report.words import counted, joined, stability
+
+if TYPE_CHECKING:
+    from workflows.studies.sampling import Study
 
 
 @section()
@@ -77,6 +81,16 @@ def model(results: Results) -> Iterator[Block]:
     ]
     head = ("random parameter", "distribution", "mean", "standard deviation", "unit")
     yield Table(head, rows, text=frozenset({0, 1, 4}))
+
+
+def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
+    """Say what was solved: headings, each with its lines."""
+    scalars = study.model.scalars
+
+    def said(path: str) -> str:
+        return "random" if path in study.given else with_unit(number(scalars[path].value, 6), scalars[path].unit)
+
+    return study.spec.words(said, " on the coarsest mesh" if len(study.meshes) > 1 else "")
 
 
 @section("alone_eigenvalue")

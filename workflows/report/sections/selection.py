@@ -125,8 +125,8 @@ def averages(results: Results) -> Iterator[Block]:
     yield Text("At the end of each test, or where the largest displacement was measured, without measurement errors.")
     dataset = results.dataset
     quantity, last = str(dataset.attrs["quantity"]), last_of_tests(dataset)
-    specs = getattr(results.study, "of_candidates", {})
-    units = {output.name: output.unit for spec in [*specs.values()][:1] for output in spec.returned}
+    study: Comparison = results.study
+    units = {output.name: output.unit for spec in [*study.of_candidates.values()][:1] for output in spec.returned}
     rows = []
     for one in last.values():
         unit = UNITS.get(quantity) or units.get(str(one["output_test"].item()), "1")
@@ -308,8 +308,8 @@ def _paths(results: Results, tests: list[str]) -> Iterator[tuple[str, tuple[dict
     """Go through outputs that were measured along a path: by name, where each of their tests is, and both axes."""
     from inverse.data.curves import steps_of
 
-    specs = getattr(results.study, "of_candidates", None)
-    steps = steps_of(next(iter(specs.values()))) if specs else None
+    study: Comparison = results.study
+    steps = next(map(steps_of, study.of_candidates.values()), None)
     if steps is None:
         return
     path, (unit, values) = next(iter(steps.numbers.items()))
