@@ -24,7 +24,7 @@ import numpy as np
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from workflows.__main__ import main as command
-from workflows.live.loop import real_time
+from workflows.live.serve import real_time
 from workflows.live.token import kept
 
 CONFIG = Path(__file__).parent.parent / "configs" / "slab.toml"

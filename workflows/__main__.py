@@ -263,7 +263,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _live(options: argparse.Namespace) -> int:
-    from workflows.live.loop import serve
+    from workflows.live.serve import serve
 
     page = None if options.no_page else options.page
     serve(options.model, options.host, options.port, page, quiet=options.quiet, secret=not options.no_token)

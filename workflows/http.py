@@ -9,6 +9,7 @@ import contextlib
 import io
 import ipaddress
 import json
+import os
 import socket
 import sys
 import threading
@@ -19,6 +20,8 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
+
+from workflows.config.mistakes import StudyError
 
 SECONDS_TO_SEND = 30.0  # within which a client must send its whole request and take the answer
 LARGEST = 16 * 2**20  # bytes of a request
@@ -149,20 +152,22 @@ class Server(ThreadingHTTPServer):
 
     Parameters
     ----------
-    host, port
+    host, listening
         Where it listens.
     ask
         Answers a request, given what it asks and its fields.
     """
 
-    request_queue_size = MOST_WAITING  # the system's own limit is often lower: clients retry dropped connections
     daemon_threads = True
 
-    def __init__(self, host: str, port: int, ask: Ask) -> None:
+    def __init__(self, host: str, listening: socket.socket, ask: Ask) -> None:
         self.ask = ask
         self.called = host.lower()
         self._free = threading.BoundedSemaphore(MOST_WAITING)
-        super().__init__((host, port), Handler)
+        super().__init__(listening.getsockname(), Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+        listening.listen(MOST_WAITING)  # the system's own limit is often lower: clients retry dropped connections
         self.local = ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -184,6 +189,23 @@ class Server(ThreadingHTTPServer):
         error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
             sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
+
+
+def listen(host: str, port: int, option: str) -> socket.socket:
+    """Return a socket at a port; 0 is any free one.
+
+    Raises
+    ------
+    StudyError
+        If it is taken.
+    """
+    try:
+        return socket.create_server((host, port))
+    except OverflowError as error:
+        reason = str(error)
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
+    raise StudyError(f"{option} {port}: cannot be used on {host}: {reason}")
 
 
 def foreign(headers: Message, called: str | None) -> str:

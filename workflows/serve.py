@@ -26,8 +26,7 @@ from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, d
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
-from workflows.config.mistakes import StudyError
-from workflows.http import RefusalError, Server
+from workflows.http import RefusalError, Server, listen
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel
@@ -272,18 +271,14 @@ def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool =
         jobs.put(job)
         return job.future.result()
 
-    try:
-        server = Server(host, port, ask)
-    except (OSError, OverflowError) as error:
-        message = f"--port {port}: cannot be used on {host}: {getattr(error, 'strerror', None) or error}"
-        raise StudyError(message) from None
+    server = Server(host, listen(host, port, "--port"), ask)
     previous = signal.signal(signal.SIGTERM, _interrupt)
     answered, listening = 0, None
     try:
         service = Service(sampled)
         if not quiet:
             sys.stdout.write(
-                f"serving '{NAME}' at http://{host}:{server.server_port}, until interrupted\n"
+                f"serving '{NAME}' at http://{host}:{server.server_address[1]}, until interrupted\n"
                 f"input       {', '.join(service.parameters)}\noutput      {', '.join(service.outputs)}\n"
             )
             sys.stdout.flush()

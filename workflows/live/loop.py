@@ -36,7 +36,6 @@ import multiprocessing
 import os
 import selectors
 import socket
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -50,9 +49,8 @@ from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
 from forward.reduced.stream import Local, Stream, local
-from workflows.config.mistakes import StudyError
 from workflows.live.mail import Mail, pair
-from workflows.live.token import kept, place, same
+from workflows.live.token import place, same
 
 WITHIN = 0.5e-3  # s that the corrections of a frame may take
 REST = 5e-5  # s in which the system delivers an answer before its correction is made
@@ -64,7 +62,6 @@ AT_ONCE = 2**13  # bytes that are read of one client before others have their tu
 CLIENTS, STRANGERS = 16, 16  # that are connected at the same time: those who have spoken, and those who have not
 FAR = "the body has moved too far at once: outputs are on the tangent at another place, until this one is solved"
 UNBALANCED = "forces were out of balance by more than 1 % before the last correction: the body moves too fast to follow"
-NOT_PROMPT = "the usual one: frames are late where others want the processors (`ulimit -r 1` would let it be real time)"
 
 
 def followed(path: str, mail: Mail) -> None:
@@ -77,9 +74,9 @@ def followed(path: str, mail: Mail) -> None:
             parameters, modes, uncertain = mail.receive()
             try:
                 found = local(model, parameters, modes, uncertain)
-                mail.send(replace(found, inverse=found.inverse.astype(np.float32)))  # in half the room
+                mail.send((replace(found, inverse=found.inverse.astype(np.float32)), ""))  # in half the room
             except SolveError as error:
-                mail.send(str(error))
+                mail.send((None, str(error)))
     except (EOFError, OSError, KeyboardInterrupt):
         return
 
@@ -354,14 +351,14 @@ class Loop:
     # --- the other processes -----------------------------------------------------------------------------------------
 
     def _local(self, helper: Mail) -> None:
+        found: Local | None
         try:
-            found = helper.receive()
+            found, self._refused = helper.receive()
         except (EOFError, OSError):
             self.ended = True
             return
         self._busy = False
-        self._refused = found if isinstance(found, str) else ""
-        if isinstance(found, Local):
+        if found is not None:
             self.stream.moved(replace(found, inverse=found.inverse.astype(float)))
             self._made = time.monotonic()
 
@@ -398,15 +395,6 @@ class Loop:
                 self._view = None
 
 
-def real_time() -> bool:
-    """Ask the system to run this process before all usual ones; whether it does. Processes that it starts are usual."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    except (OSError, AttributeError):  # not permitted, or not on this system
-        return False
-    return True
-
-
 class _UnknownError(ValueError):
     """A parameter that the model does not have."""
 
@@ -428,74 +416,3 @@ def _number(value: Any) -> float:
 def _known(values: Any) -> list[float | None]:
     """Return numbers for JSON, which has none that are not finite."""
     return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def listen(host: str, port: int, option: str) -> socket.socket:
-    """Return a socket at a port; 0 is any free one.
-
-    Raises
-    ------
-    StudyError
-        If it is taken.
-    """
-    try:
-        return socket.create_server((host, port))
-    except (OSError, OverflowError) as error:
-        number = getattr(error, "errno", None) or 0
-        reason = os.strerror(number) if number > 0 else error
-        raise StudyError(f"{option} {port}: cannot be used on {host}: {reason}") from None
-
-
-def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False, secret: bool = True) -> None:
-    """Serve a reduced model until the user ends it.
-
-    Parameters
-    ----------
-    path
-        The file.
-    host, port
-        Where clients connect.
-    page
-        Port of the page; None for no page.
-    quiet
-        Say nothing.
-    secret
-        Serve only those who have the token.
-
-    Raises
-    ------
-    StudyError
-        If a port is taken, or there is no token.
-    """
-    from workflows.live.page import show
-
-    token = kept() if secret else None
-
-    context = multiprocessing.get_context("spawn")
-    listening = listen(host, port, "--port")
-    view = process = None
-    if page is not None:
-        shown = listen("127.0.0.1", page, "--page")
-        page = shown.getsockname()[1]
-        view, theirs = pair()
-        process = context.Process(target=show, args=(str(path), shown, theirs, token), daemon=True)
-        process.start()
-        theirs.close()
-        shown.close()
-    loop = Loop(path, listening, view, token)
-    prompt = real_time()
-    if not quiet:
-        sys.stdout.write(f"frames: {host}:{listening.getsockname()[1]}, a line of JSON each\n")
-        if page is not None:
-            sys.stdout.write(f"page: http://127.0.0.1:{page}/{'' if token is None else f'#{token}'}\n")
-        sys.stdout.write(f"token: {'none, whoever reaches the port is served' if token is None else place()}\n")
-        sys.stdout.write(f"priority: {'that of real time' if prompt else NOT_PROMPT}\n")
-        sys.stdout.flush()
-    try:
-        loop.run()
-    except KeyboardInterrupt:
-        return
-    finally:
-        loop.close()
-        if process is not None:
-            process.terminate()

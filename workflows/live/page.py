@@ -20,37 +20,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.reduced.data import ReducedData, load
 from workflows.http import foreign
 from workflows.live.mail import Mail
 from workflows.live.token import same
+from workflows.report.scene.skin import flat, outer
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request
 CONNECTIONS = 24  # that are open at the same time; a browser has six
 IDLE = 10.0  # s after which one is closed of which nothing comes
-HEXAHEDRA = {12, 25, 29, 72}  # VTK's numbers of their types; the others are tetrahedra
-_OF_HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-_OF_TETRAHEDRON = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
-
-
-def surface(cells: NDArray[np.int64], kind: int) -> NDArray[np.int64]:
-    """Return the triangles (t, 3) of the boundary of a mesh, between the corners of its cells."""
-    sides = _OF_HEXAHEDRON if kind in HEXAHEDRA else _OF_TETRAHEDRON
-    faces = np.concatenate([cells[:, list(side)] for side in sides])
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = faces[np.sort(first[count == 1])]
-    return outer if outer.shape[1] == 3 else np.concatenate([outer[:, [0, 1, 2]], outer[:, [0, 2, 3]]])
 
 
 class Scene:
     """The surface of a reduced model at its newest frame."""
 
     def __init__(self, data: ReducedData) -> None:
-        triangles = surface(data.cells, data.cell_kind)
+        triangles, _ = outer(data.cells, flat(data.cell_kind))
         self._nodes, local = np.unique(triangles, return_inverse=True)
         self._data = data
         rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()

@@ -12,7 +12,7 @@ from forward.readable import scale
 from workflows.report.plots.figure import DARK
 from workflows.report.plots.places import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends, forward_scene, up_of
-from workflows.report.scene.skin import TRIANGLES, outer, skin
+from workflows.report.scene.skin import flat, outer, skin
 from workflows.results.directory import TETRAHEDRON, mesh_grid
 from workflows.results.surfaces import IntArray, crossing, tetrahedra
 
@@ -112,7 +112,7 @@ def refined(dataset: xr.Dataset, *, cut: bool = False) -> Figure:
     values = np.log10(np.maximum(density, DIMMEST * density.max()))
     near = corners.mean(axis=1) @ front
     kept = np.flatnonzero(near <= near[density.argmax()]) if cut else np.arange(len(near))
-    triangles, owners = outer(grid.cells[kept], [(np.array(of), np.array([of])) for of in TRIANGLES])
+    triangles, owners = outer(grid.cells[kept], flat(TETRAHEDRON))
     colours, norm = mpl.colormaps["viridis"], mpl.colors.Normalize(float(values.min()), float(values.max()))
     at = grid.points @ view.T
     faces = _faces(at, triangles, colours(norm(values[kept[owners]]))[:, :3], 1.0, culled=True)

@@ -113,7 +113,8 @@ WRONG = (b'"soft"', b'"1"', b"true", b"null", b"NaN", b"1e999", b"1" * 400)
 def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path, monkeypatch):  # noqa: F811
     import json
 
-    from workflows.live.loop import Loop, listen
+    from workflows.http import listen
+    from workflows.live.loop import Loop
 
     save(small, tmp_path / "model.npz")
     loop = Loop(tmp_path / "model.npz", listen("127.0.0.1", 0, "--port"))

@@ -24,8 +24,8 @@ from tests.launch import TISSUQ, environment
 from workflows.config.mistakes import StudyError
 from workflows.live.loop import FIRST
 from workflows.live.mail import pair
-from workflows.live.page import surface
 from workflows.live.token import kept, same
+from workflows.report.scene.skin import flat, outer
 
 pytestmark = pytest.mark.fem
 
@@ -37,8 +37,8 @@ def free_port():
 
 def test_the_surface_of_hexahedra_and_tetrahedra():
     cube = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])
-    assert len(surface(cube, 12)) == 2 * 10
-    assert len(surface(np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), 10)) == 6
+    assert len(outer(cube, flat(12))[0]) == 2 * 10
+    assert len(outer(np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), flat(10))[0]) == 6
 
 
 @contextlib.contextmanager

@@ -100,6 +100,12 @@ def outer(cells: IntArray, faces_: list[tuple[IntArray, IntArray]]) -> tuple[Int
     return np.concatenate(parts), np.concatenate(owners)
 
 
+def flat(kind: int) -> list[tuple[IntArray, IntArray]]:
+    """Return for each face of a cell of a kind of VTK its corners, and its triangles (t, 3) between these alone."""
+    sides = QUADRILATERALS if kind in HEXAHEDRA else TRIANGLES
+    return [(np.array(of), np.array([of[:3], (of[0], *of[2:])][: len(of) - 2])) for of in sides]
+
+
 def split(points: FloatArray, triangles: IntArray) -> Skin:
     """Make vertices of the nodes of triangles (t, 3): shared where the surface is smooth."""
     count = len(triangles)
