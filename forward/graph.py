@@ -317,10 +317,10 @@ class Scalar:
         return self * -1
 
     def __sub__(self, other: Any) -> Scalar:
-        return self + -other
+        return self.graph.formula("add", self, -other)
 
     def __rsub__(self, other: Any) -> Scalar:
-        return -self + other
+        return self.graph.formula("add", -self, other)
 
     def __truediv__(self, other: Any) -> Scalar:
         return self.graph.formula("div", self, other)
