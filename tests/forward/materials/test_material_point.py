@@ -203,7 +203,7 @@ def test_many_parameter_sets_at_once():
     np.testing.assert_array_equal(found[1], it.stresses(points[1:2])[0])
     assert np.isfinite(found[:2]).all()
     assert np.isnan(found[2]).any()  # the chains are stretched out
-    with pytest.raises(SolveError, match=r"no stress in the test uniaxial nominal\[0\]"):
+    with pytest.raises(SolveError, match=r"no stress in the test uniaxial nominal.1"):
         it.solve(points[2])
     solution = it.solve(points[0])
     np.testing.assert_array_equal(solution.outputs, found[0])
