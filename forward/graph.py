@@ -320,7 +320,7 @@ class Scalar:
         return self.graph.formula("add", self, -other)
 
     def __rsub__(self, other: Any) -> Scalar:
-        return self.graph.formula("add", -self, other)
+        return self.graph.formula("add", other, -self)
 
     def __truediv__(self, other: Any) -> Scalar:
         return self.graph.formula("div", self, other)
