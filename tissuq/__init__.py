@@ -90,8 +90,7 @@ def __getattr__(name: str) -> Any:
     if place is None:
         from forward.settings import nearest
 
-        message = f"module 'tissuq' has no attribute '{name}'; {nearest(name, tuple(_PUBLIC))}"
-        raise AttributeError(message)
+        raise AttributeError(f"module 'tissuq' has no attribute '{name}'; {nearest(name, tuple(_PUBLIC))}")
     module, _, inside = place.partition(":")
     found = import_module(module)
     return getattr(found, inside) if inside else found

@@ -123,8 +123,7 @@ class Solution(Mapping[str, float]):
         """
         weights = np.array([float(name == output) for name in self])
         if not weights.any():
-            message = f"'{output}' is not an output; {nearest(output, tuple(self))}"
-            raise KeyError(message)
+            raise KeyError(f"'{output}' is not an output; {nearest(output, tuple(self))}")
         return dict(zip(self._of.parameters, map(float, self.solved.adjoint(weights)), strict=True))
 
     @cached_property
@@ -152,8 +151,7 @@ class Solution(Mapping[str, float]):
     def displacement(self) -> FloatArray:
         """Displacements (N, 3) of the nodes (m), in the order of `Model.nodes`; on the first rank only."""
         if self._of.nodes is None:
-            message = "this model has no body"
-            raise ValueError(message)
+            raise ValueError("this model has no body")
         whole = gathered(self._of.model, self.solved.state[None, :])
         return np.zeros((0, 3)) if whole is None else whole[0, : self._of.nodes.size].reshape(-1, 3)
 

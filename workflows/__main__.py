@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,17 +105,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    check = commands.add_parser("check", help="validate a study and print what it will cost")
-    run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
-    report = commands.add_parser("report", help="rebuild the report of results; several are compared side by side")
-    serve = commands.add_parser("serve", help="serve the model of a study to other programs by UM-Bridge")
-    reduce = commands.add_parser(
-        "reduce", help="make a reduced model of the body of a study, over its random parameters"
-    )
-    init = commands.add_parser("init", help="print a commented starter study")
-    live = commands.add_parser(
-        "live", help="serve a reduced model in real time: a socket for devices, a page to look at"
-    )
+
+    def added(name: str, command: Callable[[argparse.Namespace], int], said: str) -> argparse.ArgumentParser:
+        """Add a command, and say in a line what it does."""
+        found = commands.add_parser(name, help=said)
+        found.set_defaults(command=command)
+        return found
+
+    check = added("check", _check, "validate a study and print what it will cost")
+    run = added("run", _run, "run a study, or continue it (under mpirun for several ranks)")
+    report = added("report", _report, "rebuild the report of results; several are compared side by side")
+    serve = added("serve", _serve, "serve the model of a study to other programs by UM-Bridge")
+    reduce = added("reduce", _reduce, "make a reduced model of the body of a study, over its random parameters")
+    init = added("init", _init, "print a commented starter study")
+    live = added("live", _live, "serve a reduced model in real time: a socket for devices, a page to look at")
     live.add_argument("model", type=Path, metavar="MODEL", help="what `tissuq reduce` has made")
     live.add_argument("--port", type=int, default=4343, help="of the socket; 0: any free one (default: 4343)")
     live.add_argument("--page", type=int, default=8043, help="port of the page (default: 8043)")
@@ -123,7 +126,6 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts devices on other machines too")
     live.add_argument("--no-token", action="store_true", help="serve everyone who reaches the ports")
     live.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    live.set_defaults(command=_live)
     for command in (check, run, reduce, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
         command.add_argument(
@@ -148,18 +150,10 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
     report.add_argument("--code", action="store_true", help="run code that the studies name besides what is installed")
-    schema = commands.add_parser("schema", help="print the JSON Schema of study files, for editors")
-    completion = commands.add_parser("completion", help="print what lets a shell complete commands, options and files")
+    added("schema", _schema, "print the JSON Schema of study files, for editors")
+    completion = added("completion", _completion, "print what lets a shell complete commands, options and files")
     completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
     init.add_argument("kind", metavar="KIND", help="a method.kind, such as chaos; `tissuq init list` names them all")
-    check.set_defaults(command=_check)
-    run.set_defaults(command=_run)
-    reduce.set_defaults(command=_reduce)
-    report.set_defaults(command=_report)
-    serve.set_defaults(command=_serve)
-    init.set_defaults(command=_init)
-    schema.set_defaults(command=_schema)
-    completion.set_defaults(command=_completion)
     return parser
 
 
@@ -234,8 +228,7 @@ def _report(options: argparse.Namespace) -> int:
     from workflows.report.page import compare, write_report
 
     if options.out is not None and len(options.directories) == 1:
-        message = f"--out {options.out}: is the file of a comparison, expected several directories"
-        raise StudyError(message)
+        raise StudyError(f"--out {options.out}: is the file of a comparison, expected several directories")
     for directory in options.directories:
         sys.stdout.write(f"{write_report(directory, code=options.code)}\n")
     if len(options.directories) > 1:
@@ -245,8 +238,7 @@ def _report(options: argparse.Namespace) -> int:
         except OSError as error:
             if isinstance(error, FileNotFoundError) and error.filename is None:  # one of the directories, in words
                 raise
-            message = f"--out {out}: cannot be written: {error.strerror}"
-            raise StudyError(message) from None
+            raise StudyError(f"--out {out}: cannot be written: {error.strerror}") from None
     return DONE
 
 
@@ -256,8 +248,7 @@ def _serve(options: argparse.Namespace) -> int:
 
     study = _load(options)
     if study.sampled is None:
-        message = f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve"
-        raise StudyError(message)
+        raise StudyError(f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve")
     serve(study.sampled, options.port, options.host, quiet=options.quiet)
     return DONE
 

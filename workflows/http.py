@@ -30,9 +30,9 @@ MOST_WAITING = 1024  # requests that wait to be answered
 
 
 class RefusalError(Exception):
-    """A request that cannot be answered: the kind of error, in the protocol's words, and what is wrong."""
+    """A request that cannot be answered: what is wrong, and the kind of error in the protocol's words."""
 
-    def __init__(self, kind: str, message: str, status: int = 400) -> None:
+    def __init__(self, message: str, kind: str = "InvalidInput", status: int = 400) -> None:
         super().__init__(message)
         self.kind, self.status = kind, status
 
@@ -84,21 +84,17 @@ class Handler(BaseHTTPRequestHandler):
 
     def _question(self) -> dict[str, Any]:
         if self.headers.get("Transfer-Encoding"):
-            message = "the request has no length, expected a header Content-Length"
-            raise RefusalError("InvalidInput", message, 411)
+            raise RefusalError("the request has no length, expected a header Content-Length", status=411)
         length = self.headers.get("Content-Length") or "0"
         if not (length.isascii() and length.isdecimal()):
-            message = "Content-Length: expected a number of bytes"
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError("Content-Length: expected a number of bytes")
         if len(length) > 18 or int(length) > LARGEST:
-            message = f"the request is too long, expected at most {LARGEST} bytes"
-            raise RefusalError("InvalidInput", message, 413)
+            raise RefusalError(f"the request is too long, expected at most {LARGEST} bytes", status=413)
         try:
             body = self.rfile.read(int(length))
             self._unread = False
         except TimeoutError:
-            message = f"the request did not come within {SECONDS_TO_SEND:.0f} s"
-            raise RefusalError("InvalidInput", message, 408) from None
+            raise RefusalError(f"the request did not come within {SECONDS_TO_SEND:.0f} s", status=408) from None
         return parsed(body or b"{}")
 
     def _reply(self, read: Callable[[], dict[str, Any]]) -> None:
@@ -108,15 +104,18 @@ class Handler(BaseHTTPRequestHandler):
             answer = self.server.ask(self.path.strip("/"), read())
         except RefusalError as refusal:
             answer, status = {"error": {"type": refusal.kind, "message": str(refusal)}}, refusal.status
-        body = json.dumps(answer).encode()
         self.connection.settimeout(SECONDS_TO_SEND)
         self.send_response(status)
+        self._send(answer)
+        if self._unread:
+            self._linger()
+
+    def _send(self, answer: dict[str, Any]) -> None:
+        body = json.dumps(answer).encode()
         self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
-        if self._unread:
-            self._linger()
 
     def _linger(self) -> None:
         """Read on for a moment: closing a connection with unread bytes would discard the answer."""
@@ -131,17 +130,13 @@ class Handler(BaseHTTPRequestHandler):
         """Refuse requests from browser pages, also under a name that was made to point to this host."""
         objection = foreign(self.headers, self.server.called if self.server.local else None)
         if objection:
-            raise RefusalError("Forbidden", objection, 403)
+            raise RefusalError(objection, "Forbidden", 403)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Say what is wrong with the header of a request."""
         del explain
-        body = json.dumps({"error": {"type": "InvalidInput", "message": message or HTTPStatus(code).phrase}}).encode()
         self.send_response_only(code)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
+        self._send({"error": {"type": "InvalidInput", "message": message or HTTPStatus(code).phrase}})
 
     def log_message(self, format: str, *args: Any) -> None:
         """Do not log single requests."""
@@ -236,19 +231,16 @@ def parsed(body: bytes) -> dict[str, Any]:
     """
 
     def refuse(word: str) -> float:
-        message = f"{word} is not a number of JSON"
-        raise RefusalError("InvalidInput", message)
+        raise RefusalError(f"{word} is not a number of JSON")
 
     if nesting(body) > DEEPEST:
-        message = f"the request is nested too deeply, expected at most {DEEPEST} levels"
-        raise RefusalError("InvalidInput", message)
+        raise RefusalError(f"the request is nested too deeply, expected at most {DEEPEST} levels")
     try:
         question = json.loads(body, parse_constant=refuse)
     except (ValueError, RecursionError):
         question = None
     if not isinstance(question, dict):
-        message = "the request is not a JSON object"
-        raise RefusalError("InvalidInput", message)
+        raise RefusalError("the request is not a JSON object")
     return question
 
 

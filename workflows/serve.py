@@ -75,11 +75,9 @@ class Service:
             "ApplyHessian": self._hessian,
         }
         if what not in {*answers, "ModelInfo", "InputSizes", "OutputSizes"}:
-            message = f"{shown(what)} is not of the protocol"
-            raise RefusalError("UnsupportedFeature", message, 404)
+            raise RefusalError(f"{shown(what)} is not of the protocol", "UnsupportedFeature", 404)
         if question.get("name") != NAME:
-            message = f"there is no model {shown(question.get('name'))}, expected '{NAME}'"
-            raise RefusalError("ModelNotFound", message)
+            raise RefusalError(f"there is no model {shown(question.get('name'))}, expected '{NAME}'", "ModelNotFound")
         if what == "ModelInfo":
             return {"support": {"Evaluate": True} | dict.fromkeys(list(answers)[1:], self._differentiable)}
         if what == "InputSizes":
@@ -87,13 +85,11 @@ class Service:
         if what == "OutputSizes":
             return {"outputSizes": [len(self.outputs)]}
         if what != "Evaluate" and not self._differentiable:
-            message = "the model has no derivatives"
-            raise RefusalError("UnsupportedFeature", message)
+            raise RefusalError("the model has no derivatives", "UnsupportedFeature")
         try:
             return {"output": answers[what](question)}
         except SolveError as error:
-            kind = "SolveError"
-            raise RefusalError(kind, str(error), 500) from error
+            raise RefusalError(str(error), "SolveError", 500) from error
 
     def _evaluate(self, question: dict[str, Any]) -> list[list[float]]:
         return [self._solver(question).at(self._point(question)).outputs.tolist()]
@@ -124,20 +120,17 @@ class Service:
     def _point(self, question: dict[str, Any]) -> FloatArray:
         given = question.get("input")
         if not isinstance(given, list) or len(given) != 1:
-            message = f"input: expected one vector of {len(self.parameters)} numbers, in a list"
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError(f"input: expected one vector of {len(self.parameters)} numbers, in a list")
         return _numbers(given[0], "input[0]", len(self.parameters))
 
     def _solver(self, question: dict[str, Any]) -> _Solver:
         """The model with the options of a request."""
         options = question.get("config") or {}
         if not isinstance(options, dict):
-            message = "config: expected options by name"
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError("config: expected options by name")
         for option in options:
             if option not in OPTIONS:
-                message = f"config.{option[:40]}: unknown option; {nearest(option[:40], OPTIONS)}"
-                raise RefusalError("InvalidInput", message)
+                raise RefusalError(f"config.{option[:40]}: unknown option; {nearest(option[:40], OPTIONS)}")
         key = json.dumps(options, sort_keys=True)
         if key not in self._made:
             made = _Solver(self._inputs, self._specified(options))
@@ -152,25 +145,24 @@ class Service:
         if not options:
             return model
         if not model.meshed:
-            message = f"config: a model of kind '{model.kind}' has no options"
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError(f"config: a model of kind '{model.kind}' has no options")
         level = options.get("level", 0)
         if type(level) is not int or level < 0 or (level > 0 and model.coefficients):
             message = (
                 f"config.level: {shown(level)}, expected a number of refinements, and 0 where there are random fields"
             )
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError(message)
         try:
             if level > 0 and 8 ** min(level, 20) * model.unknowns > MOST_UNKNOWNS:
                 message = f"config.level: {shown(level)}, expected a mesh of at most {MOST_UNKNOWNS:,} unknowns"
-                raise RefusalError("InvalidInput", message)
+                raise RefusalError(message)
             refined = model.refined(level)
             return refined.solved_to(options["tolerance"]) if "tolerance" in options else refined
         except ValidationError as error:
             message = f"config: {error.errors()[0]['msg']}"
         except ModelError as error:  # meshes that are divided towards boundaries have no finer ones
             message = f"config.level: {error}"
-        raise RefusalError("InvalidInput", message)
+        raise RefusalError(message)
 
 
 class _Solver:
@@ -211,8 +203,7 @@ def _numbers(given: Any, key: str, length: int) -> FloatArray:
     except OverflowError:
         found = np.zeros(0)
     if not isinstance(given, list) or not len(given) == len(found) == length or not np.isfinite(found).all():
-        message = f"{key}: expected {length} finite numbers"
-        raise RefusalError("InvalidInput", message)
+        raise RefusalError(f"{key}: expected {length} finite numbers")
     return found
 
 
@@ -220,8 +211,7 @@ def _first(question: dict[str, Any], *keys: str) -> None:
     """Refuse other vectors than the first: there is only one of parameters, and one of outputs."""
     for key in keys:
         if question.get(key) != 0:
-            message = f"{key}: {shown(question.get(key))}, expected 0"
-            raise RefusalError("InvalidInput", message)
+            raise RefusalError(f"{key}: {shown(question.get(key))}, expected 0")
 
 
 def _settle(job: _Job, service: Service) -> None:
@@ -229,15 +219,15 @@ def _settle(job: _Job, service: Service) -> None:
     try:
         job.future.set_result(service.answer(job.what, job.question))
     except KeyboardInterrupt:
-        job.future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
+        job.future.set_exception(RefusalError("the server was interrupted", "Interrupted", 503))
         raise
     except RefusalError as refusal:
         job.future.set_exception(refusal)
     except ModelError as error:
-        job.future.set_exception(RefusalError("ModelError", str(error), 500))
+        job.future.set_exception(RefusalError(str(error), "ModelError", 500))
     except Exception as error:  # the next request may succeed
         traceback.print_exc()
-        job.future.set_exception(RefusalError(type(error).__name__, str(error), 500))
+        job.future.set_exception(RefusalError(str(error), type(error).__name__, 500))
 
 
 def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:

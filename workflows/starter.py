@@ -39,8 +39,7 @@ def starter(kind: str) -> str:
     if kind == "list":
         return "".join(f"{name}\n" for name in KINDS)
     if kind not in KINDS:
-        message = f"init {kind}: unknown kind of study; {nearest(kind, KINDS)}"
-        raise StudyError(message)
+        raise StudyError(f"init {kind}: unknown kind of study; {nearest(kind, KINDS)}")
     head, method = (FOLDER / name for name in (f"heads/{HEADS.get(kind, 'body')}.toml", f"methods/{kind}.toml"))
     text = head.read_text(encoding="utf-8")
     if kind == "reduce":  # a reduced model has no pressures among its unknowns

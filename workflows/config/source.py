@@ -60,8 +60,7 @@ class Source(Settings):
         whole = self.model in (AVERAGED, STACKED)
         found: str = named(f"{READER}:Left")(self.file).digest if whole else self.drawn.digest
         if self.digest and found != self.digest:
-            message = f"{self.file} has changed since the study was begun: hash {self.digest} → {found}"
-            raise ValueError(message)
+            raise ValueError(f"{self.file} has changed since the study was begun: hash {self.digest} → {found}")
         object.__setattr__(self, "digest", found)
         return self
 

@@ -51,8 +51,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     if _deeper_than(blocks, DEEPEST):
-        message = f"lists and tables are nested too deeply, expected at most {DEEPEST} levels"
-        raise StudyError(message)
+        raise StudyError(f"lists and tables are nested too deeply, expected at most {DEEPEST} levels")
     beyond = [f"{place}: {why}" for place, value in _leaves(blocks) for why in _beyond(place, value)]
     if beyond:
         raise StudyError(*beyond[:MOST_LINES])
@@ -168,20 +167,16 @@ def _document(path: Path) -> dict[str, Any]:
         # Editors on Windows begin files with a byte order mark.
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
-        message = f"{path}: lists or tables are nested too deeply"
-        raise StudyError(message) from None
+        raise StudyError(f"{path}: lists or tables are nested too deeply") from None
     except tomllib.TOMLDecodeError as error:
-        message = f"{path}: not valid TOML: {error}"
-        raise StudyError(message) from None
+        raise StudyError(f"{path}: not valid TOML: {error}") from None
     except UnicodeDecodeError:
-        message = f"{path}: not a text file in UTF-8"
-        raise StudyError(message) from None
+        raise StudyError(f"{path}: not a text file in UTF-8") from None
     except ValueError:  # of tomllib, or of a name that is no name
         message = f"{path}: cannot be read: a number of thousands of digits, or a name with a null character"
         raise StudyError(message) from None
     except OSError as error:
-        message = f"{path}: cannot be read: {error.strerror}"
-        raise StudyError(message) from None
+        raise StudyError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def schema() -> dict[str, Any]:
@@ -271,18 +266,15 @@ def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 def _override(blocks: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
     if not equals or not key.strip():
-        message = f"--set {assignment}: expected KEY=VALUE, such as method.samples=512"
-        raise StudyError(message)
+        raise StudyError(f"--set {assignment}: expected KEY=VALUE, such as method.samples=512")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
     except ValueError:
-        message = f"--set {cut(assignment, 60)}: a number of thousands of digits"
-        raise StudyError(message) from None
+        raise StudyError(f"--set {cut(assignment, 60)}: a number of thousands of digits") from None
     except RecursionError:
-        message = f"--set {cut(assignment, 60)}: lists or tables are nested too deeply"
-        raise StudyError(message) from None
+        raise StudyError(f"--set {cut(assignment, 60)}: lists or tables are nested too deeply") from None
     here: Any = blocks
     *way, last = _path(key.strip(), blocks)
     for step in way:
@@ -290,14 +282,12 @@ def _override(blocks: dict[str, Any], assignment: str) -> None:
             here = _named(here, step, key)
             continue
         if not isinstance(here.get(step, {}), dict | list):
-            message = f"--set {key}: '{step}' is a value, not a block"
-            raise StudyError(message)
+            raise StudyError(f"--set {key}: '{step}' is a value, not a block")
         copied = here.get(step, {})
         here[step] = copied.copy()
         here = here[step]
     if isinstance(here, list):
-        message = f"--set {key}: expected the name of an element and one of its keys"
-        raise StudyError(message)
+        raise StudyError(f"--set {key}: expected the name of an element and one of its keys")
     here[last] = value
 
 
@@ -321,5 +311,4 @@ def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
         if isinstance(item, dict) and name in (*map(item.get, ("name", "kind", "on", "of")), str(i)):
             items[i] = found = item.copy()
             return found
-    message = f"--set {key}: no element is called '{name}'"
-    raise StudyError(message)
+    raise StudyError(f"--set {key}: no element is called '{name}'")

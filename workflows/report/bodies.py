@@ -53,8 +53,7 @@ def body(dataset: xr.Dataset, shown: str = "") -> Figure:
     for quantity in scene.quantities:
         if quantity.name.startswith(shown):
             return still(scene, quantity)
-    message = f"no quantity begins with {shown!r}, expected one of: {', '.join(q.name for q in scene.quantities)}"
-    raise KeyError(message)
+    raise KeyError(f"no quantity begins with {shown!r}, expected one of: {', '.join(q.name for q in scene.quantities)}")
 
 
 def still(scene: Scene, quantity: Quantity) -> Figure:

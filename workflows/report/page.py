@@ -79,8 +79,7 @@ class _Withheld:
     """Stands for a study that cannot be read without running its own code."""
 
     def __getattr__(self, name: str) -> NoReturn:
-        message = f"'{name}' of the study is not known without its own code"
-        raise OwnCodeError(message)
+        raise OwnCodeError(f"'{name}' of the study is not known without its own code")
 
 
 def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Path:
@@ -96,8 +95,7 @@ def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Pa
         with _running(code) as refusals:
             studies[name] = _read(directory, refusals)
         if "nominal" not in studies[name].dataset:
-            message = f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison"
-            raise StudyError(message)
+            raise StudyError(f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison")
     title = f"Comparison of {len(studies)} studies"
     write_text(out, render(title, [("comparison", [Heading(title, 1), *side_by_side(studies)])]))
     return out
@@ -112,8 +110,7 @@ def _asked(directory: Path) -> Report | None:
     except FileNotFoundError:
         return None
     except tomllib.TOMLDecodeError as error:
-        message = f"{directory / 'study.toml'}: not valid TOML: {error}"
-        raise StudyError(message) from None
+        raise StudyError(f"{directory / 'study.toml'}: not valid TOML: {error}") from None
     except ValidationError as error:
         raise StudyError(*lines(error, "report")) from None
 
@@ -136,8 +133,7 @@ def _read(directory: Path, refusals: list[str]) -> Results:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
-        message = f"{directory}: holds no summary.json, expected the directory of a finished study"
-        raise FileNotFoundError(message)
+        raise FileNotFoundError(f"{directory}: holds no summary.json, expected the directory of a finished study")
     own_code.make_visible(directory)
     try:
         study = parse(tomllib.loads(dataset.attrs["config"]), folder=directory)

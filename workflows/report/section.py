@@ -265,8 +265,7 @@ def of_study(report: Report | None) -> dict[str, Section]:
             found[name] = SECTIONS[name]()
         except KindError as error:
             where = f"{name.partition('.')[0]}.py in {report.folder}"
-            message = f"report.sections: {error}; expected in {where}, or in an installed package"
-            raise StudyError(message) from None
+            raise StudyError(f"report.sections: {error}; expected in {where}, or in an installed package") from None
         if found[name].before not in SECTIONS.own:
             known = nearest(found[name].before, tuple(SECTIONS.own))
             message = f"report.sections: '{name}' has before = '{found[name].before}', which is not a section; {known}"

@@ -21,14 +21,8 @@ def stability(counts: dict[str, int]) -> str:
 def joined(counts: Mapping[str, int], work: Mapping[str, int]) -> str:
     """Say how states were seen to be joined to rest, and what that took, from `joined` and `work` in summary.json."""
     audited = sum(counts.values()) - counts["not looked at"] - counts["screened"]
-    found = [
-        *([f"{counts['beyond a jump']:,} beyond a jump"] if counts["beyond a jump"] else []),
-        *(
-            [f"{counts['another equilibrium found too']:,} with another equilibrium"]
-            if counts["another equilibrium found too"]
-            else []
-        ),
-    ]
+    words = {"beyond a jump": "beyond a jump", "another equilibrium found too": "with another equilibrium"}
+    found = "".join(f", {counts[one]:,} {said}" for one, said in words.items() if counts[one])
     cost = [
         f"{100 * work[f'audit_{name}'] / work[name]:.2g} % of the {name.replace('_', '-')}"
         for name in ("residuals", "factorisations", "back_substitutions")
@@ -36,7 +30,7 @@ def joined(counts: Mapping[str, int], work: Mapping[str, int]) -> str:
     ]
     return (
         f"joined to rest: {audited:,} by following the path, {counts['screened']:,} by the screens only"
-        f"{''.join(f', {one}' for one in found)}; audits took {', '.join(cost)}"
+        f"{found}; audits took {', '.join(cost)}"
     )
 
 

@@ -66,11 +66,9 @@ def read_dataset(directory: Path) -> xr.Dataset:
     except (MemoryError, PermissionError):
         raise
     except Exception as error:  # HDF5 says in many ways that a file is damaged
-        message = f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}"
-        raise FileNotFoundError(message) from None
+        raise FileNotFoundError(f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}") from None
     if "config" not in found.attrs:
-        message = f"{path}: holds no results of a study, expected a file that `tissuq run` has written"
-        raise FileNotFoundError(message)
+        raise FileNotFoundError(f"{path}: holds no results of a study, expected a file that `tissuq run` has written")
     return found
 
 

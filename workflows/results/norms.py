@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from workflows.results.surfaces import CORNERS
 
 POINTS = 4  # of Gauss' rule along each direction: exact up to degree 7
 CELLS = 2000  # that are integrated at once
 _TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
-_HEXAHEDRON = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float
-)  # VTK's order
+_HEXAHEDRON = CORNERS.astype(float)
 
 
 def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> tuple[FloatArray, float]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.bodies.mesh import TETRAHEDRA
 from forward.model import FloatArray
 from workflows.results.vtu import Grid
 
@@ -94,14 +95,12 @@ def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
 
 
 HEXAHEDRA = (12, 29, 72)  # kinds of cells of VTK
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-# Six tetrahedra around a diagonal of a hexahedron.
-SIX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # of VTK
 
 
 def tetrahedra(cells: IntArray, kind: int) -> IntArray:
     """Return tetrahedra (t, 4) between the corners of cells."""
-    return cells[:, SIX].reshape(-1, 4) if kind in HEXAHEDRA else cells[:, :4]
+    return cells[:, TETRAHEDRA["hexahedron"]].reshape(-1, 4) if kind in HEXAHEDRA else cells[:, :4]
 
 
 def level(

@@ -16,6 +16,7 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels
 from workflows.report.scene.pack import Packer
+from workflows.report.section import Results
 from workflows.results.surfaces import IntArray
 
 if TYPE_CHECKING:
@@ -210,26 +211,23 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
     if dataset.sizes["parameter"] > MOST or study.correlations:
         return None
     if "multi_index" not in dataset:
-        of = of_reduced(study)
-        if of is None:
+        found = of_reduced(study)
+        if found is None:
             return None
-        dataset = of
+        dataset = found
     expansion, samples = Expansion.of(dataset), None
     if expansion.basis.joint is not None:
         inputs = study.inputs
         given = inputs.marginals
         samples = inputs.points(sobol_points(0, 0, 0, SAMPLES, len(inputs.names)))
-    outputs = [str(name) for name in dataset["output"].values]
-    drawn = outputs
-    if "step" in dataset.coords:
-        drawn = [str(name) for name in dataset["output"].values[dataset["step"] == dataset["step"].max()]]
+    of = Results(dataset, {}, study)
     return Sliders(
         expansion,
         {name: given.get(name) for name in expansion.parameters},
         dict(study.units_of("/")),
-        {name: str(dataset["unit"].sel(output=name).item()) for name in outputs},
+        {name: of.unit(name) for name in of.outputs},
         np.hypot(dataset["loo_error"] * dataset["std"], np.nan_to_num(dataset.get("own_error", 0.0))),
-        drawn,
+        of.drawn,
         float(dataset["field_loo_error"]) if "field_loo_error" in dataset else float("nan"),
         dataset.attrs.get("source", ""),
         samples,

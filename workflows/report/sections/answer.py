@@ -219,15 +219,7 @@ def inversion(results: Results) -> Card:
 def _goal(name: str) -> str:
     """Name what is predicted: `press.target.0.x` is target x in press, `press.energy` is energy in press."""
     case, *parts = name.split(".")
-    match parts:
-        case [output]:
-            return f"{output} in {case}"
-        case [place, "0", component]:
-            return f"{place} {component} in {case}"
-        case [place, number_, component]:
-            return f"{place} {number_} {component} in {case}"
-        case _:
-            return name
+    return f"{' '.join(part for part in parts if part != '0')} in {case}" if len(parts) in (1, 3) else name
 
 
 def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
