@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,6 @@ from forward.registry import named
 from forward.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from forward.spec import ModelSpec
     from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
@@ -21,6 +20,13 @@ KEPT = "draws.npz"  # beside study.toml: the draws as they were read
 AVERAGED = "averaged"  # all candidates, by their probabilities
 STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
 READER = "workflows.studies.posteriors"  # reads files of draws, once a study names one
+
+
+def averages(blocks: Mapping[str, Any]) -> bool:
+    """Whether the source that stands among the parameters of a study means all candidates of a comparison."""
+    parameters = blocks.get("parameters")
+    source = parameters.get("from") if isinstance(parameters, Mapping) else None
+    return isinstance(source, Mapping) and source.get("model") in (AVERAGED, STACKED)
 
 
 class Source(Settings):

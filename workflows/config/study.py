@@ -16,8 +16,8 @@ from forward.settings import cut
 from uq.methods.method import METHODS
 from workflows.config.blocks import located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.source import KEPT, Sourced
-from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
+from workflows.config.source import AVERAGED, KEPT, Sourced, averages
+from workflows.studies.study import SAMPLING, STUDIES, UNNAMED, WITHOUT_EFFECT, StudyKind
 
 _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
 DEEPEST = 32  # levels of lists and tables in a study
@@ -65,9 +65,10 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         method = blocks.get("method")
         kind = method.get("kind") if isinstance(method, Mapping) else None
         another = isinstance(kind, str) and kind not in METHODS.own and kind in STUDIES
-        found: StudyKind = STUDIES[str(kind) if another else SAMPLING].made(blocks, folder)
+        usual = AVERAGED if averages(blocks) else SAMPLING
+        found: StudyKind = STUDIES[str(kind) if another else usual].made(blocks, folder)
     except ValidationError as error:
-        apart = [kind for kind in STUDIES.own if kind != SAMPLING]
+        apart = [kind for kind in STUDIES.own if kind not in UNNAMED]
         raise StudyError(*lines(error, apart=apart)) from None
     return found
 
@@ -181,7 +182,7 @@ def _document(path: Path) -> dict[str, Any]:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, with which editors complete and check it."""
-    forms = [form for kind in STUDIES.names for form in STUDIES[kind].forms()]
+    forms = [form for kind in STUDIES.names if kind != AVERAGED for form in STUDIES[kind].forms()]
     any_form: Any = Union[*forms]
     found = TypeAdapter(any_form).json_schema(ref_template=_REFERENCE)
     for form in forms:  # a file may name a table instead of containing the data

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from forward.external.own_modules import Loaded, Sources, other_code, search, sources
 from forward.registry import dotted, installed
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document
 from workflows.results.directory import write_text
+from workflows.run.version import version
 
 if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
@@ -38,10 +39,10 @@ def digest(study: StudyKind) -> str | None:
     return _sources(study).digest if modules(study) else None
 
 
-def identity(study: StudyKind) -> dict[str, Any]:
-    """Return everything that evaluations depend on: the study, and the source of these modules."""
+def identity(study: StudyKind) -> str:
+    """Return everything that evaluations depend on: the study, the source of these modules, and the version."""
     source = digest(study)
-    return study.identity() | ({} if source is None else {"source": source})
+    return json.dumps([study.identity() | ({} if source is None else {"source": source}), version()])
 
 
 def refuse_other(directory: Path, study: StudyKind) -> None:

@@ -138,12 +138,12 @@ def _run(
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
-    checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
+    checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
     ensemble.say = say
     try:
         study = study.prepared(ensemble, directory, say)
         progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
-        checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
+        checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
         job = ensemble.together(lambda: study.job(ensemble, name, directory, checkpoint))
         if world.rank == 0:
             own_code.keep(directory, study, loaded)

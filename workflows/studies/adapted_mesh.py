@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
     from forward.fem.adapt import Adapted
     from uq.evaluation.ensemble import Ensemble
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import S, SamplingBlocks
 
 FILES = MESH, HISTORY = "mesh.npz", "mesh.json"
 
 
-def on_adapted_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
     """Refine the mesh of a study at the mean of its parameters, or find what was refined before; collective.
 
     The first group of ranks does it. What comes of it is a file, which all read.
@@ -50,13 +50,13 @@ def on_adapted_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Call
     return study.of(study.model.on_mesh(str(path), contents))
 
 
-def kept(study: Study) -> Study:
+def kept(study: S) -> S:
     """Return a study on such a mesh as its results have it, which may be moved."""
     body = study.model.body  # type: ignore[attr-defined]
     return study.of(study.model.on_mesh(MESH, body.contents))
 
 
-def _keep(study: Study, found: Adapted, path: Path) -> None:
+def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
     """Write down the mesh, at last, and how it came about."""
     from forward.bodies.tetrahedra import packed
 
@@ -81,7 +81,7 @@ def _keep(study: Study, found: Adapted, path: Path) -> None:
     write_whole(path, packed(found.mesh, found.indicators))
 
 
-def history(study: Study) -> dict[str, Any] | None:
+def history(study: SamplingBlocks) -> dict[str, Any] | None:
     """Return how the mesh of a study came about, which stands beside it; None where that is not known."""
     try:
         found: dict[str, Any] = json.loads(_path(study).with_name(HISTORY).read_text(encoding="utf-8"))
@@ -90,11 +90,11 @@ def history(study: Study) -> dict[str, Any] | None:
     return found
 
 
-def _path(study: Study) -> Path:
+def _path(study: SamplingBlocks) -> Path:
     return Path(study.model.body.file)  # type: ignore[attr-defined]  # bodies that are adapted have files
 
 
-def with_history(study: Study, dataset: xr.Dataset) -> xr.Dataset:
+def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     """Add to results the mesh, what each cell adds to its errors, and what the meshes before were; and say it."""
     from forward.bodies.tetrahedra import indicators_of
 
@@ -121,7 +121,7 @@ def with_history(study: Study, dataset: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _finding(study: Study, told: dict[str, Any]) -> Finding:
+def _finding(study: SamplingBlocks, told: dict[str, Any]) -> Finding:
     """Say what errors are left, and why."""
     adapt = study.model.adapt  # type: ignore[attr-defined]
     last, first = told["cycles"][-1], told["cycles"][0]

@@ -19,6 +19,7 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_priors, ranges
 from workflows.config.source import AVERAGED, READER, Sourced
+from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.design_job import job, job_of_models
 from workflows.studies.design_job import mistakes as mistakes_of_values
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 PRODUCTS = 600  # with the derivative, for the directions of a field that many candidates tell
 
 
-class DesignStudy(Sourced, StudyKind):
+class DesignStudy(Sourced, FromPython, StudyKind):
     """What could be observed, and how much of it.
 
     Parameters
@@ -163,7 +164,7 @@ class DesignStudy(Sourced, StudyKind):
         yield from mistakes_of_values(self.method, self.model)
 
 
-class DesignOfModels(OfCandidates, StudyKind):
+class DesignOfModels(OfCandidates, FromPython, StudyKind):
     """What could be observed, and the models that it should tell apart.
 
     Parameters

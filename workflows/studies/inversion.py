@@ -24,6 +24,7 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_factor, mistakes_of_priors, ranges
+from workflows.run.from_python import FromPython
 from workflows.studies.measured import DataFiles, as_block, data_as
 from workflows.studies.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
@@ -75,7 +76,7 @@ class Predict(Settings):
         return self.samples
 
 
-class Inversion(StudyKind):
+class Inversion(FromPython, StudyKind):
     """What to invert: displacements of a specimen, or outputs of any other model.
 
     Parameters

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from forward.specimen import Specimen
     from inverse.data.measurements import Measurements
     from workflows.studies.inversion import Inversion
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import SamplingBlocks
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
 LISTED = 8  # outputs that are named
 
 
-def of_sampling(study: Study, rank_groups: int) -> list[str]:
+def of_sampling(study: SamplingBlocks, memory: float, rank_groups: int) -> list[str]:
     """Say what is sampled, how often, and how long that will take."""
     method, spec, planned = study.method, study.spec, study.planned
     open_ended = method.open_ended or study.accuracy.tolerance is not None
@@ -64,7 +64,7 @@ def of_sampling(study: Study, rank_groups: int) -> list[str]:
         never = never_estimable(spec, [output.name for output in spec.returned])
         if never:
             lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")
-    needed = study.memory + BYTES_OF_PROGRAM
+    needed = memory + BYTES_OF_PROGRAM
     return [
         *lines,
         f"memory      about {needed / MIB:,.0f} MiB for each group of ranks",
@@ -87,7 +87,7 @@ class Part(NamedTuple):
     shared: bool = False
 
 
-def parts(study: Study) -> list[Part]:
+def parts(study: SamplingBlocks) -> list[Part]:
     """Predict the cost of a study of a body, part by part.
 
     Samples are the maximum number; those that multilevel methods add after their pilots are unknown.
@@ -114,7 +114,7 @@ def parts(study: Study) -> list[Part]:
     ]
 
 
-def _estimates(study: Study) -> Iterator[Part]:
+def _estimates(study: SamplingBlocks) -> Iterator[Part]:
     """Estimates of the error of the mesh, each with its solution."""
     estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
     if estimating is None:
@@ -127,7 +127,7 @@ def _estimates(study: Study) -> Iterator[Part]:
     )
 
 
-def _compilation(study: Study) -> float:
+def _compilation(study: SamplingBlocks) -> float:
     """Seconds of the forms of a body, and of those for the error of its mesh."""
     estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
     if estimating is None:

@@ -23,6 +23,7 @@ from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
+from workflows.run.from_python import FromPython
 from workflows.studies.job import Job
 from workflows.studies.posteriors import Left, draws_in
 from workflows.studies.study import StudyKind
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 KEPT = ("model", "data", "method", "candidates", "parameters", "correlations")  # blocks that a posterior depends on
 
 
-class PopulationStudy(StudyKind):
+class PopulationStudy(FromPython, StudyKind):
     """From what, and how, the distribution over specimens is found.
 
     Parameters

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ValidationError, model_validator
 
 from forward.findings import Finding
 from forward.machine import MIB
 from forward.model import ModelError
-from forward.registry import OfKind, named
+from forward.registry import named
 from forward.scalars import Mistake
-from forward.spec import MODELS, ModelSpec
-from uq.accuracy.budget import FEWEST, OF_SOLVER, estimates_for, spare_for
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
-from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Accuracy, Correlation
-from workflows.config.priors import (
-    findings_of_draws,
-    inputs_of,
-    mistakes_of_priors,
-    ranges,
-)
-from workflows.config.source import AVERAGED, READER, STACKED, Sourced
+from uq.accuracy.budget import FEWEST
+from workflows.config.blocks import Accuracy
+from workflows.config.priors import findings_of_draws, inputs_of, mistakes_of_priors, ranges
+from workflows.config.source import READER
+from workflows.run.from_python import FromPython
+from workflows.studies import tolerance_asked
+from workflows.studies.sampling_blocks import SamplingBlocks
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -40,10 +32,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 
-OF_TOLERANCE = "workflows.studies.tolerance_asked"  # what a tolerance of all errors decides and forbids
-
-
-class Study(Sourced, StudyKind):
+class Study(SamplingBlocks, FromPython, StudyKind):
     """What to compute.
 
     Parameters
@@ -66,104 +55,22 @@ class Study(Sourced, StudyKind):
     stopped: ClassVar[str] = "one linearisation"
     explains: ClassVar[bool] = False
 
-    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
-    method: Annotated[Method, OfKind(METHODS)]
-    accuracy: Accuracy = Accuracy()
-
-    @classmethod
-    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Study:
-        """Check the blocks of a study, or of one that is averaged over the candidates of a comparison."""
-        parameters = blocks.get("parameters")
-        source = parameters.get("from") if isinstance(parameters, Mapping) else None
-        if isinstance(source, Mapping) and source.get("model") in (AVERAGED, STACKED):
-            of_all: type[Study] = named("workflows.studies.averaged:AveragedStudy")
-            return of_all.model_validate(blocks)
-        return cls.model_validate(blocks)
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
-        return inputs_of(self.parameters, self.correlations, self.model.coefficients, draws=self.draws)
-
-    @cached_property
-    def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters, solved as exactly as a tolerance needs."""
-        spec, asked = self.model.over(ranges(self.given)), self.accuracy.tolerance
-        solver = spec.solver_tolerance
-        return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
-
     @property
     def sampled(self) -> Sampled:
         """The model with its random parameters."""
         return Sampled(self.inputs, self.spec)
 
     @property
-    def models(self) -> dict[str, ModelSpec]:
-        """The models that the method may ask for beside that one, by name."""
-        return self.method.models(self.spec)
-
-    @property
-    def meshes(self) -> tuple[ModelSpec, ...]:
-        """The model, and the same on the finer meshes that a multilevel method may use."""
-        return self.spec, *(model for name, model in self.models.items() if name.startswith(MESH))
-
-    @property
-    def planned(self) -> int:
-        """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
-        return self.method.planned(len(self.inputs.names))
-
-    @cached_property
-    def estimates(self) -> int:
-        """Number of estimates of the error of the mesh with the planned solves: none of models without one.
-
-        Methods on several meshes, and comparisons that are asked to solve on a finer one, estimate it themselves.
-        """
-        return 0 if not self._estimating or self._too_large is not None else self.estimates_of(self.planned)
-
-    def estimates_of(self, solves: int) -> int:
-        """Number of estimates of the error of the mesh that so many solves afford, two at least, by predicted times."""
-        paid: float = named("workflows.studies.predictions:estimates_paid")(self.spec, len(self.inputs.names), solves)
-        return estimates_for(solves, paid)
-
-    @property
-    def spare(self) -> float:
-        """How many solves the calibration of these estimates may cost with the planned solves."""
-        return math.inf if self.accuracy.tolerance is not None else spare_for(self.planned)
-
-    @property
-    def _estimating(self) -> bool:
-        theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
-        return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.remembers
-
-    @cached_property
-    def _too_large(self) -> float | None:
-        """Memory (MiB) that an estimate of the error of the mesh and its calibration take, if that is too much."""
-        needed = self._bytes_of_estimates / MIB
-        return needed if needed > self.accuracy.memory else None
-
-    @cached_property
-    def _bytes_of_estimates(self) -> float:
-        cost = self.spec.mesh_error_cost(self.spare)
-        return 0.0 if cost is None else cost.bytes + cost.calibration_bytes
-
-    @property
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
-        return super().memory + (self._bytes_of_estimates if self.estimates else 0.0)
+        return super().memory + (self.bytes_of_estimates if self.estimates else 0.0)
 
     @property
     def growth(self) -> tuple[float, str]:
         """Memory (bytes) of the largest mesh that it may make, and what sets it; 0 where it makes none."""
-        if self.accuracy.tolerance is None or not self.estimates or not named(f"{OF_TOLERANCE}:refinement")(self)[0]:
+        if self.accuracy.tolerance is None or not self.estimates or not tolerance_asked.refinement(self)[0]:
             return super().growth
         return MIB * self.accuracy.memory, "what accuracy.memory"
-
-    @property
-    def solves(self) -> int:
-        """Number of solves, those for the error of the mesh too."""
-        return self.planned + self.estimates
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -173,65 +80,64 @@ class Study(Sourced, StudyKind):
         found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
         if self.source is not None:
             found = (*found, *named(f"{READER}:findings")(self.source, self.spec, self.inputs))
-        return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
+        return found if self.accuracy.tolerance is None else (*found, *tolerance_asked.findings(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self.accuracy.mesh_error and self.spec.hidden:
             yield Finding("mesh-of-body", "note", {"why": self.spec.hidden})
         elif "mesh_error" in self.accuracy.model_fields_set and self.accuracy.mesh_error and not self.spec.meshed:
             yield Finding("no-mesh", "note", {"kind": self.model.kind})
-        if self._estimating and self._too_large is not None:
+        if self.estimating and self.too_large is not None:
             yield Finding(
-                "mesh-estimates-too-large", "warning", {"memory": self._too_large, "limit": self.accuracy.memory}
+                "mesh-estimates-too-large", "warning", {"memory": self.too_large, "limit": self.accuracy.memory}
             )
         if self.accuracy.tolerance is None and 0 < self.estimates < FEWEST:  # a tolerance takes as many as it needs
             yield Finding("mesh-estimates-few", "note", {"points": self.estimates})
         if self.accuracy.mesh_error and self.spec.meshed and self.spec.remembers:
             yield Finding("mesh-with-memory", "note", {"what": self.spec.remembers})
 
-    @property
-    def specs(self) -> tuple[ModelSpec, ...]:
-        """The model, and those beside it."""
-        return self.spec, *self.models.values()
-
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
         from workflows.studies.plans import of_sampling
 
-        return of_sampling(self, rank_groups)
+        return of_sampling(self, self.memory, rank_groups)
 
-    def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+    def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Self:
         """Refine the mesh, where that is asked for; collective."""
-        found: Study = self
+        found = self
         if self.model.unrefined:
-            found = named("workflows.studies.adapted_mesh:on_adapted_mesh")(self, ensemble, directory, say)
+            from workflows.studies.adapted_mesh import on_adapted_mesh
+
+            found = on_adapted_mesh(self, ensemble, directory, say)
         if self.accuracy.tolerance is not None and self.estimates:
-            found = named("workflows.studies.tolerance:on_fine_mesh")(found, ensemble, directory, say)
+            from workflows.run.own_code import identity
+            from workflows.studies.tolerance import on_fine_mesh
+
+            found = on_fine_mesh(found, ensemble, directory, say, identity)
         return found
 
     @property
-    def kept(self) -> Study:
+    def kept(self) -> Self:
         """The study, with a mesh that was refined where its results are."""
         if not self.model.adaptive:
             return self
-        found: Study = named("workflows.studies.adapted_mesh:kept")(self)
-        return found
+        from workflows.studies.adapted_mesh import kept
 
-    def of(self, model: ModelSpec) -> Study:
-        """Return the same study of another model."""
-        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | {"model": model})
+        return kept(self)
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and others that the method may want, at the points of the method; collective."""
-        made: Job = named("workflows.studies.sampling_job:job")(self, ensemble, directory)
-        return made
+        from workflows.studies.sampling_job import job
+
+        return job(self, ensemble, directory)
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add how the stability of each sample was tested."""
-        with_stability = named("workflows.studies.sampling_job:with_stability")
-        found: xr.Dataset = with_stability(self, dataset, evaluations["/"])
-        found = named("workflows.studies.sampling_job:with_unknown_meshes")(self, found)
-        return named("workflows.studies.adapted_mesh:with_history")(self, found) if self.model.adaptive else found
+        from workflows.studies.adapted_mesh import with_history
+        from workflows.studies.sampling_job import with_stability, with_unknown_meshes
+
+        found = with_unknown_meshes(self, with_stability(self, dataset, evaluations["/"]))
+        return with_history(self, found) if self.model.adaptive else found
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -244,7 +150,7 @@ class Study(Sourced, StudyKind):
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
         accuracy = value.get("accuracy") if isinstance(value, dict) else None
         asked = isinstance(accuracy, dict | Accuracy) and "tolerance" in dict(accuracy)
-        return named(f"{OF_TOLERANCE}:completed")(value) if asked else value
+        return tolerance_asked.completed(value) if asked else value
 
     @model_validator(mode="before")
     @classmethod
@@ -274,7 +180,7 @@ class Study(Sourced, StudyKind):
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         yield from mistakes_of_priors(self.spec, self.parameters, self.correlations, lambda: self.inputs, self.draws)
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
-            yield from named(f"{OF_TOLERANCE}:mistakes")(self)
+            yield from tolerance_asked.mistakes(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
         yield from self.mistakes_of_ranks(self.spec)

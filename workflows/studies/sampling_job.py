@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from forward.model import SolveError, Stability
-from forward.registry import named
 from uq.accuracy.budget import spare_for
-from uq.estimators import branch
+from uq.estimators import branch, of_draws
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -23,6 +22,7 @@ from uq.surrogates.linearisation import linearise, linearised
 from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
+from workflows.studies import adapted_mesh
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
 from workflows.studies.solves import measured, of_answers, stressed, with_contact, with_stresses
@@ -33,15 +33,14 @@ if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
-    from uq.accuracy.doubts import Told
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import SamplingBlocks
 
 REALISATIONS = 3  # of random fields, to look at
 
 
-def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
+def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
     recorders: dict[str, Recorder] = {}
@@ -60,7 +59,8 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
-            within: Callable[..., xr.Dataset] = named("workflows.studies.within:within")
+            from workflows.studies.within import within
+
             return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
         found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
         return (
@@ -114,7 +114,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
 
 
 def _with_mesh_errors(
-    study: Study,
+    study: SamplingBlocks,
     found: xr.Dataset,
     inputs: Inputs,
     evaluate: Evaluate,
@@ -141,10 +141,10 @@ def _with_mesh_errors(
         inputs, evaluate, centre, count, seed, fields="node" in found.dims, spare=spare_for(recorder.solves)
     )
     estimates.append(errors.evaluations)
-    return with_mesh_errors(found, inputs, centre, errors, told_of(study))
+    return with_mesh_errors(found, inputs, centre, errors, study.told)
 
 
-def with_unknown_meshes(study: Study, dataset: xr.Dataset) -> xr.Dataset:
+def with_unknown_meshes(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     """Keep which outputs have an error of a mesh that nobody knows, for all who print them."""
     if (study.spec.meshed or study.spec.hidden) and "output" in dataset.coords:
         kind = next((name for name in ("mean", "nominal") if holds(dataset, name, "mesh")), None)
@@ -154,23 +154,12 @@ def with_unknown_meshes(study: Study, dataset: xr.Dataset) -> xr.Dataset:
     return dataset
 
 
-def with_errors_of_draws(study: Study, found: xr.Dataset) -> xr.Dataset:
+def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset:
     """Add to the errors what draws are responsible for, if some parameters are given by draws."""
     if study.source is None:
         return found
     in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
-    added: xr.Dataset = named("uq.estimators.of_draws:with_errors_of_draws")(found, study.inputs, in_turn)
-    return added
-
-
-def told_of(study: Study) -> Told:
-    """Return what is known of the outputs of a study beside their values."""
-    from uq.accuracy.doubts import Told
-
-    outputs = study.spec.returned
-    never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
-    units = {one.name: one.unit for one in outputs}
-    return Told(units, never, study.spec.solver_tolerance or 0.0, contact=study.spec.touched)
+    return of_draws.with_errors_of_draws(found, study.inputs, in_turn)
 
 
 def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
@@ -188,7 +177,7 @@ def _without_nodes(found: xr.Dataset) -> xr.Dataset:
     return found.drop_dims([dim for dim in ("node",) if dim in found.dims])
 
 
-def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
+def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
     """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
 
     They are the first samples of Monte Carlo with the seed of the study.
@@ -199,7 +188,7 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
     return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
-def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+def with_stability(study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
     """Add how the stability of each sample was tested, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
     add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
@@ -215,19 +204,23 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
     return dataset
 
 
-def _told(study: Study, recorder: Recorder, estimates: Sequence[Evaluations], directory: Path) -> dict[str, Any]:
+def _told(
+    study: SamplingBlocks, recorder: Recorder, estimates: Sequence[Evaluations], directory: Path
+) -> dict[str, Any]:
     """Return what was solved on each mesh or of each model, if there are several, and what estimates and meshes took.
 
     Estimates of the error of the mesh are not among the evaluations. Solves stopped early are the model's.
     """
     ranks, told, seconds = study.parallel.ranks_per_model, dict[str, Any](), 0.0
-    refined = named("workflows.studies.adapted_mesh:history")(study) if study.model.adaptive else None
+    refined = adapted_mesh.history(study) if study.model.adaptive else None
     if estimates:
         every = merge(estimates)
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        before = named("workflows.studies.tolerance:meshes_before")(directory)
+        from workflows.studies.tolerance import meshes_before
+
+        before = meshes_before(directory)
         earlier = sum(one["seconds"] for one in before)
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}

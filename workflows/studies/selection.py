@@ -27,6 +27,7 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
+from workflows.run.from_python import FromPython
 from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
 from workflows.studies.job import MOVED, MethodJob
@@ -62,7 +63,7 @@ DATA = {
 }
 
 
-class Comparison(StudyKind):
+class Comparison(FromPython, StudyKind):
     """What studies that compare models have in common: candidates by name, groups of data, the method."""
 
     stopped: ClassVar[str] = "all evidences found"

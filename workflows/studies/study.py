@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
-from forward.registry import Kinds, named
+from forward.registry import Kinds
 from forward.settings import Settings
 from workflows.config.blocks import Parallel, Report
 from workflows.config.mistakes import refused
+from workflows.config.source import AVERAGED
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 SAMPLING = "sampling"  # the kind of study whose methods solve at points
+UNNAMED = (SAMPLING, AVERAGED)  # kinds that no file names: their methods do, and their parameters
 WITHOUT_EFFECT = ("parallel", "report")  # blocks that results do not depend on
 
 
@@ -183,11 +185,6 @@ class StudyKind(Settings):
         """The one model of the study with its random parameters, if it has one: what a server answers for."""
         return None
 
-    def run(self, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False) -> xr.Dataset:
-        """Run the study from Python, in memory or to a directory, as `workflows.run.run.results_of` does."""
-        found: xr.Dataset = named("workflows.run.run:results_of")(self, directory, quiet=quiet, report=report)
-        return found
-
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add to results what all evaluations say."""
         return dataset
@@ -218,6 +215,7 @@ STUDIES = Kinds(
     "study",
     {
         SAMPLING: "workflows.studies.sampling:Study",
+        AVERAGED: "workflows.studies.averaged:AveragedStudy",
         "select": "workflows.studies.model_selection:ModelSelection",
         "invert": "workflows.studies.inversion:Inversion",
         "synthesize": "workflows.studies.synthesis:Synthesis",

@@ -19,6 +19,7 @@ from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.priors import inputs_of, mistakes_of_priors, ranges
+from workflows.run.from_python import FromPython
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from uq.evaluation.request import Evaluate
 
 
-class Synthesis(StudyKind):
+class Synthesis(FromPython, StudyKind):
     """What synthetic data to make: displacements of a specimen, or outputs of any other model.
 
     Parameters

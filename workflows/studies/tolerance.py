@@ -35,12 +35,9 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from workflows.results.directory import write_text
-from workflows.run import own_code
-from workflows.run.version import version
 from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
-from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance_asked import (
     AIM,
     COUNTS,
@@ -63,7 +60,7 @@ if TYPE_CHECKING:
 
     from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import S, SamplingBlocks
 
 FILE = "tolerance.json"
 KEPT = 0.8  # of the tolerance: what a mesh may take that was not predicted (`AIM`: one that is)
@@ -77,8 +74,15 @@ POINTS = 4096  # at which tangents are drawn
 SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
 
 
-def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+def on_fine_mesh(
+    study: S, ensemble: Ensemble, directory: Path, say: Callable[[str], None], identity: Callable[[S], str]
+) -> S:
     """Return the study on a mesh that is fine enough, or on the finest that there may be; collective.
+
+    Parameters
+    ----------
+    identity
+        All that evaluations of a study depend on, which blocks on disk are found by.
 
     Raises
     ------
@@ -91,7 +95,7 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
     if told is None:
         _forget(study, world, directory)
     while told is None:
-        meshes.append(_assessed(study, ensemble, directory, count))
+        meshes.append(_assessed(study, ensemble, Checkpoint(directory, identity(study)), count))
         say(_line(meshes[-1]))
         finer, count, why = _next(study, first, meshes)
         if finer is None:
@@ -117,7 +121,7 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
     return study.of(study.model.model_copy(update={"body": body})) if changed else study
 
 
-def _forget(first: Study, world: Any, directory: Path) -> None:
+def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
     """Remove the mesh of an attempt that was given up or interrupted, unless the study itself asked for it."""
     if world.rank == 0 and not first.model.adaptive:
         for name in ADAPTED:
@@ -143,7 +147,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     return found
 
 
-def _body(study: Study, first: Study) -> dict[str, Any]:
+def _body(study: SamplingBlocks, first: SamplingBlocks) -> dict[str, Any]:
     """What of the body was changed."""
     if study.model is first.model:
         return {}
@@ -153,7 +157,7 @@ def _body(study: Study, first: Study) -> dict[str, Any]:
     return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
 
 
-def _refined(study: Study, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+def _refined(study: S, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
     """Return the study of a model, whose mesh may have to be refined first; collective."""
     if not model.unrefined:
         return study.of(model)
@@ -180,7 +184,7 @@ class Found:
     """
 
     def __init__(
-        self, study: Study, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int = COUNTS[0]
+        self, study: SamplingBlocks, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int = COUNTS[0]
     ) -> None:
         fields = getattr(study.method, "fields", True) and centre.state.size > 0
         self.centre = centre
@@ -193,7 +197,7 @@ class Found:
         moments = {"mean": drawn.mean(axis=0), "mean_error": zero, "std": drawn.std(axis=0), "std_error": zero}
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
         dataset = dataset.assign({name: (("output",), values) for name, values in moments.items()})
-        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, told_of(study))
+        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, study.told)
         self.doubts = doubts(self.dataset)
         errors = np.abs([estimate_of(self.dataset, name).mesh for name in ESTIMATED])
         self.close = np.nan_to_num(self.dataset["mesh_error_unknown"].to_numpy() * errors)
@@ -204,9 +208,8 @@ def doubts(dataset: xr.Dataset) -> FloatArray:
     return np.nan_to_num([estimate_of(dataset, name).doubt for name in ESTIMATED])
 
 
-def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> Assessed:
+def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint, count: int) -> Assessed:
     """Estimate what the mesh of a study takes of the tolerance; collective."""
-    checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]))
     model = ensemble.together(lambda: study.spec.build(ensemble.group, study.inputs.names))
 
     def task(evaluate: Evaluate) -> Assessed | Exception:
@@ -260,7 +263,9 @@ def _line(one: Assessed) -> str:
 # --- which mesh is next ----------------------------------------------------------------------------------------------
 
 
-def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, int, str]:
+def _next(
+    study: SamplingBlocks, first: SamplingBlocks, meshes: Sequence[Assessed]
+) -> tuple[ModelSpec | None, int, str]:
     """Return the model on the next mesh and the number of estimates on it, and why that is so.
 
     None in place of a model where the last mesh is taken.
@@ -299,7 +304,7 @@ def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[Model
     return best.model, best.estimates, ""
 
 
-def _memory(study: Study) -> str:
+def _memory(study: SamplingBlocks) -> str:
     return f"accuracy.memory = {study.accuracy.memory:,.0f} MiB"
 
 
@@ -314,7 +319,7 @@ class _Way:
     seconds: float
 
 
-def _ways(study: Study, now: Assessed, rate: float) -> Iterator[_Way]:
+def _ways(study: SamplingBlocks, now: Assessed, rate: float) -> Iterator[_Way]:
     """Go through the meshes with more and more cells for which there is memory, from the given one on."""
     few, power = SAMPLES[study.method.kind in ("automatic", "chaos") and study.inputs.independent]
     seen, times = set[int](), 1.0
@@ -345,7 +350,7 @@ def _ways(study: Study, now: Assessed, rate: float) -> Iterator[_Way]:
             yield _Way(1.0 if model is study.model else finer, model, count, share, seconds)
 
 
-def _adapting(study: Study, tolerance: float) -> ModelSpec:
+def _adapting(study: SamplingBlocks, tolerance: float) -> ModelSpec:
     """Return the model with a mesh that is refined until its relative error is so much, or memory ends."""
     found: ModelSpec = study.model.model_copy(
         update={"adapt": Adapt(tolerance=tolerance, unknowns=most_unknowns(study))}

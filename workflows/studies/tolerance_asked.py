@@ -26,7 +26,7 @@ from workflows.studies.predictions import times_of
 
 if TYPE_CHECKING:
     from uq.accuracy.goal import Goal
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import SamplingBlocks
 
 AUTOMATIC = "automatic"
 SCRAMBLES = 16  # of quasi-Monte Carlo, by default
@@ -67,13 +67,13 @@ def completed(blocks: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**blocks, "method": {**method, "samples": most}}
 
 
-def most(study: Study) -> int:
+def most(study: SamplingBlocks) -> int:
     """Return how many solves there may be, by accuracy.solves or by the method's own number of samples."""
     samples = getattr(study.method, "samples", None)
     return min(study.accuracy.solves, samples or study.accuracy.solves)
 
 
-def goal(study: Study) -> Goal:
+def goal(study: SamplingBlocks) -> Goal:
     """Return what the tolerance asks of estimates, before anything is known of the mesh."""
     from uq.accuracy.goal import Goal
 
@@ -82,7 +82,7 @@ def goal(study: Study) -> Goal:
     return Goal.of(study.accuracy.tolerance, units, study.accuracy.solves, study.spec.solver_tolerance or 0.0)
 
 
-def mistakes(study: Study) -> Iterator[Mistake]:
+def mistakes(study: SamplingBlocks) -> Iterator[Mistake]:
     """Find what cannot be asked together with a tolerance, or by it."""
     asked, method = study.accuracy.tolerance, study.method
     if asked is None:
@@ -110,7 +110,7 @@ def mistakes(study: Study) -> Iterator[Mistake]:
         yield ("accuracy", "tolerance"), message, asked
 
 
-def refinement(study: Study) -> tuple[str, str]:
+def refinement(study: SamplingBlocks) -> tuple[str, str]:
     """Return how the mesh of a study could be refined, "cells", "adapt" or "", and the same in words."""
     model = study.model
     if model.adaptive:
@@ -131,7 +131,7 @@ def refinement(study: Study) -> tuple[str, str]:
     return "", f"is not refined: {objection}"
 
 
-def findings(study: Study) -> Iterator[Finding]:
+def findings(study: SamplingBlocks) -> Iterator[Finding]:
     """Say what of the errors the tolerance cannot hold."""
     if not study.spec.meshed and not study.spec.hidden:
         return
@@ -149,7 +149,7 @@ def findings(study: Study) -> Iterator[Finding]:
         yield Finding("tolerance-mesh-fixed", "note", {"words": words})
 
 
-def plan(study: Study) -> Iterator[str]:
+def plan(study: SamplingBlocks) -> Iterator[str]:
     """Say what is held, and what is decided by it."""
     accuracy = study.accuracy
     parts = [
@@ -223,7 +223,7 @@ class Assessed:
         return float(np.hypot(self.close, few * np.array(self.between)).max() / factor)
 
 
-def most_unknowns(study: Study) -> int:
+def most_unknowns(study: SamplingBlocks) -> int:
     """Return the unknowns of the largest mesh for which accuracy.memory is enough, with the estimates of its error."""
     model: Any = study.model
     memory = MIB * study.accuracy.memory
@@ -247,7 +247,7 @@ def most_unknowns(study: Study) -> int:
         most, times = max(most, spec.unknowns), times * STEP
 
 
-def cells(study: Study) -> tuple[int, ...]:
+def cells(study: SamplingBlocks) -> tuple[int, ...]:
     """Cells along each edge, or how often those of a file are halved."""
     body = study.model.body  # type: ignore[attr-defined]
     return tuple(body.cells) if hasattr(body, "cells") else (2**body.levels,)
@@ -269,7 +269,7 @@ def rate_of(meshes: Sequence[Assessed]) -> float:
     return float(np.clip(np.log(before / after) / np.log(fine / coarse), *RATES))
 
 
-def dimension(study: Study) -> int:
+def dimension(study: SamplingBlocks) -> int:
     """Number of directions in which a mesh gets finer: two of a layer of plane strain."""
     here = cells(study)
     if refinement(study)[0] != "cells" or len(here) == 1:
@@ -290,13 +290,13 @@ def rate_seen(meshes: Sequence[Assessed], degree: int, d: int) -> float | None:
     return float(np.clip(d * np.log(before / after) / np.log(fine / coarse), RATE, 2 * degree))
 
 
-def least_share(first: Study, now: Assessed, rate: float) -> float:
+def least_share(first: SamplingBlocks, now: Assessed, rate: float) -> float:
     """Predict what the largest mesh takes of the tolerance, by one that was seen; `first` is on the given mesh."""
     finer = max(most_unknowns(first) / now.unknowns, 1.0) ** (1 / dimension(first))
     return now.share_with(finer**rate, COUNTS[-1])
 
 
-def out_of_reach(study: Study, first: Study, meshes: Sequence[Assessed]) -> str | None:
+def out_of_reach(study: SamplingBlocks, first: SamplingBlocks, meshes: Sequence[Assessed]) -> str | None:
     """Say that no mesh in memory is fine enough, what is reachable and what to do; None where one may be.
 
     Parameters

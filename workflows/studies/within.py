@@ -23,7 +23,6 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.findings import add
 from uq.surrogates.linearisation import linearise
-from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance import Found, doubts, history
 from workflows.studies.tolerance_asked import goal as asked
 from workflows.studies.tolerance_asked import most
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from uq.inputs.random_parameters import Inputs
     from uq.methods.method import Method
-    from workflows.studies.sampling import Study
+    from workflows.studies.sampling_blocks import SamplingBlocks
 
 FAR_OFF = 2.0  # times what is not known: then estimates on two meshes contradict each other
 ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
@@ -43,7 +42,7 @@ IN_WORDS = {"mean": "mean", "std": "standard deviation"}
 
 
 def within(
-    study: Study,
+    study: SamplingBlocks,
     method: Method,
     inputs: Inputs,
     evaluate: Evaluate,
@@ -78,7 +77,7 @@ def within(
         found = method.until(inputs, recorders["/"], goal)
         if mesh is None:
             break
-        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, told_of(study))
+        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, study.told)
         now = replace(goal, mesh=doubts(found))
         settled = now.reached(_moments(found), half_width(found)) <= 1
         goal = now
@@ -97,7 +96,7 @@ def _moments(dataset: xr.Dataset) -> dict[str, FloatArray]:
 
 
 def _told(
-    study: Study, found: xr.Dataset, goal: Goal, parts: dict[str, FloatArray], before: dict[str, Any] | None
+    study: SamplingBlocks, found: xr.Dataset, goal: Goal, parts: dict[str, FloatArray], before: dict[str, Any] | None
 ) -> dict[str, Any]:
     """Say what was asked for and reached, by what, and why; nothing that depends on the machine."""
     names = [str(name) for name in found["output"].values]
@@ -105,7 +104,7 @@ def _told(
     sizes = goal.sizes(found["mean"].to_numpy(), found["std"].to_numpy())
     row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
     meshes = [] if before is None else before["meshes"]
-    never = told_of(study).never
+    never = study.told.never
     estimates = {name: estimate_of(found, name) for name in ESTIMATED}
     corrected = np.isfinite(estimates["mean"].corrected)  # the outputs of which the error of the mesh was estimated
     if before is None:  # nothing to be known, or not asked for; else it was too much
@@ -204,7 +203,7 @@ def contradictions(meshes: Sequence[Mapping[str, Any]], outputs: Mapping[str, An
             )
 
 
-def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
+def _findings(study: SamplingBlocks, told: dict[str, Any]) -> Iterator[Finding]:
     """Say that the tolerance is not kept, and what keeps it from being so."""
     worst, shares = told["worst"], told["shares"]
     if told["kept"]:

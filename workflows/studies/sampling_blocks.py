@@ -1,0 +1,122 @@
+"""What stands in a study that samples a model, and what follows from it before anything is solved."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Self, TypeVar
+
+from pydantic import Field
+
+from forward.machine import MIB
+from forward.registry import OfKind
+from forward.spec import MODELS, ModelSpec
+from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
+from uq.accuracy.doubts import Told
+from uq.inputs.distributions import Distribution
+from uq.inputs.random_parameters import Inputs
+from uq.methods.method import MESH, METHODS, Method
+from workflows.config.blocks import Accuracy, Correlation, Parallel
+from workflows.config.priors import inputs_of, ranges
+from workflows.config.source import Sourced
+from workflows.studies.predictions import estimates_paid
+
+
+class SamplingBlocks(Sourced):
+    """The blocks of a study that samples a model, as `workflows.studies.sampling.Study` explains them."""
+
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    method: Annotated[Method, OfKind(METHODS)]
+    accuracy: Accuracy = Accuracy()
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
+        return inputs_of(self.parameters, self.correlations, self.model.coefficients, draws=self.draws)
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters, solved as exactly as a tolerance needs."""
+        spec, asked = self.model.over(ranges(self.given)), self.accuracy.tolerance
+        solver = spec.solver_tolerance
+        return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
+
+    @property
+    def models(self) -> dict[str, ModelSpec]:
+        """The models that the method may ask for beside that one, by name."""
+        return self.method.models(self.spec)
+
+    @property
+    def meshes(self) -> tuple[ModelSpec, ...]:
+        """The model, and the same on the finer meshes that a multilevel method may use."""
+        return self.spec, *(model for name, model in self.models.items() if name.startswith(MESH))
+
+    @property
+    def planned(self) -> int:
+        """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
+        return self.method.planned(len(self.inputs.names))
+
+    @cached_property
+    def estimates(self) -> int:
+        """Number of estimates of the error of the mesh with the planned solves: none of models without one.
+
+        Methods on several meshes, and comparisons that are asked to solve on a finer one, estimate it themselves.
+        """
+        return 0 if not self.estimating or self.too_large is not None else self.estimates_of(self.planned)
+
+    def estimates_of(self, solves: int) -> int:
+        """Number of estimates of the error of the mesh that so many solves afford, two at least, by predicted times."""
+        return estimates_for(solves, estimates_paid(self.spec, len(self.inputs.names), solves))
+
+    @property
+    def spare(self) -> float:
+        """How many solves the calibration of these estimates may cost with the planned solves."""
+        return math.inf if self.accuracy.tolerance is not None else spare_for(self.planned)
+
+    @property
+    def estimating(self) -> bool:
+        """Whether the error of the mesh is estimated, if there is memory for that."""
+        theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
+        return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.remembers
+
+    @cached_property
+    def too_large(self) -> float | None:
+        """Memory (MiB) that an estimate of the error of the mesh and its calibration take, if that is too much."""
+        needed = self.bytes_of_estimates / MIB
+        return needed if needed > self.accuracy.memory else None
+
+    @cached_property
+    def bytes_of_estimates(self) -> float:
+        """Memory (bytes) of an estimate and of its calibration."""
+        cost = self.spec.mesh_error_cost(self.spare)
+        return 0.0 if cost is None else cost.bytes + cost.calibration_bytes
+
+    @property
+    def solves(self) -> int:
+        """Number of solves, those for the error of the mesh too."""
+        return self.planned + self.estimates
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model, and those beside it."""
+        return self.spec, *self.models.values()
+
+    def of(self, model: ModelSpec) -> Self:
+        """Return the same study of another model."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | {"model": model})
+
+    @property
+    def told(self) -> Told:
+        """What is known of the outputs beside their values."""
+        outputs = self.spec.returned
+        never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
+        units = {one.name: one.unit for one in outputs}
+        return Told(units, never, self.spec.solver_tolerance or 0.0, contact=self.spec.touched)
+
+
+S = TypeVar("S", bound=SamplingBlocks)
