@@ -99,7 +99,7 @@ class Hyperelastic(LoadedBody):
             message = f"model.adapt: {UNREFINED}"
             raise ModelError(message)
         alone = "path:built" if self.stepped else "model:HyperelasticModel"
-        model = "path:HistoryModel" if self.frictional else alone
+        model = "path:HistoryModel" if self.path_dependent else alone
         return named(f"forward.fem.{model}")(self, comm, parameters)
 
 
@@ -217,7 +217,7 @@ class Path(Hyperelastic):
     def cost(self, factors: int = 1) -> Times:
         """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
         found = super().cost(factors)
-        return found if self.frictional else sum_of([replace(found, contact=False)] * self.count)
+        return found if self.path_dependent else sum_of([replace(found, contact=False)] * self.count)
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all steps."""

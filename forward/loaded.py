@@ -84,7 +84,7 @@ class LoadedBody(Refinable):
     @property
     def linear(self) -> Linear:
         """What its linear systems are solved with."""
-        if self.mixed or self.body.degree < 2 or self.frictional:
+        if self.mixed or self.body.degree < 2 or self.remembers:
             return Linear.FACTOR
         if self.solver.linear != "auto":
             return Linear(self.solver.linear)
@@ -100,9 +100,9 @@ class LoadedBody(Refinable):
         return factor(self.body, mixed=self.mixed, symmetric=self.symmetric).bytes > SINGLE_FROM
 
     @property
-    def frictional(self) -> bool:
-        """Whether a tool rubs on it, so that its state depends on the states before."""
-        return any(load.contact and not load.symmetric for load in self.loads)
+    def path_dependent(self) -> bool:
+        """Whether a tool rubs on it, or another load remembers, so that its state depends on the states before."""
+        return any(load.remembers for load in self.loads)
 
     @property
     def unavailable(self) -> Mapping[str, str]:
@@ -113,8 +113,9 @@ class LoadedBody(Refinable):
 
     @property
     def remembers(self) -> str:
-        """What makes its states depend on those before; empty if nothing does."""
-        return "friction" if self.frictional else ""
+        """With what no error of its mesh is estimated: friction, and loads that are no forms; empty without."""
+        rubbing = ["friction"] if any(load.contact and load.remembers for load in self.loads) else []
+        return " and ".join((*rubbing, *(f"'{load.label}'" for load in self.loads if not load.written)))
 
     @property
     def touched(self) -> bool:
@@ -138,11 +139,11 @@ class LoadedBody(Refinable):
 
     @property
     def increments(self) -> int:
-        """In how many increments the load grows where there is friction, in all; 1 without."""
-        if not self.frictional:
+        """In how many increments the load grows where states depend on those before, in all; 1 elsewhere."""
+        if not self.path_dependent:
             return 1
         tools, steps = [load for load in self.loads if load.contact], max(len(self.labels), 1)
-        return steps * max(getattr(load, "increments", None) or -(-INCREMENTS // steps) for load in tools)
+        return steps * max([getattr(load, "increments", None) or -(-INCREMENTS // steps) for load in tools], default=1)
 
     def unlocked(self) -> Self:
         """Return the same body on the same mesh in the form that locks least."""
@@ -249,7 +250,7 @@ class LoadedBody(Refinable):
 
     def cost(self, factors: int = 2) -> Times:
         """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
-        predicted = self.solver.kind != "newton" and not self.frictional
+        predicted = self.solver.kind != "newton" and not self.path_dependent
         contact, mixed, symmetric = self.touched, self.mixed, self.symmetric
         one = times(
             self.body,
@@ -289,7 +290,7 @@ class LoadedBody(Refinable):
 
     def _linear_in_words(self) -> str:
         """Say what linear systems are solved with."""
-        referred = self.linear != Linear.MULTIGRID and self.solver.kind != "newton" and not self.frictional
+        referred = self.linear != Linear.MULTIGRID and self.solver.kind != "newton" and not self.path_dependent
         return IN_WORDS[self.linear] + (
             "; that of the reference in single precision" if referred and self.single else ""
         )
@@ -336,8 +337,10 @@ class LoadedBody(Refinable):
         support = Support(self.body, self.clamp, self.displacements, self.loads)
         yield from support.contradictions()
         yield from self.mistakes_of_adapt()
-        if self.adapt is not None and self.frictional:
-            yield ("adapt",), "errors of the mesh are not estimated with friction, expected friction = 0", True
+        if self.adapt is not None and self.remembers:
+            expected = "friction = 0" if self.remembers == "friction" else "neither"
+            message = f"errors of the mesh are not estimated with {self.remembers}, expected {expected}"
+            yield ("adapt",), message, True
         yield from support.mistakes(complete=not unknown)
 
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
@@ -365,8 +368,8 @@ class LoadedBody(Refinable):
             objection = "multigrid needs cells of degree 2, between which and linear ones it goes to and fro"
         elif self.formulation == "mixed":
             objection = "multigrid solves for displacements only, and the form is mixed"
-        elif self.frictional:
-            objection = "multigrid is not available with friction"
+        elif self.remembers:
+            objection = f"multigrid is not available with {self.remembers}"
         elif self.solver.kind == "newton":
             objection = "the textbook solver has a factor for every step"
         if objection:

@@ -152,7 +152,7 @@ class ModelSpec(Settings):
 
     @property
     def remembers(self) -> str:
-        """What makes its states depend on those before, so that errors of its mesh are not estimated; empty if none."""
+        """With what errors of its mesh are not estimated: what remembers, or is no form; empty if none."""
         return ""
 
     @property

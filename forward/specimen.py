@@ -124,9 +124,11 @@ class _Loaded(Hyperelastic):
     def _mistakes(self) -> Iterator[Mistake]:
         yield from super()._mistakes()
         for i, load in enumerate(self.loads):
-            if self.frictional and load.contact and not load.symmetric:
+            if load.remembers and load.contact:
                 message = "a specimen has no friction yet, expected friction = 0 (or a model of kind 'path')"
                 yield ("loads", i, "friction"), message, getattr(load, "friction", None)
+            elif load.remembers:
+                yield ("loads", i), "a specimen remembers nothing yet, expected a model of kind 'path'", load.label
 
 
 class Specimen(Solid):

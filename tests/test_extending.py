@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import shutil
 import tomllib
 from types import SimpleNamespace
 
@@ -95,6 +96,31 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     loads.write_text(loads.read_text().replace("/ 3", "/ 2"))
     assert other.returncode == 2
     assert "my_loads.py has changed" in other.stderr
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_an_item_that_is_no_form(folder, tmp_path):
+    """A cable through a body: a number of it is random, two ranks share the body, and what it cannot have is said."""
+    for path in folder.glob("*.py"):
+        shutil.copy(path, tmp_path)
+    shutil.copy(ROOT / "tests" / "items.py", tmp_path / "my_items.py")
+    study, out = (folder / "wound.toml").read_text(), tmp_path / "out"
+    cable = 'kind = "my_items.Cable", name = "cable", start = [0, 0, 0], end = [0.04, 0.02, 0.02], stiffness = 0.05'
+    study = study.replace("loads = [", f"loads = [\n    {{ {cable} }},").split("[method]", maxsplit=1)[0]
+    study += '"loads.cable.stiffness" = { kind = "uniform", lower = 0.02, upper = 0.1 }\n'
+    study += '[method]\nkind = "local-sensitivity"\n'
+    (tmp_path / "cable.toml").write_text(study + "[parallel]\nranks_per_model = 2\n")
+    done = run(2, TISSUQ, "run", tmp_path / "cable.toml", "--out", out, "--no-report")
+    assert done.returncode == 0, done.stderr
+    said = [one["text"] for one in json.loads((out / "summary.json").read_text())["findings"]]
+    assert "The error of the mesh is not estimated with 'cable': compare with a finer mesh." in said
+    (tmp_path / "small.toml").write_text(study.replace("local-sensitivity", "reduce"))
+    refused = run(None, TISSUQ, "run", tmp_path / "small.toml", "--out", tmp_path / "small")
+    assert refused.returncode != 0
+    assert "the load 'cable' is no form and cannot be reduced" in refused.stderr
+    assert "Traceback" not in refused.stderr
 
 
 @pytest.mark.mpi

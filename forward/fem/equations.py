@@ -78,7 +78,7 @@ class Discretisation(Linearisation):
             field.set(parameters)
 
     def _size_of_loads(self) -> float:
-        """Norm (N) of the complete loads on the undeformed body, without tools.
+        """Norm (N) of the complete loads on the undeformed body, without tools and items.
 
         That of the last points is kept: many points at once are set again and again.
         """
@@ -95,10 +95,12 @@ class Discretisation(Linearisation):
         return self._sizes[key]
 
     def _forces_at_rest(self) -> FloatArray:
-        """Forces (U_local,) on the undeformed body due to the complete loads, without tools."""
+        """Forces (U_local,) on the undeformed body due to the complete loads, without tools and items."""
         kept = self._load.value.copy()
         self._load.value, self._touched.value = 1.0, 0.0
-        forces = self._imbalance(np.zeros(self.size))
+        self.set_state(np.zeros(self.size))
+        self.work.residuals += 1
+        forces = self._residual()
         forces[self.fixed] = 0
         self._load.value, self._touched.value = kept, 1.0
         return forces
@@ -196,11 +198,11 @@ class Discretisation(Linearisation):
     def _imbalance(self, u: FloatArray) -> FloatArray:
         self.set_state(u)
         self.work.residuals += 1
-        return self._residual()
+        return self.imbalance()
 
     def imbalance(self) -> FloatArray:
         """Imbalance (U_local,) at the current state; on prescribed unknowns, the reactions."""
-        return self._residual()
+        return self._residual() + self.items.forces() if self.items else self._residual()
 
     def residual(self, u: FloatArray) -> Residual:
         """Return the imbalance at u (U_local,).
@@ -219,11 +221,13 @@ class Discretisation(Linearisation):
         squares = [forces @ forces, reactions @ reactions, gap @ gap, volumes @ volumes]
         free, fixed, apart, lacking = np.sqrt(self.total(np.array(squares))).tolist()
         r[self.fixed] = gap
-        scale = float(self._load.value) * self._external
+        scale = self.load * self._external
         if self._moves:
             scale = max(scale, fixed)
         if self._contact_forces is not None:
             scale = max(scale, self.norm(self._contact_forces()))
+        if self.items:
+            scale = max(scale, self.norm(self.items.forces()))
         return Residual(r, free, scale, apart, self._force_of(lacking, u))
 
     @contextmanager

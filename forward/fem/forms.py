@@ -85,7 +85,7 @@ class Forms:
         self.stored_energy, self._potential, self.dilation = self._energies()
         # Where there is friction: the state at the end of the increment before, and what has moved since.
         self.increments = spec.increments
-        self._before = spaces.function(self.unknowns.whole) if spec.frictional else None
+        self._before = spaces.function(self.unknowns.whole) if spec.path_dependent else None
         self._share = spaces.constant(self.mesh, 0.0)
         self._shifts = {load.label: spaces.constant(self.mesh, np.zeros(4)) for load in spec.loads if load.contact}
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
@@ -97,6 +97,11 @@ class Forms:
         self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
         self._loads = self._virtual_works()
         self.symmetric = spec.symmetric
+
+    @property
+    def load(self) -> float:
+        """Fraction of the loads and prescribed displacements that is set."""
+        return float(self._load.value)
 
     @cached_property
     def energy(self) -> Any:
@@ -245,6 +250,9 @@ class Forms:
         """
         works = []
         for load in self.spec.loads:
+            if not load.written:
+                works.append(ufl.Form([]))
+                continue
             numbers = self._numbers(f"loads.{load.label}")
             if load.contact:
                 numbers |= {"depth": self._load * numbers["depth"]}

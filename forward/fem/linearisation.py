@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from forward.fem.cost import Linear, factor
 from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unknowns
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
+from forward.fem.items import Items
 from forward.fem.latest import Latest
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
@@ -58,6 +59,7 @@ class Linearisation(Forms):
         self._lasting = beside is None
         self.linear = spec.linear if self._lasting else Linear.FACTOR
         self._prescribe()
+        self.items = Items(self)
         self._of_stiffness = self.stiffness_form(imbalance)
         if self._lasting:
             assert self._solver  # so that memory is checked before anything else is allocated
@@ -248,7 +250,7 @@ class Linearisation(Forms):
             pressed = ufl.derivative(load.potential(at), self._state, self._variation)
             found += self.derivative(ufl.algorithms.expand_derivatives(pressed), trial)
             found += load.rubbing_stiffness(at, self.unknowns.split(trial)[0])
-        followers = [work for load, work in works if not load.symmetric and not load.contact]
+        followers = [work for load, work in works if not load.symmetric and not load.contact and load.written]
         if followers:
             of_followers = self.derivative(sum(followers[1:], followers[0]), trial)
             found += 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers)
@@ -277,7 +279,14 @@ class Linearisation(Forms):
     def _new_matrix(self, form: Any, *, symmetric: bool, blocked: bool = False) -> linear.StiffnessMatrix:
         expected = factor(self.spec.body, mixed=self.spec.mixed, symmetric=symmetric)
         return linear.StiffnessMatrix(
-            form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected, blocked=blocked
+            form,
+            self._constraints,
+            self.unknowns,
+            self.comm,
+            symmetric=symmetric,
+            expected=expected,
+            blocked=blocked,
+            items=partial(self.items.entries, symmetric=symmetric) if self.items else None,
         )
 
     @cached_property
@@ -328,7 +337,8 @@ class Linearisation(Forms):
         """Product of the stiffness of all unknowns (or its transpose) with w (U_local,), at the state that is set."""
         self.unknowns.give(self._along, w)
         self.work.residuals += 1
-        return (self._transposed_action if transpose else self._stiffness_action)()
+        found = (self._transposed_action if transpose else self._stiffness_action)()
+        return found + self.items.stiffness_times(w, transpose=transpose) if self.items else found
 
     def imbalance_by_vertices(self, w: FloatArray) -> FloatArray:
         """Virtual works F(u; φ_i w) (n_vertices,) of w (U_local,) times the hat function of each own vertex.
@@ -365,13 +375,46 @@ class Linearisation(Forms):
         for label, shift in shifts.items():
             self._shifts[label].value = shift
 
+    @property
+    def size_before(self) -> int:
+        """Number of values on this rank that an increment leaves: its unknowns, and what items keep behind them."""
+        return self.size + self.items.kept_size if self.items else self.size
+
     def rubbed(self, w: FloatArray, *, transpose: bool = True) -> FloatArray:
-        """Product of the derivative of the imbalance by the state before (or its transpose) with w (U_local,)."""
-        if self._before is None:
-            return np.zeros(self.size)
-        self.unknowns.give(self._along, w)
-        self.work.residuals += 1
-        return (self._rubbing_transposed if transpose else self._rubbing_action)()
+        """Product of the derivative of the imbalance by what the increment before has left with such a vector.
+
+        Or of its transpose with w (U_local,).
+        """
+        found = np.zeros(self.size)
+        if self._rubbing:
+            self.unknowns.give(self._along, w[: self.size])
+            self.work.residuals += 1
+            found = (self._rubbing_transposed if transpose else self._rubbing_action)()
+        if not self.items:
+            return found
+        if transpose:
+            return np.append(found, self.items.to_past(w))
+        return found + self.items.from_past(w[self.size :])
+
+    def left(self, states: FloatArray, before: FloatArray, directions: FloatArray) -> FloatArray:
+        """Return the changes of what the increment that is set leaves.
+
+        Parameters
+        ----------
+        states, before, directions
+            Changes of its state (k, U_local), of what the one before has left, and of the parameters (k, d).
+        """
+        if not self.items:
+            return states
+        return np.hstack([states, self.items.kept_along(states, before[:, self.size :], directions)])
+
+    def left_adjoint(self, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the transpose of `left` for weights (k, size_before): by state, by what was left before, (k, d)."""
+        states, before = weights[:, : self.size], np.zeros_like(weights)
+        if not self.items:
+            return states, before, np.zeros((len(weights), len(self.parameters)))
+        of_states, before[:, self.size :], of_parameters = self.items.kept_adjoint(weights[:, self.size :])
+        return states + of_states, before, of_parameters
 
     def assembled_stiffness(self) -> Any:
         """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
@@ -424,6 +467,11 @@ class Linearisation(Forms):
             if path in self._directions and self._parameter_force is not None:
                 self.work.residuals += 1
                 forces[i] = self._parameter_force()
+        if self.items:
+            rows = {self.parameters[i]: row for i, row in zip(self.scalars, forces, strict=True)}
+            for path, force in self.items.by_number():
+                if path in rows:
+                    rows[path] += force
         return forces
 
     def right_sides(self) -> FloatArray:

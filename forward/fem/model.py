@@ -68,6 +68,11 @@ def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool
         yield one is not None, ((point, guess or Guess()) for point, guess in group)
 
 
+def not_estimated(what: str) -> SolveError:
+    """Return the refusal of an estimate of the error of the mesh."""
+    return SolveError(f"the error of the mesh is not estimated with {what}; compare with a finer mesh")
+
+
 class HyperelasticModel(OneByOne):
     """A hyperelastic body as a `ForwardModel`: one mesh, one set of forms and one solver for every realisation.
 
@@ -133,7 +138,15 @@ class HyperelasticModel(OneByOne):
 
     @property
     def enriched(self) -> Enriched:
-        """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
+        """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used.
+
+        Raises
+        ------
+        SolveError
+            If something acts on it that has no place there.
+        """
+        if self.spec.remembers:
+            raise not_estimated(self.spec.remembers)
         if 1 not in self._richer:
             self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
         return self._richer[1]

@@ -1,9 +1,9 @@
 """A body in several steps: one mesh and one set of forms, a state for every step, each found from the one before.
 
-Without friction steps only say where the curve is known. With it the state depends on the states before, and the load
-grows in increments. With the states u_i at their ends, F_i(u_i, u_{i−1}, ω) = 0. Tangents go forward through the
-increments, K_i du_i = −∂F_i/∂ω dω − C_i du_{i−1} with C_i = ∂F_i/∂u_{i−1}, and adjoints go back,
-K_iᵀλ_i = ∂ψ/∂u_i − C_{i+1}ᵀλ_{i+1}: they are the derivatives of what is computed, for one factor of each increment.
+Mostly steps only say where the curve is known. With friction the state depends on the states before, and the load grows
+in increments. With the states u_i at their ends, F_i(u_i, u_{i−1}, ω) = 0. Tangents go forward through the increments,
+K_i du_i = −∂F_i/∂ω dω − C_i du_{i−1} with C_i = ∂F_i/∂u_{i−1}, and adjoints back, K_iᵀλ_i = ∂ψ/∂u_i − C_{i+1}ᵀλ_{i+1}:
+they are the derivatives of what is computed, for one factor of each increment. What items keep stands behind u_i.
 What is differentiated is the path with its increments as they are; one that had to be halved is part of it.
 """
 
@@ -21,7 +21,7 @@ from scipy.sparse import eye
 from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped, side_by_side
 from forward.fem.calibration import FinerMesh
 from forward.fem.equations import Discretisation
-from forward.fem.model import RAISES, STIFFER, HyperelasticModel
+from forward.fem.model import RAISES, STIFFER, HyperelasticModel, not_estimated
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace
 from forward.loaded import LoadedBody
@@ -29,6 +29,7 @@ from forward.model import FloatArray, Guess, OneByOne, Saturation, SolveError, S
 from forward.solvers.acceptance import Diverged
 from forward.solvers.newton import newton
 from forward.solvers.system import Found
+from forward.terms.acting import Past
 
 FEW = 16  # parameters up to which derivatives of the states of all steps are kept
 SMALLEST = 1 / 64  # of an increment, to which it may be divided where Newton's method fails
@@ -48,7 +49,7 @@ class PathModel(Joined):
     steps
         The body as a model at each step.
     values
-        Values (steps, numbers) of the numbers that have steps.
+        Those (steps, numbers) of the numbers that have steps.
     """
 
     models: tuple[Mapped, ...]
@@ -168,7 +169,7 @@ class Increment(NamedTuple):
     Attributes
     ----------
     time
-        Steps of the path that are passed: 1 at the end of the first.
+        Steps that are passed: 1 at the end of the first.
     load
         Fraction of the loads.
     numbers
@@ -186,16 +187,17 @@ class Increment(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """An increment with the equilibrium (U_local,) at its end."""
+    """An increment with the equilibrium (U_local,) at its end, and what items leave there to the next."""
 
     at: Increment
     state: FloatArray
     residual: float
     stability: Stability
+    left: tuple[Past, ...] = ()
 
 
 class HistoryModel(OneByOne):
-    """A body on which tools rub, along a path or under one load, as a `ForwardModel`.
+    """A body on which tools rub or items remember, along a path or under one load, as a `ForwardModel`.
 
     Every increment is solved from the one before by Newton's method, so that predictions of states are not used.
 
@@ -236,17 +238,16 @@ class HistoryModel(OneByOne):
         equations = self.equations
         equations.set_parameters(np.append(parameters, here.numbers), stiffer)
         equations.at_load(here.load)
-        loaded = 0.0 if before is None else before.at.load
-        changes = here.numbers - (here.numbers if before is None else before.at.numbers)
-        state = np.zeros(equations.size) if before is None else before.state
-        equations.set_before(state, (here.load - loaded) / here.load, dict(self._shifts(changes)))
+        start = before or Passed(Increment(0.0, 0.0, here.numbers), np.zeros(equations.size), 0.0, Stability.NOT_TESTED)
+        moved = dict(self._shifts(here.numbers - start.at.numbers))
+        equations.set_before(start.state, (here.load - start.at.load) / here.load, moved)
+        equations.items.follow(start.left, here.time)
 
     def _shifts(self, changes: FloatArray) -> Iterator[tuple[str, FloatArray]]:
         """What each tool moves (m) where its place or its depth is a number with steps."""
         moved = dict(zip(self.spec.stepped, changes, strict=True))
         for load in (load for load in self.equations.spec.loads if load.contact):
-            names = ("x", "y", "z", "depth")
-            yield load.label, np.array([moved.get(f"loads.{load.label}.{name}", 0.0) for name in names])
+            yield load.label, np.array([moved.get(f"loads.{load.label}.{of}", 0.0) for of in (*"xyz", "depth")])
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> HistorySolution:
         """Find the equilibria of all increments at `parameters` (d,), each from the one before; collective.
@@ -306,7 +307,9 @@ class HistoryModel(OneByOne):
                 left.append(Increment((last.time + here.time) / 2, (last.load + here.load) / 2, numbers))
                 continue
             self.equations.work.load_steps += 1
-            passed.append(Passed(here, found.state, found.residual, found.stability))
+            passed.append(
+                Passed(here, found.state, found.residual, found.stability, self.equations.items.left(found.state))
+            )
             left.pop()
 
     def _predicted(self, here: Increment, passed: list[Passed]) -> FloatArray:
@@ -374,9 +377,9 @@ class HistorySolution:
         return self._model.equations
 
     def _forward(self, directions: FloatArray) -> Iterator[tuple[int, FloatArray, FloatArray]]:
-        """Derivatives (k, U_local) of the states at the end of each increment and of the one before."""
+        """Derivatives (k, U_local) of the state at the end of each increment, and of what the one before has left."""
         along = self._model.along(directions)
-        before = np.zeros((len(directions), self._model.equations.size))
+        before = np.zeros((len(directions), self._model.equations.size_before))
         for i in range(len(self.passed)):
             equations = self._visit(i)
             right = equations.right_sides_along(along)
@@ -385,8 +388,8 @@ class HistorySolution:
                 changes[:, equations.fixed] = 0
                 right -= changes
             here = self._linearise(i).back_substitute(right)
-            yield i, here, before
-            before = here
+            last, before = before, equations.left(here, before, along)
+            yield i, here, last
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
@@ -405,10 +408,10 @@ class HistorySolution:
 
     @cached_property
     def _slopes(self) -> dict[int, tuple[FloatArray, FloatArray, FloatArray]]:
-        """∂ψ/∂u_i, ∂ψ/∂u_{i−1} (m, U_local) and ∂ψ/∂ω (m, d + s) of the outputs at the end of each step."""
+        """∂ψ/∂u_i (m, U_local), the same by what was left before, and ∂ψ/∂ω (m, d + s) at the end of each step."""
         found = {}
         for i in (i for i, one in enumerate(self.passed) if one.at.returned):
-            size = self._visit(i).size
+            size = self._visit(i).size_before
             functionals = self._model.body.functionals
             before = [f.gradient_before() if hasattr(f, "gradient_before") else np.zeros(size) for f in functionals]
             of_state = np.array([f.gradient() for f in functionals])
@@ -417,19 +420,20 @@ class HistorySolution:
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        model, rows = self._model, np.atleast_2d(weights)
-        equations, slopes = model.equations, self._slopes
+        equations, slopes, rows = self._model.equations, self._slopes, np.atleast_2d(weights)
         own = dict(zip(slopes, np.split(rows, len(slopes), axis=1), strict=True))
         gradients = np.zeros((len(rows), len(equations.parameters)))
-        carried = np.zeros((len(rows), equations.size))
+        carried = np.zeros((len(rows), equations.size_before))
         for i in reversed(range(len(self.passed))):
-            load, carried = carried, np.zeros_like(carried)
+            self._linearise(i)
+            load, carried, of_parameters = equations.left_adjoint(carried)
+            gradients += of_parameters
             if i in own:
                 of_state, of_before, partials = slopes[i]
                 load = load + own[i] @ of_state
                 carried += own[i] @ of_before
                 gradients += own[i] @ partials
-            multipliers = self._linearise(i).back_substitute(load, transpose=True)
+            multipliers = equations.back_substitute(load, transpose=True)
             self._visit(i)
             gradients[:, equations.scalars] += equations.total(multipliers @ equations.right_sides().T)
             multipliers[:, equations.fixed] = 0
@@ -440,8 +444,7 @@ class HistorySolution:
         return gradients[:, : len(self.parameters)].reshape(*np.shape(weights)[:-1], -1)
 
     def mesh_error(self, spare: float = math.inf) -> Never:
-        """There is no estimate with friction: the states before differ in elements of another degree too."""
-        message = "the error of the mesh is not estimated with friction; compare with a finer mesh"
-        raise SolveError(message)
+        """There is no estimate with memory: the states before differ in elements of another degree too."""
+        raise not_estimated(self._model.spec.remembers)
 
     saturation = mesh_error

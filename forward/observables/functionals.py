@@ -75,9 +75,11 @@ class Integral:
         return self._equations.derivative_before(self.density * self.measure)
 
     def gradient_before(self) -> FloatArray:
-        """Return ∂ψ/∂u (U_local,) by the state at the end of the increment before."""
-        found = self._gradient_before
-        return np.zeros(self._equations.size) if found is None else np.asarray(found()) / self.size
+        """Return ∂ψ/∂u by what the increment before has left: of that, by the state at its end."""
+        found = np.zeros(self._equations.size_before)
+        if self._gradient_before is not None:
+            found[: self._equations.size] = np.asarray(self._gradient_before()) / self.size
+        return found
 
     def partial(self) -> FloatArray:
         """Return ∂ψ/∂ω (d,)."""

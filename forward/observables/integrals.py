@@ -101,7 +101,7 @@ class _Reaction:
         return self._equations.stiffness_times(self.w, transpose=True)
 
     def gradient_before(self) -> FloatArray:
-        """By the state at the end of the increment before, where friction depends on it."""
+        """By what the increment before has left, where friction or an item depends on it."""
         return self._equations.rubbed(self.w)
 
     def partial(self) -> FloatArray:

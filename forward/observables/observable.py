@@ -97,6 +97,10 @@ class Equations(Protocol):
         """Energy density; in the mixed form, without its volumetric part."""
 
     @property
+    def size_before(self) -> int:
+        """Number of values on this rank that an increment leaves: its unknowns, and what items keep behind them."""
+
+    @property
     def volume(self) -> float:
         """Volume (m³) of the undeformed mesh."""
 

@@ -15,6 +15,8 @@ def mistakes(spec: LoadedBody) -> Iterator[str]:
             f"a reduced model has no friction, which depends on the way that a tool went, expected friction = 0 of "
             f"{', '.join(rubbing)}"
         )
+    for load in (load for load in spec.loads if not load.written):
+        yield f"the load '{load.label}' is no form and cannot be reduced, expected loads that are written as forms"
     known = {"displacement", "mean-displacement", "max-displacement", "reaction", "strain-energy", "volume-change"}
     known |= {"max-von-mises", "force", "contact-area"}
     for output in spec.outputs:

@@ -61,8 +61,9 @@ class Support:
 
     @property
     def _on_boundaries(self) -> list[tuple[int, Any]]:
-        """Loads that act on a boundary of the body, with their numbers."""
-        return [one for one in enumerate(self.loads) if getattr(one[1], "on", "") in self.body.boundaries]
+        """Loads that act on a boundary of the body, or on none, with their numbers."""
+        known = {None, *self.body.boundaries}
+        return [one for one in enumerate(self.loads) if getattr(one[1], "on", None) in known]
 
     def _gives_way(self, tool: Any) -> bool:
         """Whether the boundary that a tool may touch can move along its direction."""

@@ -30,6 +30,7 @@ from forward.findings import Finding
 from forward.registry import Kinds, OfKind
 from forward.scalars import Scalar, numbers
 from forward.settings import Named
+from forward.terms.acting import Acting
 from forward.words import settings
 
 
@@ -116,6 +117,7 @@ class Term(Named):
 
     of_density: ClassVar[bool] = False  # whether it depends on the density of the body, which may be a random field
     contact: ClassVar[bool] = False  # whether it acts only where the body touches it: load steps scale its `depth`
+    written: ClassVar[bool] = True  # whether it is written as forms, so that it can be enriched and reduced
 
     def potential(self, at: Place) -> Any | None:
         """Return its potential energy (J), as a form of UFL; None where it has none.
@@ -179,6 +181,18 @@ class Term(Named):
         """Whether it leaves the stiffness symmetric, as a potential does."""
         return type(self).potential is not Term.potential
 
+    @property
+    def remembers(self) -> bool:
+        """Whether it depends on what earlier steps left, as friction does."""
+        return self.contact and not self.symmetric
+
+    def acting(self, equations: Any) -> Acting:
+        """Return what it is on the nodes of a discrete body (`forward.fem.equations`); collective.
+
+        Only of loads that are not `written` as forms.
+        """
+        raise NotImplementedError
+
     def words(self, numbers: Mapping[str, str]) -> str:
         """Say what it is, for reports.
 
@@ -193,6 +207,26 @@ class Term(Named):
     def scalars(self) -> dict[str, Scalar]:
         """Its numbers that can be parameters, by their names: those of its fields."""
         return {name: Scalar(getattr(self, name), type(self), name) for name in numbers(type(self))}
+
+
+class Item(Term):
+    """A load that is no form: `acting` is defined by every kind (`forward.terms.acting`).
+
+    Its numbers are what they are at every fraction of the loads, which it is told. It acts on nodes of one mesh, so no
+    error of the mesh is estimated with it, and it cannot be reduced.
+    """
+
+    written: ClassVar[bool] = False
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether its stiffness is symmetric."""
+        return True
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it keeps something for the next step."""
+        return False
 
 
 LOADS = Kinds(

@@ -19,6 +19,7 @@ from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
 from forward.solvers.system import TIGHT
+from forward.terms.acting import Entries
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -50,6 +51,8 @@ class StiffnessMatrix:
         Expected size of its factor.
     blocked
         Whether the matrix is stored by blocks of the components, which takes half the memory and suits no factor.
+    items
+        What else acts: its entries by the rows (U_local,) of the matrix that the unknowns are.
 
     Attributes
     ----------
@@ -72,6 +75,7 @@ class StiffnessMatrix:
         symmetric: bool,
         expected: Factor,
         blocked: bool = False,
+        items: Callable[[NDArray[Any]], Entries] | None = None,
     ) -> None:
         # PETSc keeps what Python has dropped, such as factors of models that are gone, until all ranks destroy it here.
         PETSc.garbage_cleanup(comm)
@@ -82,11 +86,20 @@ class StiffnessMatrix:
         self.matrix = fem.petsc.create_matrix(form, *(["baij"] if blocked else []))
         if symmetric:
             self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._items = items
+        if items is not None:  # whose entries have no room yet: the first assembly makes it
+            self.matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+            self._numbers = unknowns.take(np.arange(*self.matrix.getOwnershipRange(), dtype=float))
 
     def assemble(self) -> None:
         """Assemble at the state that is set."""
         self.matrix.zeroEntries()
         fem.petsc.assemble_matrix(self.matrix, self._form, bcs=self._constraints)
+        if self._items is not None:
+            self.matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)  # between values that are set and those that are added
+            rows, columns, values = self._items(self._numbers)
+            each = np.arange(len(rows) + 1, dtype=np.int32)
+            self.matrix.setValuesIJV(each, columns.astype(np.int32), values, addv=True, rowmap=rows.astype(np.int32))
         self.matrix.assemble()
 
     def assembled(self) -> Any:

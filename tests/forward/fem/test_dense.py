@@ -12,26 +12,31 @@ from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
 
 pytestmark = pytest.mark.unit
-SIZE, SCALARS, FIELD, OUTPUTS = 6, 2, 3, 2
+SIZE, SCALARS, FIELD, OUTPUTS, KEPT = 6, 2, 3, 2, 3
+LEFT = SIZE + KEPT
 RNG = np.random.default_rng(8)
 
 
 class Equations:
-    """F(u_i, u_{i−1}, ω) = K_i u_i + C_i u_{i−1} − R_i ω_s + P_i ω_f, with two outputs g_i·u_i + h_i·u_{i−1} + p_i·ω.
+    """F(u_i, l_{i−1}, ω) = K_i u_i + C_i l_{i−1} − R_i ω_s + P_i ω_f, with two outputs g_i·u_i + h_i·l_{i−1} + p_i·ω.
 
-    One unknown is prescribed: its row is the identity, and nothing else moves it.
+    An increment leaves l_i = (u_i, A_i u_i + B_i l_{i−1} + D_i ω), where B_i meets what was kept alone. One unknown is
+    prescribed: its row is the identity, and nothing else moves it.
     """
 
     def __init__(self, increments):
-        self.size, self.fixed, self.scalars = SIZE, np.array([0]), np.arange(SCALARS)
+        self.size, self.size_before, self.fixed, self.scalars = SIZE, LEFT, np.array([0]), np.arange(SCALARS)
         self.parameters = tuple(f"p{i}" for i in range(SCALARS + FIELD))
         self.fields = (SimpleNamespace(),)
         n = (increments,)
         self.K = RNG.normal(size=(*n, SIZE, SIZE)) + 6 * np.eye(SIZE)
-        self.C = RNG.normal(size=(*n, SIZE, SIZE))
+        self.C = RNG.normal(size=(*n, SIZE, LEFT))
+        self.A, self.B = RNG.normal(size=(*n, KEPT, SIZE)), RNG.normal(size=(*n, KEPT, LEFT))
+        self.B[:, :, :SIZE] = 0
+        self.D = RNG.normal(size=(*n, KEPT, SCALARS + FIELD))
         self.R = RNG.normal(size=(*n, SCALARS, SIZE))
         self.P = RNG.normal(size=(*n, FIELD, SIZE))
-        self.g, self.h = RNG.normal(size=(2, *n, OUTPUTS, SIZE))
+        self.g, self.h = RNG.normal(size=(*n, OUTPUTS, SIZE)), RNG.normal(size=(*n, OUTPUTS, LEFT))
         self.p = RNG.normal(size=(*n, OUTPUTS, SCALARS + FIELD))
         self.K[:, 0, :], self.K[:, :, 0] = 0, 0
         self.K[:, 0, 0] = 1
@@ -66,6 +71,14 @@ class Equations:
         C = self.C[self.at]
         return C.T @ row if transpose else C @ row
 
+    def left(self, states, before, directions):
+        i = self.at
+        return np.hstack([states, states @ self.A[i].T + before @ self.B[i].T + directions @ self.D[i].T])
+
+    def left_adjoint(self, weights):
+        i, kept = self.at, weights[:, SIZE:]
+        return weights[:, :SIZE] + kept @ self.A[i], kept @ self.B[i], kept @ self.D[i]
+
     def back_substitute(self, right, *, transpose=False):
         K = self.K[self.at]
         return np.linalg.solve(K.T if transpose else K, right.T).T
@@ -92,21 +105,22 @@ def functionals(equations):
 def exact(equations, steps):
     """Derivatives (m, d) of all outputs: the equations of all increments as one dense system."""
     n = len(equations.K)
-    whole = np.zeros((n * SIZE, n * SIZE))
-    right = np.zeros((n * SIZE, SCALARS + FIELD))
+    whole = np.zeros((n * LEFT, n * LEFT))
+    right = np.zeros((n * LEFT, SCALARS + FIELD))
     for i in range(n):
-        here = slice(i * SIZE, (i + 1) * SIZE)
-        whole[here, here] = equations.K[i]
+        here, kept = slice(i * LEFT, i * LEFT + SIZE), slice(i * LEFT + SIZE, (i + 1) * LEFT)
+        whole[here, here], whole[kept, here], whole[kept, kept] = equations.K[i], -equations.A[i], np.eye(KEPT)
         if i:
             free = equations.C[i].copy()
             free[0] = 0
-            whole[here, (i - 1) * SIZE : i * SIZE] = free
-        right[here] = np.column_stack([equations.R[i].T, -equations.P[i].T])
-    du = np.linalg.solve(whole, right).reshape(n, SIZE, -1)
+            before = slice((i - 1) * LEFT, i * LEFT)
+            whole[here, before], whole[kept, before] = free, -equations.B[i]
+        right[here], right[kept] = np.column_stack([equations.R[i].T, -equations.P[i].T]), equations.D[i]
+    left = np.linalg.solve(whole, right).reshape(n, LEFT, -1)
     rows = []
     for i in steps:
-        before = equations.h[i] @ du[i - 1] if i else 0.0
-        rows.append(equations.g[i] @ du[i] + before + equations.p[i])
+        before = equations.h[i] @ left[i - 1] if i else 0.0
+        rows.append(equations.g[i] @ left[i, :SIZE] + before + equations.p[i])
     return np.concatenate(rows)
 
 
