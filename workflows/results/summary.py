@@ -26,6 +26,13 @@ OTHER_ESTIMATES = (
 )
 # Of these, what is not estimated of every output.
 NOT_OF_ALL = {part(name, which) for name in ESTIMATED for which in (*OF_MESH, "total")}
+# Of outputs that were not measured: bands by the posterior and the prior, and errors of the mesh.
+BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")
+PREDICTED = {
+    **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
+    "share": "prediction_share",
+    part("", "mesh"): part("prediction_mean", "mesh"),
+}
 
 
 def summarise(dataset: xr.Dataset) -> Part:
@@ -43,9 +50,38 @@ def summarise(dataset: xr.Dataset) -> Part:
 
 
 def _inversion(dataset: xr.Dataset) -> Part:
-    from workflows.studies.inversion_results import summary
+    """Return what is known of each data set; of a single one at the top level too."""
+    sets = {str(name): _data_set(dataset.sel(data_set=name)) for name in dataset.data_set.values}
+    only = next(iter(sets.values())) if len(sets) == 1 else {}
+    shared = int(np.nanmax(dataset["expansion_solves"])) if "expansion_solves" in dataset else 0
+    return {**only, "solves": int(np.nansum(dataset["solves"])) + shared, "data_sets": sets}
 
-    return summary(dataset)
+
+def _data_set(found: xr.Dataset) -> Part:
+    from inverse.methods.record import SOURCES, TRUST
+
+    if not bool(found["ok"]):
+        return {"failed": str(found["why"].item())}
+    checked = "mesh_checked" in found
+    keys = ("mode", "std", "lower", "upper", *(("mesh_shift", "mesh_left") if checked else ()))
+    numbers = ("log_evidence", "log_evidence_error", "determined", "residual_probability")
+    return {
+        "posterior": _by("parameter", found, {key: key for key in keys}),
+        **{key: _number(found[key]) for key in numbers},
+        **({"mesh": of_meshes(found)} if checked else {}),
+        **({"predictions": _by("goal", found, PREDICTED)} if "goal" in found.coords else {}),
+        **({"source": SOURCES[int(found["source"])]} if "source" in found else {}),
+        "trust": (*TRUST, "doubtful")[int(found["trust"])],
+        "verdict": str(found["why"].item()),
+    }
+
+
+def of_meshes(found: xr.Dataset) -> Part:
+    """What finer meshes said: the error over the noise (root mean square), whether it is corrected, and solves."""
+    error = found["mesh_error"].to_numpy()
+    size = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+    corrected, solves = bool(found["mesh_corrected"] == 1), found["mesh_solves"]
+    return {"error": _number(size), "corrected": corrected, "solves": int(solves) if np.isfinite(solves) else 0}
 
 
 def _synthetic(dataset: xr.Dataset) -> Part:
@@ -87,13 +123,8 @@ def against_random(design: Mapping[str, Any]) -> str:
 def _comparison(dataset: xr.Dataset) -> Part:
     shown = ("log_evidence", "log_evidence_error", "probability", *(("stacking",) if "stacking" in dataset else ()))
     trusted = dataset["trusted"].all("group")
-    return {
-        "models": {
-            str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
-            | {"trusted": bool(trusted.sel(model=model))}
-            for model in dataset.model.values
-        }
-    }
+    models = _by("model", dataset, {name: name for name in shown})
+    return {"models": {name: one | {"trusted": bool(trusted.sel(model=name))} for name, one in models.items()}}
 
 
 def _moments(dataset: xr.Dataset) -> Part:
@@ -124,6 +155,12 @@ def _nested(labels: Sequence[tuple[str, Sequence[str]]], values: Mapping[str, Fl
         for i, name in enumerate(names)
         if dimension != "partner" or name != above
     }
+
+
+def _by(dimension: str, found: xr.Dataset, names: Mapping[str, str]) -> Any:
+    """Return variables of one dimension, by its labels and then by short names."""
+    labels = [str(name) for name in found[dimension].values]
+    return _nested([(dimension, labels)], {short: found[name].to_numpy() for short, name in names.items()})
 
 
 def _methods(dataset: xr.Dataset) -> Part:

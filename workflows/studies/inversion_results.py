@@ -1,4 +1,4 @@
-"""Results of inversions: the dataset of all data sets, summary.json, batch.csv, ArviZ's groups."""
+"""Results of inversions: the dataset of all data sets, batch.csv, ArviZ's groups."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from forward.bodies.inclusions import derived, log_factor
 from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.record import COLUMNS, ENDS, SOURCES, TRUST, stacked, usual_sizes
-from uq.estimators.estimate import part
+from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
 from workflows.config.priors import admissible
+from workflows.results.summary import of_meshes
 from workflows.studies.findings_inversion import judged
 
 if TYPE_CHECKING:
@@ -193,61 +193,6 @@ def _true_at(study: Inversion, measurement: Measurements | None, places: FloatAr
     return np.full(len(places), np.nan)
 
 
-def summary(found: xr.Dataset) -> dict[str, Any]:
-    """Return the part of summary.json that follows from the results; a single data set's is also at the top level."""
-    sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
-    only = next(iter(sets.values())) if len(sets) == 1 else {}
-    shared = int(np.nanmax(found["expansion_solves"])) if "expansion_solves" in found else 0
-    return {**only, "solves": int(np.nansum(found["solves"])) + shared, "data_sets": sets}
-
-
-def _one(found: xr.Dataset) -> dict[str, Any]:
-    if not bool(found["ok"]):
-        return {"failed": str(found["why"].item())}
-    numbers = (*EVIDENCE, "residual_probability")
-    keys = ("mode", "std", "lower", "upper", *(("mesh_shift", "mesh_left") if "mesh_checked" in found else ()))
-    return {
-        "posterior": {
-            str(name): {key: _number(found[key].sel(parameter=name)) for key in keys} for name in found.parameter.values
-        },
-        **{key: _number(found[key]) for key in numbers},
-        **({"mesh": _mesh(found)} if "mesh_checked" in found else {}),
-        **({"predictions": of_predictions(found)} if "goal" in found.coords else {}),
-        **({"source": SOURCES[int(found["source"])]} if "source" in found else {}),
-        "trust": (*TRUST, "doubtful")[int(found["trust"])],
-        "verdict": str(found["why"].item()),
-    }
-
-
-BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")
-OF_PREDICTIONS = {
-    **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
-    "share": "prediction_share",
-    part("", "mesh"): part("prediction_mean", "mesh"),
-}
-
-
-def of_predictions(found: xr.Dataset) -> dict[str, Any]:
-    """What is predicted from a data set: bands by the posterior and the prior, and errors of the mesh."""
-    return {
-        str(goal): {short: _number(found[name].sel(goal=goal)) for short, name in OF_PREDICTIONS.items()}
-        for goal in found["goal"].values
-    }
-
-
-def _mesh(found: xr.Dataset) -> dict[str, Any]:
-    """What finer meshes said: the error over the noise (root mean square), whether it is corrected, and solves."""
-    error = found["mesh_error"].to_numpy()
-    size = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
-    corrected, solves = bool(found["mesh_corrected"] == 1), found["mesh_solves"]
-    return {"error": _number(size), "corrected": corrected, "solves": int(solves) if np.isfinite(solves) else 0}
-
-
-def _number(value: Any) -> float | None:
-    number = float(value)
-    return number if np.isfinite(number) else None
-
-
 STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
 EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
 NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
@@ -287,7 +232,7 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     }
     if "mesh_checked" not in one or one["mesh_checked"] != 1:  # finer meshes said nothing
         return row
-    error, shifts = _mesh(one)["error"], zip(names, one["mesh_shift"].to_numpy(), strict=True)
+    error, shifts = of_meshes(one)["error"], zip(names, one["mesh_shift"].to_numpy(), strict=True)
     row |= {"mesh_error": "" if error is None else f"{error:.4g}"}
     row |= {"mesh_corrected": "yes" if one["mesh_corrected"] == 1 else "no"}
     return row | {f"{name} mesh_shift": f"{shift:.4g}" for name, shift in shifts if np.isfinite(shift)}
