@@ -121,8 +121,7 @@ def _run(
             return None
         case "hmc":
             if model is None:
-                message = "chains = 'hmc' follow the gradients of a model itself, which is not given"
-                raise ValueError(message)
+                raise ValueError("chains = 'hmc' follow the gradients of a model itself, which is not given")
             return gradient_chains(posterior, gaussian, model, seed=seed)
         case "emcee":
             return ensemble(posterior, gaussian, seed=seed)

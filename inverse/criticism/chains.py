@@ -305,8 +305,7 @@ def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = 
     try:
         import emcee
     except ImportError:
-        message = "an ensemble needs emcee, which is not installed: pip install emcee"
-        raise ImportError(message) from None
+        raise ImportError("an ensemble needs emcee, which is not installed: pip install emcee") from None
     c = len(gaussian.mode)
     long = walkers(c) if lengths is None else lengths
     count = long.chains

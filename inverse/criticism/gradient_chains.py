@@ -219,6 +219,5 @@ def _mici() -> Any:
     try:
         import mici
     except ImportError:
-        message = "chains that follow gradients need mici, which is not installed: pip install mici"
-        raise ImportError(message) from None
+        raise ImportError("chains that follow gradients need mici, which is not installed: pip install mici") from None
     return mici

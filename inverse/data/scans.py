@@ -155,11 +155,10 @@ class Scan(Reading):
     @model_validator(mode="after")
     def _check_files(self) -> Scan:
         if (self.file is None) != bool(self.deformed) or (self.reference is None) == bool(self.deformed):
-            message = (
+            raise ValueError(
                 "expected either file, or reference and deformed: surfaces without a common numbering do not say where "
                 "a point has gone"
             )
-            raise ValueError(message)
         return self
 
 

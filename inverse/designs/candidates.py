@@ -124,8 +124,7 @@ class Candidates:
         for pattern, value in given.items():
             mine = np.array([fnmatchcase(name, pattern) for name in self.names], dtype=bool)
             if not mine.any():
-                message = f"'{pattern}' is the name of no candidate, such as {', '.join(self.names[:3])}"
-                raise ValueError(message)
+                raise ValueError(f"'{pattern}' is the name of no candidate, such as {', '.join(self.names[:3])}")
             found[mine] = value
         return found
 

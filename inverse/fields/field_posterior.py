@@ -92,11 +92,9 @@ class FieldPosterior:
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
         if self.data.shape != (n,) or self.sigma.shape != (n,):
-            message = f"{self.data.size} data and {self.sigma.size} standard deviations, expected {n} of each"
-            raise ValueError(message)
+            raise ValueError(f"{self.data.size} data and {self.sigma.size} standard deviations, expected {n} of each")
         if not (self.sigma > 0).all():
-            message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
-            raise ValueError(message)
+            raise ValueError(f"standard deviation of the errors {self.sigma.min():g}, expected positive ones")
         if not self.measured.any():
             raise ValueError("all data are NaN, expected at least one number")
 

@@ -94,8 +94,7 @@ def infer_noise(
     """
     factor = float(prior.from_normal(np.zeros(1))[0][0])
     if factor <= 0:
-        message = f"the median of the prior of the noise is {factor:g}, expected a positive one"
-        raise ValueError(message)
+        raise ValueError(f"the median of the prior of the noise is {factor:g}, expected a positive one")
     rounds: list[float] = []
     for _ in range(ROUNDS):
         scaled = replace(posterior, sigma=factor * posterior.sigma)

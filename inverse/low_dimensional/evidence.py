@@ -121,8 +121,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         If the model has no answer at any of the points.
     """
     if samples < LEAST:
-        message = f"{samples} samples, expected at least {LEAST}"
-        raise ValueError(message)
+        raise ValueError(f"{samples} samples, expected at least {LEAST}")
     quarter = samples // LEAST * SCRAMBLES
     opening = first(gaussian)
     derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
@@ -179,8 +178,7 @@ def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -
     """Estimate from weights (n,) whose eight parts, in order, are independent replicates."""
     shift = log_weights.max()
     if not np.isfinite(shift):
-        message = "the model has no answer at any of the points drawn for the evidence"
-        raise SolveError(message)
+        raise SolveError("the model has no answer at any of the points drawn for the evidence")
     w = np.exp(log_weights - shift)
     means = w.reshape(SCRAMBLES, -1).mean(axis=1)
     total = float(means.mean())
@@ -258,8 +256,7 @@ def _by_surrogate(
     """
     d, parts, errors = len(posterior.inputs.names), list(pilot), []
     if not affordable(d):
-        message = f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted"
-        raise SolveError(message)
+        raise SolveError(f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted")
     for k in range(1, QUARTERS):
         cloud = sample(fit(posterior, Density.joined([part.density for part in parts])), gaussian, seed + 100 * k)
         picked = posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1)
@@ -267,8 +264,7 @@ def _by_surrogate(
         errors.append(cloud.error)
         found = _weighted(parts, "surrogate", why)
         if k == 1 and found.ess < otherwise * len(found.log_weights):
-            message = f"a polynomial makes them worth {found.ess:.0f} of {len(found.log_weights)}"
-            raise SolveError(message)
+            raise SolveError(f"a polynomial makes them worth {found.ess:.0f} of {len(found.log_weights)}")
     # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density with a
     # wrong factor makes its share of the mixture wrong by that factor.
     scatter = max(found.error, np.sqrt(max(1 / found.ess - 1 / len(found.log_weights), 0.0)))

@@ -131,8 +131,7 @@ def laplace(
         if found is not None:
             ends.append(found)
     if not ends:
-        message = f"the model has no answer at any of the {starts} starts of the search for the mode"
-        raise SolveError(message)
+        raise SolveError(f"the model has no answer at any of the {starts} starts of the search for the mode")
     values = np.array([float(end.log_posterior[0]) for end in ends])
     best = int(values.argmax())
     here = ends[best]

@@ -141,8 +141,7 @@ class Posterior:
             message = f"{self.data.size} data with {self.sigma.size} standard deviations, expected equal numbers"
             raise ValueError(message)
         if not (self.sigma > 0).all():
-            message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
-            raise ValueError(message)
+            raise ValueError(f"standard deviation of the errors {self.sigma.min():g}, expected positive ones")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -125,8 +125,7 @@ def fit(posterior: Posterior, solved: Density) -> Posterior:
     good = np.isfinite(solved.log_likelihood)
     n, d = int(good.sum()), len(posterior.inputs.names)
     if n < 2 * FOLDS:
-        message = f"{n} points have an answer, too few for a polynomial"
-        raise SolveError(message)
+        raise SolveError(f"{n} points have an answer, too few for a polynomial")
     weights = _tempered(solved.log_posterior[good], NEAR * n)
     x, outputs = solved.x[good, :d], solved.everything[good]
     slopes = posterior.inputs.from_normals(x)[1]

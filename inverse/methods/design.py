@@ -105,8 +105,7 @@ class Design(Settings):
             raise ValueError("expected number, how many observations, or budget, what they may cost")
         if (self.criterion == "predictions") != bool(self.goals):
             wanted = "the names of values that are predicted" if not self.goals else "criterion = 'predictions'"
-            message = f"criterion = '{self.criterion}' with goals = {list(self.goals)}, expected {wanted}"
-            raise ValueError(message)
+            raise ValueError(f"criterion = '{self.criterion}' with goals = {list(self.goals)}, expected {wanted}")
         return self
 
     @property
@@ -142,8 +141,7 @@ class Design(Settings):
         found = evaluate(Request(points, tangents=True))
         ok = found.ok
         if not ok.any():
-            message = f"the model has no answer at any of the {len(ok)} draws: {found.failures[0].reason}"
-            raise SolveError(message)
+            raise SolveError(f"the model has no answer at any of the {len(ok)} draws: {found.failures[0].reason}")
         assert found.tangents is not None
         mesh = self._mesh_errors(inputs, of_mesh) if self.mesh_error and of_mesh is not None else None
         sigma = self._with_mesh(self.sigma(values, found.outputs[ok]), mesh)
@@ -221,8 +219,7 @@ class Design(Settings):
             As `run`.
         """
         for name, message, _ in self.mistakes(values):
-            text = f"method.{name}: {message}"
-            raise ModelError(text)
+            raise ModelError(f"method.{name}: {message}")
         goals = self._goals(values)
         found = Candidates.of(values, self.each, goals)
         return found, goals, found.numbers(self.costs)
@@ -270,8 +267,7 @@ class Design(Settings):
         found = np.array([size * one.relative if one.relative is not None else one.absolute for one, size in pairs])
         if not (found > 0).all():
             name = values.names[int(np.argmin(found))]
-            message = f"errors relative to {name}, which is zero at all draws, expected absolute ones"
-            raise ModelError(message)
+            raise ModelError(f"errors relative to {name}, which is zero at all draws, expected absolute ones")
         return found
 
     def run_models(

@@ -106,8 +106,7 @@ class Invert(MeshTreatment, Settings):
     @model_validator(mode="after")
     def _check(self) -> Invert:
         if self.samples is not None and 0 < self.samples < LEAST:
-            message = f"samples = {self.samples}, expected at least {LEAST}"
-            raise ValueError(message)
+            raise ValueError(f"samples = {self.samples}, expected at least {LEAST}")
         return self
 
     def solves(self, size: int, *, field: bool) -> int:
@@ -137,8 +136,7 @@ def derivable(model: ForwardModel, kind: str) -> None:
         If it has none.
     """
     if not model.differentiable:
-        message = (
+        raise ModelError(
             f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "
             "found: expected a jacobian of the Python function, or a server that has ApplyJacobian or Gradient"
         )
-        raise ModelError(message)

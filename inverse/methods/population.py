@@ -228,29 +228,24 @@ class Columns:
         for name, given in covariates.items():
             for one in given:
                 if one not in specimens:
-                    message = f"covariates.{name}: '{one}' is not a specimen; {nearest(one, list(specimens))}"
-                    raise ValueError(message)
+                    raise ValueError(f"covariates.{name}: '{one}' is not a specimen; {nearest(one, list(specimens))}")
             missing = [one for one in specimens if one not in given]
             if missing:
-                message = f"covariates.{name}: nothing is said of {', '.join(missing)}, expected all specimens"
-                raise ValueError(message)
+                raise ValueError(f"covariates.{name}: nothing is said of {', '.join(missing)}, expected all specimens")
             values = [given[one] for one in specimens]
             texts = {value for value in values if isinstance(value, str)}
             if texts and len(texts) < len(set(values)):
-                message = f"covariates.{name}: numbers and words, expected either"
-                raise ValueError(message)
+                raise ValueError(f"covariates.{name}: numbers and words, expected either")
             if len(set(values)) == 1:
-                message = f"covariates.{name}: the same for all specimens, which says nothing on them"
-                raise ValueError(message)
+                raise ValueError(f"covariates.{name}: the same for all specimens, which says nothing on them")
             for word in sorted(texts)[1:] if texts else [None]:
                 words.append((name, word))
                 columns.append([float(value if word is None else value == word) for value in values])
         q = len(columns)
         if q > len(specimens) - 2:
-            message = (
+            raise ValueError(
                 f"covariates: {q} numbers to find for each parameter from {len(specimens)} specimens, expected fewer"
             )
-            raise ValueError(message)
         table = np.array(columns).reshape(q, len(specimens)).T
         names = tuple(name if word is None else f"{name} = {word}" for name, word in words)
         return cls(names, table - table.mean(axis=0), table.mean(axis=0), tuple(words))
@@ -260,8 +255,7 @@ class Columns:
         known = {name for name, _ in self.words}
         for name in given:
             if name not in known:
-                message = f"new: '{name}' is not a covariate; {nearest(name, sorted(known))}"
-                raise ValueError(message)
+                raise ValueError(f"new: '{name}' is not a covariate; {nearest(name, sorted(known))}")
         row = np.zeros(len(self.names))
         for k, (name, word) in enumerate(self.words):
             if name not in given:
@@ -269,8 +263,7 @@ class Columns:
             value = given[name]
             if isinstance(value, str) == (word is None):
                 wanted = "a number" if word is None else "a word"
-                message = f"new: {name} is {value!r}, expected {wanted}, as of the specimens"
-                raise ValueError(message)
+                raise ValueError(f"new: {name} is {value!r}, expected {wanted}, as of the specimens")
             row[k] = (float(value) if word is None else float(value == word)) - self.means[k]
         return row
 
@@ -297,16 +290,14 @@ class Scale:
         """Return that of a distribution; errors as in `Population.run`."""
         names = prior_names(posteriors)
         if len(posteriors) < 2:
-            message = f"has {len(posteriors)} specimen, expected at least 2"
-            raise ValueError(message)
+            raise ValueError(f"has {len(posteriors)} specimen, expected at least 2")
         if distribution == "normal":
             return cls(False, np.ones(len(names)))
         every = np.concatenate([one.values[one.weights > 0] for one in posteriors.values()])
         positive, negative = (every > 0).all(axis=0), (every < 0).all(axis=0)
         for name, one in zip(names, positive | negative, strict=True):
             if not one:
-                message = f"'{name}' has draws of both signs, or zero: expected distribution = 'normal'"
-                raise ValueError(message)
+                raise ValueError(f"'{name}' has draws of both signs, or zero: expected distribution = 'normal'")
         return cls(True, np.where(positive, 1.0, -1.0))
 
     def to(self, values: FloatArray) -> FloatArray:

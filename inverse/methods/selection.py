@@ -78,8 +78,7 @@ class Noise(Settings):
             return data.sigma
         sigma = np.maximum(self.relative * np.abs(data.values), self.absolute)
         if not (sigma > 0).all():
-            message = "relative noise vanishes where a datum is zero, expected a floor: absolute = ..."
-            raise ValueError(message)
+            raise ValueError("relative noise vanishes where a datum is zero, expected a floor: absolute = ...")
         return sigma
 
 
@@ -124,8 +123,7 @@ class Select(Settings):
     def _check(self) -> Select:
         names = [STATED, *self.other_noises, *self.subsets]
         if len(set(names)) < len(names):
-            message = f"other_noises and subsets: names {', '.join(names)}, expected different ones"
-            raise ValueError(message)
+            raise ValueError(f"other_noises and subsets: names {', '.join(names)}, expected different ones")
         return self
 
     @property
@@ -349,5 +347,4 @@ def _of(pair: tuple[str, str]) -> Iterator[None]:
     try:
         yield
     except SolveError as error:
-        message = f"candidate '{pair[0]}': {error.reason}"
-        raise SolveError(message, error.history) from None
+        raise SolveError(f"candidate '{pair[0]}': {error.reason}", error.history) from None

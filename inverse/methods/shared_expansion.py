@@ -174,8 +174,7 @@ def _fitted(
 ) -> tuple[_Expansion, FloatArray]:
     """Expand values (n, m) with tangents (n, m, d); its errors (m,) at samples that are left out."""
     if len(points) < LEAST_SHARED:
-        message = f"{len(points)} points have an answer, too few for an expansion that the data sets share"
-        raise SolveError(message)
+        raise SolveError(f"{len(points)} points have an answer, too few for an expansion that the data sets share")
     found = Regression.of(inputs, points, values, tangents, ORDER)
     seen = inputs.coordinates.of(points)
     low, high = seen.min(axis=0), seen.max(axis=0)

@@ -37,8 +37,7 @@ class SyntheticNoise(Settings):
     @model_validator(mode="after")
     def _check(self) -> SyntheticNoise:
         if (self.relative is None) == (self.absolute is None):
-            message = "expected either relative or absolute"
-            raise ValueError(message)
+            raise ValueError("expected either relative or absolute")
         return self
 
 
@@ -122,8 +121,7 @@ class Synthesize(Settings):
         truths = self.truths(inputs)
         found = evaluate(Request(truths))
         for failure in found.failures:
-            message = f"data set {failure.index}: {failure.reason}"
-            raise SolveError(message, failure.history)
+            raise SolveError(f"data set {failure.index}: {failure.reason}", failure.history)
         sigma = np.empty((count, m))
         for case in np.unique(cases):
             of_case = cases == case

@@ -135,8 +135,7 @@ def job_of_models(
             of = cast("SpecimenModel", model)
             return cast("SpecimenModel", other).observing(of.places, of.axes.tolist(), of.cases.tolist())
         if other.outputs != model.outputs:
-            message = f"{name} gives {', '.join(other.outputs[:3])}, …, expected the outputs of {first}"
-            raise ModelError(message)
+            raise ModelError(f"{name} gives {', '.join(other.outputs[:3])}, …, expected the outputs of {first}")
         return other
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -179,8 +178,7 @@ def _of_field(
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         found = [one.dataset for one in outcomes if one.dataset is not None]
         if not found:
-            message = f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}"
-            raise SolveError(message)
+            raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
         return method.of_fields(found, values)
 
     return TasksJob(

@@ -167,8 +167,7 @@ def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
         blocks["method"] = {key: value for key, value in blocks["method"].items() if key != "check"} | once
     else:
         if set(parameters) != set(blocks.get("parameters", {})):
-            message = "random fields are among the unknowns, whose distribution is that of the model"
-            raise ValueError(message)
+            raise ValueError("random fields are among the unknowns, whose distribution is that of the model")
         path = _file(blocks["data"], specimen, folder)
         data = {key: value for key, value in blocks["data"].items() if key not in {"files", "sets"}}
         blocks |= known | {"data": {**data, "files": [str(path)]}}
@@ -182,19 +181,16 @@ def _file(data: dict[str, Any], specimen: str, folder: Path) -> Path:
     known = {one["name"]: one for one in data.get("sets", [])}
     where = "expected method.study, the file of the study that the source is of"
     if specimen not in known:
-        message = f"the data of {specimen} are in no file"
-        raise ValueError(message)
+        raise ValueError(f"the data of {specimen} are in no file")
     try:
         paths = files(data["files"], [folder, Path()])
     except DataError:
         paths = []
     path = dict(zip(distinct(paths), paths, strict=True)).get(specimen)
     if path is None or not path.is_file():
-        message = f"{known[specimen]['file']} is not in {folder} or here, {where}"
-        raise ValueError(message)
+        raise ValueError(f"{known[specimen]['file']} is not in {folder} or here, {where}")
     if digest_of_file(path) != known[specimen]["digest"]:
-        message = f"{path} has changed since {specimen} was inverted"
-        raise ValueError(message)
+        raise ValueError(f"{path} has changed since {specimen} was inverted")
     return path.resolve()
 
 

@@ -58,12 +58,10 @@ def read(file: str, group: str | None, model: str | None) -> Draws:
             raise ValueError(message)
         for what, value in (("group", group), ("model", model)):
             if value is not None:
-                message = f"{what} = '{value}', but {path.name} is a table of draws, which has no {what}s"
-                raise ValueError(message)
+                raise ValueError(f"{what} = '{value}', but {path.name} is a table of draws, which has no {what}s")
         return of_table(path, sha256(path.read_bytes()).hexdigest()[:LETTERS])
     except OSError as error:
-        message = f"{path}: cannot be read: {error.strerror or error}"
-        raise ValueError(message) from None
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 def to_file(draws: Draws) -> bytes:
@@ -86,8 +84,7 @@ def _kept(path: Path) -> Draws:
             names, digest = tuple(map(str, found["names"])), str(found["digest"])
             return Draws(names, found["values"], found["weights"], float(found["effective"]), digest)
     except (OSError, KeyError, ValueError) as error:
-        message = f"{path}: cannot be read: {error}"
-        raise ValueError(message) from None
+        raise ValueError(f"{path}: cannot be read: {error}") from None
 
 
 # --- results of tissuq ---------------------------------------------------------------------------------------------
@@ -161,21 +158,18 @@ class Left:
         """Return the draws of a posterior."""
         if self.kind not in READERS:
             known = f"expected one of: {', '.join(READERS)}"
-            message = f"{self.path}: is a study of kind '{self.kind}', which has no posterior, {known}"
-            raise ValueError(message)
+            raise ValueError(f"{self.path}: is a study of kind '{self.kind}', which has no posterior, {known}")
         try:
             return replace(READERS[self.kind](self.path, self.found, group, model), digest=self.digest)
         except KeyError as error:
-            message = (
+            raise ValueError(
                 f"{self.path}: its results.nc has no {error}, expected one that this version has made: run it again"
-            )
-            raise ValueError(message) from None
+            ) from None
 
     def specimens(self, model: str | None) -> dict[str, Draws]:
         """Return the posteriors of the groups of a comparison, or of the data sets of a batch, by their names."""
         if self.kind not in ("select", "invert"):
-            message = f"{self.path}: is a study of kind '{self.kind}', expected 'select' or 'invert'"
-            raise ValueError(message)
+            raise ValueError(f"{self.path}: is a study of kind '{self.kind}', expected 'select' or 'invert'")
         names = _texts(self.found, "group" if self.kind == "select" else "data_set")
         done = np.atleast_1d(self.found["ok"]).astype(bool) if self.kind == "invert" else [True] * len(names)
         return {name: self.draws(name, model) for name, one in zip(names, done, strict=True) if one}
@@ -187,12 +181,10 @@ def _texts(found: Arrays, name: str) -> list[str]:
 
 def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> int:
     if given is None and len(known) > 1:
-        message = f"{path}: has several {what}s, expected {what} = one of: {', '.join(known)}"
-        raise ValueError(message)
+        raise ValueError(f"{path}: has several {what}s, expected {what} = one of: {', '.join(known)}")
     if given is not None and given not in known:
         words = [*known, BEST, AVERAGED, STACKED] if what == "model" else list(known)
-        message = f"{what} = '{given}' is not in {path}; {nearest(given, words)}"
-        raise ValueError(message)
+        raise ValueError(f"{what} = '{given}' is not in {path}; {nearest(given, words)}")
     return 0 if given is None else known.index(given)
 
 
@@ -212,16 +204,14 @@ def _selected(path: Path, found: Arrays, group: str | None, model: str | None) -
     weights, values = np.nan_to_num(found["point_weight"][k, g]), found["point"][k, g]
     here, some = np.isfinite(values).any(axis=0), weights > 0
     if not some.any() or not (here & (parameters != NOISE)).any():
-        message = f"{path}: candidate '{models[k]}' has no draws, as its evidence was not found"
-        raise ValueError(message)
+        raise ValueError(f"{path}: candidate '{models[k]}' has no draws, as its evidence was not found")
     return _drawn(parameters[here].tolist(), values[some][:, here], weights[some])
 
 
 def _inverted(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
     """Weighted points of the posterior of one data set; its draws in results that have none."""
     if model is not None:
-        message = f"model = '{model}', but {path} is an inversion, which has one model"
-        raise ValueError(message)
+        raise ValueError(f"model = '{model}', but {path} is an inversion, which has one model")
     if "draw" not in found:
         message = f"{path}: is an inversion of a field, which has no draws of numbers, expected one with few parameters"
         raise ValueError(message)
@@ -230,8 +220,7 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None) -
     weights = np.nan_to_num(found["point_weight"][k]) if "point" in found else np.ones(len(values))
     whole = np.isfinite(values).all(axis=1) & (weights > 0)
     if not whole.any() or not bool(np.atleast_1d(found["ok"])[k]):
-        message = f"{path}: has no draws of that data set, which could not be inverted"
-        raise ValueError(message)
+        raise ValueError(f"{path}: has no draws of that data set, which could not be inverted")
     chains = int(np.nan_to_num(np.atleast_1d(found["chains"])[k])) if "chains" in found else 0
     worth = float(np.atleast_1d(found["chain_effective" if chains else "effective"])[k])
     return _drawn(_texts(found, "parameter"), values[whole], weights[whole], worth if worth > 0 else np.inf)
@@ -240,8 +229,7 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None) -
 def _of_population(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
     """Draws of a new specimen or, with its name, of one of the population."""
     if model is not None:
-        message = f"model = '{model}', but {path} is a population, which has one model"
-        raise ValueError(message)
+        raise ValueError(f"model = '{model}', but {path} is a population, which has one model")
     values = np.asarray(found["population_draw"])
     if group is not None:
         values = np.asarray(found["specimen_draw"])[_chosen("group", group, _texts(found, "specimen"), path)]
@@ -277,13 +265,11 @@ def candidates(file: str, by: str) -> list[NamedCandidate]:
     """
     left = Left(file)
     if left.kind != "select":
-        message = (
+        raise ValueError(
             f"{left.path}: is a study of kind '{left.kind}', expected 'select' for model = 'averaged' or 'stacked'"
         )
-        raise ValueError(message)
     if by not in left.found:
-        message = f"{left.path}: has no weights of stacking, as it was made by an earlier version: run it again"
-        raise ValueError(message)
+        raise ValueError(f"{left.path}: has no weights of stacking, as it was made by an earlier version: run it again")
     shares = zip(left.found["model"], left.found[by], left.found[f"{by}_error"], strict=True)
     every = [NamedCandidate(str(m), float(p), float(e), left.material(str(m))) for m, p, e in shares]
     without = [one.name for one in every if "kind" not in one.material]

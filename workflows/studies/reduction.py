@@ -97,8 +97,7 @@ def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
     case = next((one for one in specimen.cases if one.name == method.get("case")), None)
     if case is None:
         known = ", ".join(one.name for one in specimen.cases)
-        message = f"method.case: one load case of a specimen is reduced at a time, expected one of: {known}"
-        raise StudyError(message)
+        raise StudyError(f"method.case: one load case of a specimen is reduced at a time, expected one of: {known}")
     body = specimen.loaded(case)
     acts = {*body.scalars, *body.coefficients}
     absent = set(specimen.scalars) - acts

@@ -120,8 +120,7 @@ class Reduce(Method):
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Refuse: states are needed, which an evaluation does not return."""
-        message = "method.kind = 'reduce' is run by a study of its own"
-        raise ValueError(message)
+        raise ValueError("method.kind = 'reduce' is run by a study of its own")
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of a model cannot be reduced."""
@@ -217,8 +216,7 @@ class _Making:
         first = method.snapshots - in_rounds
         snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
         if snapshots is None:
-            message = f"no snapshot has an answer: {self._lost[0]}"
-            raise SolveError(message)
+            raise SolveError(f"no snapshot has an answer: {self._lost[0]}")
         reduction = Reduction(self._model, inputs.mean, inputs.std)
         rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature, more=min(self._sizes.more, ENOUGH))
         seconds = 0.0

@@ -76,8 +76,7 @@ def _netcdf(path: Path) -> tuple[Columns, FloatArray | None]:
         try:
             found = variables(content, "posterior")[0]
         except OSError:
-            message = f"{path.name}: is no netCDF file"
-            raise ValueError(message) from None
+            raise ValueError(f"{path.name}: is no netCDF file") from None
     columns: Columns = {}
     chains = None
     for name, one in found.items():
@@ -96,8 +95,7 @@ def _netcdf(path: Path) -> tuple[Columns, FloatArray | None]:
         message = f"{path.name}: has no draws, expected a group 'posterior' with dimensions chain and draw, or columns"
         raise ValueError(message)
     if len({len(one) for one in columns.values()}) > 1:
-        message = f"{path.name}: its variables have different numbers of draws, expected the same of each"
-        raise ValueError(message)
+        raise ValueError(f"{path.name}: its variables have different numbers of draws, expected the same of each")
     return columns, chains
 
 
@@ -115,13 +113,11 @@ def _of_columns(name: str, columns: Columns, chains: FloatArray | None, digest: 
     """Draws from columns (N,), with the weights among them."""
     names = tuple(one for one in columns if not _beside(one))
     if not names:
-        message = f"{name}: has columns {', '.join(columns)}, expected one for each parameter"
-        raise ValueError(message)
+        raise ValueError(f"{name}: has columns {', '.join(columns)}, expected one for each parameter")
     values = np.column_stack([columns[one] for one in names])
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
-        message = f"{name}: draw {row + 1} of '{names[column]}' is {values[row, column]}, expected numbers"
-        raise ValueError(message)
+        raise ValueError(f"{name}: draw {row + 1} of '{names[column]}' is {values[row, column]}, expected numbers")
     weights = np.ones(len(values))
     for one in columns:
         if one.lower() in WEIGHTS:
@@ -129,8 +125,7 @@ def _of_columns(name: str, columns: Columns, chains: FloatArray | None, digest: 
         elif one.lower() in LOG_WEIGHTS:
             weights = np.exp(columns[one] - columns[one].max())
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
-        message = f"{name}: weights are negative, infinite or all zero, expected numbers ≥ 0"
-        raise ValueError(message)
+        raise ValueError(f"{name}: weights are negative, infinite or all zero, expected numbers ≥ 0")
     weights = weights / weights.sum()
     worth = 1 / float((weights**2).sum())
     if np.ptp(weights) == 0:
