@@ -7,14 +7,16 @@ for one of its data sets or groups of data, with a prior like the population.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from pydantic import field_validator
+
 from forward.findings import Finding
 from forward.model import SolveError
-from forward.registry import named
 from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.population import Columns, Population, Scale, prior_names
@@ -54,6 +56,14 @@ class PopulationStudy(FromPython, StudyKind):
     stopped: ClassVar[str] = "a population"
 
     method: Population
+
+    @field_validator("method")
+    @classmethod
+    def _begun(cls, method: Population) -> Population:
+        """Keep the hash of the source, where it can be read."""
+        with suppress(ValueError):  # `mistakes` says what is wrong with it
+            return method if method.digest else method.model_copy(update={"digest": Left(method.source).digest})
+        return method
 
     @cached_property
     def source(self) -> Left:
@@ -139,7 +149,6 @@ class PopulationStudy(FromPython, StudyKind):
         if method.digest and found != method.digest:
             message = f"has changed since the study was begun: hash {method.digest} → {found}"
             yield place, message, method.source
-        object.__setattr__(method, "digest", found)
 
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
@@ -274,9 +283,10 @@ def _prior(study: PopulationStudy, names: Sequence[str]) -> Inputs:
 def _source(study: PopulationStudy) -> StudyKind | None:
     """Return the study that the source is of; None where that is gone."""
     from workflows.config.study import parse
+    from workflows.run.own_code import make_visible
 
     try:
-        named("workflows.run.own_code:make_visible")(Path(study.method.source))
+        make_visible(Path(study.method.source))
         return parse(study.source.blocks, folder=Path(study.method.source))
     except (StudyError, ValueError, OSError):
         return None
