@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from inverse.methods.record import BAND, ENDS, Record
 from uq.estimators.estimate import part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from inverse.fields.low_rank import LowRankPosterior
     from uq.inputs.draws import Draws
 
-Record = dict[str, FloatArray | str]
-
-ENDS = (0.025, 0.975)  # of intervals
 Z = 1.959963984540054  # standard normal quantile of the upper end
 SPARE = 20.0  # solves that calibrating the error of the mesh may cost
 STREAM = 7  # of the normal numbers of pairs
@@ -72,8 +70,7 @@ class Band:
 
     def named(self, first: str) -> Record:
         """Return its numbers by their names in results."""
-        names = ("mean", "mean_error", "std", "std_error", "lower", "upper")
-        return {f"{first}{name}": getattr(self, name) for name in names}
+        return {f"{first}{name}": vars(self)[name] for name in BAND}
 
 
 def record(before: Band, after: Band, mesh_error: FloatArray, share: FloatArray | None = None) -> Record:

@@ -38,104 +38,50 @@ COLUMNS = {
     "parameters": ("start", "log_posterior", "decrement", "damping"),
     "field": ("misfit", "penalty", "gradient", "pairs", "products", "length", "solves"),
 }
+BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")  # of what is predicted
 Record = dict[str, FloatArray | str]
 
-DIMS: dict[str, tuple[str, ...]] = {
-    # of both
-    "mode": ("parameter",),
-    "mean": ("parameter",),
-    "std": ("parameter",),
-    "lower": ("parameter",),
-    "upper": ("parameter",),
-    "covariance": ("parameter", "partner"),
-    "log_evidence": (),
-    "log_evidence_error": (),
-    "laplace_log_evidence": (),
-    "effective": (),
-    "tail": (),
-    "chains": (),
-    "chain_rhat": (),
-    "chain_effective": (),
-    "converged": (),
-    "trust": (),
-    "source": (),
-    "why": (),
-    "solves": (),
-    "eigenvalue": ("direction",),
-    "determined": (),
-    "alone_eigenvalue": ("case", "direction"),
-    "alone_determined": ("case",),
-    "misfit": ("case",),
-    "misfit_degrees": ("case",),
-    "misfit_count": ("case",),
-    "residual_square": (),
-    "residual_degrees": (),
-    "residual_probability": (),
-    "agreement_probability": (),
-    "prior_square": (),
-    "prior_degrees": (),
-    "mesh_checked": (),
-    "mesh_why": (),
-    "mesh_error": ("datum",),
-    "mesh_shift": ("parameter",),
-    "mesh_left": ("parameter",),
-    "mesh_corrected": (),
-    "mesh_settled": (),
-    "mesh_solves": (),
-    "mesh_before": (),
-    "motion_eigenvalue": ("motion",),
-    "step": ("iteration", "column"),
-    "place": ("datum", "axis"),
-    "datum_axis": ("datum",),
-    "datum_direction": ("datum", "axis"),
-    "datum_case": ("datum",),
-    "measured": ("datum",),
-    "sigma": ("datum",),
-    "predicted": ("datum",),
-    "predicted_std": ("datum",),
-    "residual": ("datum",),
-    "resolution": ("datum",),
-    "stiffness_mode": ("node",),
-    "stiffness_mean": ("node",),
-    "stiffness_std": ("node",),
-    # of few parameters
-    "laplace_std": ("parameter",),
-    "direction_parameter": ("direction", "parameter"),
-    "together_std": ("parameter",),
-    "alone_std": ("case", "parameter"),
-    "start_mode": ("start", "parameter"),
-    "start_log_posterior": ("start",),
-    "zero_likelihood": (),
-    "expansion_error": (),
-    "expansion_solves": (),
-    "reduced_share": (),
-    "reduced_shift": ("parameter",),
-    "reduced_rounds": (),
-    "reduced_solves": (),
-    "point": ("point", "parameter"),
-    "point_weight": ("point",),
-    "draw": ("sample", "parameter"),
-    "draw_log_likelihood": ("sample", "datum"),
-    # of a field
-    "direction_stiffness": ("shown", "node"),
-    "shown_number": ("shown",),
-    "alone_stiffness_std": ("case", "node"),
-    "stiffness_mesh_shift": ("node",),
-    "stiffness_draw": ("sample", "node"),
-    "neglected": (),
-    "information": (),
-    "products": (),
-    # of what is predicted
-    **{
-        f"prediction_{name}": ("goal",)
-        for first in ("", "prior_")
-        for name in (f"{first}{end}" for end in ("mean", "mean_error", "std", "std_error", "lower", "upper"))
-    },
-    "prediction_share": ("goal",),
-    part("prediction_mean", "mesh"): ("goal",),
-    "prediction_solves": (),
-    "prediction_why": (),
+# What is found of a data set, by its dimensions: of both, of few parameters, of a field, of what is predicted.
+_NUMBERS = """
+    log_evidence log_evidence_error laplace_log_evidence effective tail chains chain_rhat chain_effective converged
+    trust source why solves determined residual_square residual_degrees residual_probability agreement_probability
+    prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
+    zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
+    neglected information products
+    prediction_solves prediction_why
+"""
+_ARRAYS = {
+    "parameter": "mode mean std lower upper mesh_shift mesh_left laplace_std together_std reduced_shift",
+    "parameter partner": "covariance",
+    "direction": "eigenvalue",
+    "case": "alone_determined misfit misfit_degrees misfit_count",
+    "case direction": "alone_eigenvalue",
+    "motion": "motion_eigenvalue",
+    "iteration column": "step",
+    "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution",
+    "datum axis": "place datum_direction",
+    "node": "stiffness_mode stiffness_mean stiffness_std stiffness_mesh_shift",
+    "direction parameter": "direction_parameter",
+    "case parameter": "alone_std",
+    "start parameter": "start_mode",
+    "start": "start_log_posterior",
+    "point parameter": "point",
+    "point": "point_weight",
+    "sample parameter": "draw",
+    "sample datum": "draw_log_likelihood",
+    "shown node": "direction_stiffness",
+    "shown": "shown_number",
+    "case node": "alone_stiffness_std",
+    "sample node": "stiffness_draw",
+    "goal": " ".join(
+        [
+            "prediction_share",
+            part("prediction_mean", "mesh"),
+            *(f"prediction_{one}{end}" for one in ("", "prior_") for end in BAND),
+        ]
+    ),
 }
+DIMS = {name: tuple(dims.split()) for dims, names in {"": _NUMBERS, **_ARRAYS}.items() for name in names.split()}
 
 
 @dataclass(frozen=True, eq=False)

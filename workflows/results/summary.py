@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
+from inverse.methods.record import BAND
 from uq.estimators.estimate import ESTIMATED, OF_MESH, PARTS, holds, part
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
@@ -27,7 +28,6 @@ OTHER_ESTIMATES = (
 # Of these, what is not estimated of every output.
 NOT_OF_ALL = {part(name, which) for name in ESTIMATED for which in (*OF_MESH, "total")}
 # Of outputs that were not measured: bands by the posterior and the prior, and errors of the mesh.
-BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")
 PREDICTED = {
     **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
     "share": "prediction_share",
