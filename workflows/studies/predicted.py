@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
     from inverse.fields.low_rank import LowRankPosterior
-    from inverse.methods.predict import Band, Record
+    from inverse.methods.predict import Band
+    from inverse.methods.record import Record
     from uq.evaluation.request import Evaluate
     from workflows.studies.inversion import Inversion, Predict
 
