@@ -22,7 +22,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.run.run import run
 from workflows.starter import starter
-from workflows.studies.study import SAMPLING, STUDIES
+from workflows.studies.study import STUDIES, UNNAMED
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -111,7 +111,7 @@ def test_every_kind_and_every_study_of_the_net_stands_among_the_abilities():
     page = (ROOT / "docs" / "abilities.md").read_text(encoding="utf-8")
     studies = [path.relative_to(ROOT).as_posix() for path in (ROOT / "benchmarks" / "net").glob("*.toml")]
     kinds = [kind for family in (MATERIALS, LOADS, OUTPUTS, MODELS, METHODS, STUDIES) for kind in family.own]
-    missing = [name for name in (*kinds, *studies) if f"`{name}`" not in page and name != SAMPLING]
+    missing = [name for name in (*kinds, *studies) if f"`{name}`" not in page and name not in UNNAMED]
     assert missing == []
     without = re.findall(r"^\| (?!what|--)[^|]*\| (?!`)[^|]*\|$", page, re.MULTILINE)
     assert without == [], "each line names what runs it"

@@ -11,6 +11,10 @@ from pydantic import Field
 from forward.settings import Settings
 from uq.evaluation.request import BLOCKS
 
+KEPT = "draws.npz"  # beside study.toml: the draws as they were read
+AVERAGED = "averaged"  # all candidates of a comparison, by their probabilities
+STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
+
 
 class Correlation(Settings):
     """Correlation of two parameters in the Gaussian copula."""

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field, model_serializer, model_validator
+from pydantic import Field, field_validator, model_serializer, model_validator
 
-from forward.registry import named
-from forward.settings import Settings
+from forward.findings import Finding
+from forward.settings import Settings, nearest
+from workflows.config.blocks import AVERAGED, KEPT, STACKED
+from workflows.config.priors import findings_of_impossible
 
 if TYPE_CHECKING:
+    from forward.scalars import Mistake, Scalar
     from forward.spec import ModelSpec
     from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
-
-KEPT = "draws.npz"  # beside study.toml: the draws as they were read
-AVERAGED = "averaged"  # all candidates, by their probabilities
-STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
-READER = "workflows.studies.posteriors"  # reads files of draws, once a study names one
+    from uq.inputs.random_parameters import Inputs
 
 
 def averages(blocks: Mapping[str, Any]) -> bool:
@@ -61,20 +60,126 @@ class Source(Settings):
     def _of_text(cls, value: Any) -> Any:
         return {"file": value} if isinstance(value, str) else value
 
-    @model_validator(mode="after")
-    def _read(self) -> Source:
-        whole = self.model in (AVERAGED, STACKED)
-        found: str = named(f"{READER}:Left")(self.file).digest if whole else self.drawn.digest
+    @property
+    def whole(self) -> bool:
+        """Whether all candidates of a comparison are meant."""
+        return self.model in (AVERAGED, STACKED)
+
+    @property
+    def read(self) -> Source:
+        """The same with the hash of the file as it is; a ValueError says that it has changed, or is none."""
+        from workflows.studies.posteriors import Left
+
+        found = Left(self.file).digest if self.whole else self.drawn.digest
         if self.digest and found != self.digest:
             raise ValueError(f"{self.file} has changed since the study was begun: hash {self.digest} → {found}")
-        object.__setattr__(self, "digest", found)
-        return self
+        return self.model_copy(update={"digest": found})
 
     @cached_property
     def drawn(self) -> Draws:
         """The draws, by their names in the source; a ValueError says what is wrong with it."""
-        found: Draws = named(f"{READER}:read")(self.file, self.group, self.model)
+        from workflows.studies.posteriors import read
+
+        return read(self.file, self.group, self.model)
+
+    def mapped(self, scalars: Mapping[str, Scalar]) -> dict[str, str]:
+        """Return names in it by paths of numbers of the model; those that do not fit are left out."""
+        drawn = self.drawn.names
+        if self.names:
+            return {path: name for path, name in self.names.items() if path in scalars and name in drawn}
+        found = {}
+        for name in drawn:
+            ends = [path for path in scalars if path == name or path.endswith(f".{name}")]
+            if name in scalars or len(ends) == 1:
+                found[name if name in scalars else ends[0]] = name
         return found
+
+    @property
+    def material(self) -> dict[str, Any]:
+        """The block of the material that was calibrated, as far as it is known."""
+        from workflows.studies.posteriors import Left
+
+        left = Left(self.file)
+        return left.material(self.model) if left.path.is_dir() else {}
+
+    def draws_of(self, scalars: Mapping[str, Scalar]) -> Draws | None:
+        """Return the draws by paths of numbers of the model; None if there are none.
+
+        Raises
+        ------
+        ValueError
+            If they are no distribution: too few, constant, or linearly dependent.
+        """
+        from uq.inputs.draws import Draws
+
+        found, drawn = self.mapped(scalars), self.drawn
+        if not found:
+            return None
+        columns = [drawn.names.index(name) for name in found.values()]
+        chosen = Draws(tuple(found), drawn.values[:, columns], drawn.weights, drawn.effective, drawn.digest)
+        objection = chosen.objection()
+        if objection is not None:
+            raise ValueError(objection)
+        return chosen
+
+    def mistakes(self, model: ModelSpec, own: Sequence[str]) -> Iterator[Mistake]:
+        """Find what does not fit the model, and numbers that have a distribution of their own too."""
+        drawn, place, scalars = self.drawn.names, ("parameters", "from"), model.scalars
+        found, clean = self.mapped(scalars), True
+        for path, name in self.names.items():
+            if path not in scalars:
+                clean = False
+                yield (*place, "names"), f"'{path}' is not a number of the model; {nearest(path, tuple(scalars))}", path
+            if name not in drawn:
+                clean = False
+                yield (*place, "names"), f"'{name}' is not in {self.file}; {nearest(name, list(drawn))}", name
+        for name in drawn if not self.names else ():
+            if name not in found.values():
+                clean = False
+                ends = [path for path in scalars if path.endswith(f".{name}")]
+                near = f"expected one of: {', '.join(ends)}" if ends else nearest(name, tuple(scalars))
+                message = (
+                    f"'{name}' of {self.file} is not a number of the model; {near}; with names = {{ PATH = NAME }} "
+                    "only the names in it are taken"
+                )
+                yield place, message, name
+        for path in found:
+            if path in own:
+                clean = False
+                message = f"has a distribution, and is in {self.file} too, expected only one of them"
+                yield ("parameters", path), message, path
+        block, mine = self.material, getattr(model, "material", None)
+        if block and mine is not None and block.get("kind") != mine.kind and not self.names:
+            clean = False
+            message = f"constants are of the material '{block.get('kind')}' in {self.file}, expected it in the model"
+            yield ("model", "material", "kind"), message, mine.kind
+        if clean:
+            try:
+                self.draws_of(scalars)
+            except ValueError as error:
+                yield place, str(error), self.file
+
+    def findings(self, model: ModelSpec, inputs: Inputs) -> Iterator[Finding]:
+        """Find what the draws say before anything is solved."""
+        from uq.estimators.of_draws import findings_of_source
+
+        yield from findings_of_source(inputs)
+        materials = model.materials(inputs.names)
+        if inputs.draws is not None:
+            yield from findings_of_impossible(model.scalars, inputs.draws, () if materials is None else materials.names)
+        block, mine = self.material, getattr(model, "material", None)
+        if block and mine is not None:
+            fixed = {
+                name: float(v)
+                for name, v in block.items()
+                if isinstance(v, int | float) and name not in self.drawn.names
+            }
+            here = mine.model_dump()
+            other = [
+                f"{name} = {here[name]:g}, there {v:g}" for name, v in fixed.items() if name in here and here[name] != v
+            ]
+            if other:
+                yield Finding("constants-changed", "warning", {"source": self.file, "changed": "; ".join(other)})
 
 
 class Sourced(Settings):
@@ -101,10 +206,7 @@ class Sourced(Settings):
     @cached_property
     def draws(self) -> Draws | None:
         """Draws of numbers of the model, if there is a source of them."""
-        if self.source is None:
-            return None
-        found: Draws | None = named(f"{READER}:draws_of")(self.source, self.model.scalars)
-        return found
+        return None if self.source is None else self.source.draws_of(self.model.scalars)
 
     @property
     def given(self) -> dict[str, Distribution]:
@@ -123,9 +225,16 @@ class Sourced(Settings):
     @property
     def beside(self) -> Mapping[str, bytes]:
         """The draws, as they were read."""
-        if self.source is None or self.source.model in (AVERAGED, STACKED):
+        if self.source is None or self.source.whole:
             return {}
-        return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
+        from workflows.studies.posteriors import to_file
+
+        return {KEPT: to_file(self.source.drawn)}
+
+    @field_validator("source")
+    @classmethod
+    def _read(cls, source: Source | None) -> Source | None:
+        return None if source is None else source.read
 
     @model_serializer(mode="wrap")
     def _source_among_parameters(self, handler: Any) -> dict[str, Any]:

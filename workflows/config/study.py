@@ -14,9 +14,9 @@ from pydantic import TypeAdapter, ValidationError
 from forward.registry import dotted
 from forward.settings import cut
 from uq.methods.method import METHODS
-from workflows.config.blocks import located
+from workflows.config.blocks import AVERAGED, KEPT, located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.source import AVERAGED, KEPT, Sourced, averages
+from workflows.config.source import Sourced, averages
 from workflows.studies.study import SAMPLING, STUDIES, UNNAMED, WITHOUT_EFFECT, StudyKind
 
 _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks

@@ -19,8 +19,8 @@ from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, 
 from forward.model import SolveError
 from uq.evaluation.request import Evaluations
 from uq.findings import add
+from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
-from workflows.config.source import KEPT
 from workflows.config.study import differences, document, dump
 from workflows.results.directory import (
     above_rounding,

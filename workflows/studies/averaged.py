@@ -18,8 +18,8 @@ from uq.estimators.averaged import averaged
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add
+from workflows.config.blocks import STACKED
 from workflows.config.mistakes import lines
-from workflows.config.source import STACKED
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.posteriors import NamedCandidate, candidates, read

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from pydantic import Field
 
 from forward.findings import Finding
-from forward.registry import OfKind, named
+from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from inverse.methods.design import Design
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation
+from workflows.config.blocks import AVERAGED, Correlation
 from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_priors, ranges
-from workflows.config.source import AVERAGED, READER, Sourced
+from workflows.config.source import Sourced
 from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.design_job import job, job_of_models
@@ -95,7 +95,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
     def findings(self) -> tuple[Finding, ...]:
         """Findings about model and prior before anything is solved."""
         inputs, source = self.inputs, self.source
-        of_draws = () if source is None else named(f"{READER}:findings")(source, self.spec, inputs)
+        of_draws = () if source is None else source.findings(self.spec, inputs)
         return (*self.model.findings_over(ranges(self.given)), *findings_of_materials(inputs), *of_draws)
 
     @classmethod
@@ -144,7 +144,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
             if self.source.model == AVERAGED:
                 yield ("parameters", "from", "model"), "one model is linearised, expected one of them", AVERAGED
                 return
-            wrong = list(named(f"{READER}:mistakes")(self.source, self.model, tuple(self.parameters)))
+            wrong = list(self.source.mistakes(self.model, tuple(self.parameters)))
             yield from wrong
             if wrong:
                 return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
@@ -14,23 +14,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from forward.findings import Finding
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.low_dimensional.posterior import NOISE
 from uq.evaluation.hdf5 import variables
 from uq.inputs.draws import Draws
-from uq.inputs.random_parameters import Inputs
-from workflows.config.priors import findings_of_impossible
-from workflows.config.source import AVERAGED, KEPT, STACKED
+from workflows.config.blocks import AVERAGED, KEPT, STACKED
 from workflows.studies.tables_of_draws import of_table
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.scalars import Mistake, Scalar
-    from forward.spec import ModelSpec
-    from workflows.config.source import Source
 
 Arrays = Mapping[str, Any]
 LETTERS = 16  # of a hash
@@ -277,103 +271,3 @@ def candidates(file: str, by: str) -> list[NamedCandidate]:
         message = f"{left.path}: candidates {', '.join(without)} have no material, expected a comparison of materials"
         raise ValueError(message)
     return sorted(every, key=lambda one: -one.probability)
-
-
-# --- numbers of the model --------------------------------------------------------------------------------------------
-
-
-def mapped(source: Source, scalars: Mapping[str, Scalar]) -> dict[str, str]:
-    """Return names in the source by paths of numbers of the model; those that do not fit are left out."""
-    drawn = source.drawn.names
-    if source.names:
-        return {path: name for path, name in source.names.items() if path in scalars and name in drawn}
-    found = {}
-    for name in drawn:
-        ends = [path for path in scalars if path == name or path.endswith(f".{name}")]
-        if name in scalars or len(ends) == 1:
-            found[name if name in scalars else ends[0]] = name
-    return found
-
-
-def mistakes(source: Source, model: ModelSpec, own: Sequence[str]) -> Iterator[Mistake]:
-    """Find what does not fit the model, and numbers that have a distribution of their own too."""
-    drawn, place, scalars = source.drawn.names, ("parameters", "from"), model.scalars
-    found, clean = mapped(source, scalars), True
-    for path, name in source.names.items():
-        if path not in scalars:
-            clean = False
-            yield (*place, "names"), f"'{path}' is not a number of the model; {nearest(path, tuple(scalars))}", path
-        if name not in drawn:
-            clean = False
-            yield (*place, "names"), f"'{name}' is not in {source.file}; {nearest(name, list(drawn))}", name
-    for name in drawn if not source.names else ():
-        if name not in found.values():
-            clean = False
-            ends = [path for path in scalars if path.endswith(f".{name}")]
-            near = f"expected one of: {', '.join(ends)}" if ends else nearest(name, tuple(scalars))
-            message = (
-                f"'{name}' of {source.file} is not a number of the model; {near}; with names = {{ PATH = NAME }} "
-                "only the names in it are taken"
-            )
-            yield place, message, name
-    for path in found:
-        if path in own:
-            clean = False
-            message = f"has a distribution, and is in {source.file} too, expected only one of them"
-            yield ("parameters", path), message, path
-    block, mine = material_of(source), getattr(model, "material", None)
-    if block and mine is not None and block.get("kind") != mine.kind and not source.names:
-        clean = False
-        message = f"constants are of the material '{block.get('kind')}' in {source.file}, expected it in the model"
-        yield ("model", "material", "kind"), message, mine.kind
-    if clean:
-        try:
-            draws_of(source, scalars)
-        except ValueError as error:
-            yield place, str(error), source.file
-
-
-def findings(source: Source, model: ModelSpec, inputs: Inputs) -> Iterator[Finding]:
-    """Find what the draws say before anything is solved."""
-    from uq.estimators.of_draws import findings_of_source
-
-    yield from findings_of_source(inputs)
-    materials = model.materials(inputs.names)
-    if inputs.draws is not None:
-        yield from findings_of_impossible(model.scalars, inputs.draws, () if materials is None else materials.names)
-    block, mine = material_of(source), getattr(model, "material", None)
-    if block and mine is not None:
-        fixed = {
-            name: float(v) for name, v in block.items() if isinstance(v, int | float) and name not in source.drawn.names
-        }
-        here = mine.model_dump()
-        other = [
-            f"{name} = {here[name]:g}, there {v:g}" for name, v in fixed.items() if name in here and here[name] != v
-        ]
-        if other:
-            yield Finding("constants-changed", "warning", {"source": source.file, "changed": "; ".join(other)})
-
-
-def material_of(source: Source) -> dict[str, Any]:
-    """Return the block of the material that was calibrated, as far as it is known."""
-    left = Left(source.file)
-    return left.material(source.model) if left.path.is_dir() else {}
-
-
-def draws_of(source: Source, scalars: Mapping[str, Scalar]) -> Draws | None:
-    """Return the draws by paths of numbers of the model; None if there are none.
-
-    Raises
-    ------
-    ValueError
-        If they are no distribution: too few, constant, or linearly dependent.
-    """
-    found, drawn = mapped(source, scalars), source.drawn
-    if not found:
-        return None
-    columns = [drawn.names.index(name) for name in found.values()]
-    chosen = Draws(tuple(found), drawn.values[:, columns], drawn.weights, drawn.effective, drawn.digest)
-    objection = chosen.objection()
-    if objection is not None:
-        raise ValueError(objection)
-    return chosen

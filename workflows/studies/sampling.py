@@ -12,14 +12,11 @@ from pydantic import ValidationError, model_validator
 from forward.findings import Finding
 from forward.machine import MIB
 from forward.model import ModelError
-from forward.registry import named
 from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
 from workflows.config.blocks import Accuracy
 from workflows.config.priors import findings_of_draws, inputs_of, mistakes_of_priors, ranges
-from workflows.config.source import READER
 from workflows.run.from_python import FromPython
-from workflows.studies import tolerance_asked
 from workflows.studies.sampling_blocks import SamplingBlocks
 from workflows.studies.study import Sampled, StudyKind
 
@@ -68,7 +65,11 @@ class Study(SamplingBlocks, FromPython, StudyKind):
     @property
     def growth(self) -> tuple[float, str]:
         """Memory (bytes) of the largest mesh that it may make, and what sets it; 0 where it makes none."""
-        if self.accuracy.tolerance is None or not self.estimates or not tolerance_asked.refinement(self)[0]:
+        if self.accuracy.tolerance is None or not self.estimates:
+            return super().growth
+        from workflows.studies import tolerance_asked
+
+        if not tolerance_asked.refinement(self)[0]:
             return super().growth
         return MIB * self.accuracy.memory, "what accuracy.memory"
 
@@ -79,8 +80,12 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
         found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
         if self.source is not None:
-            found = (*found, *named(f"{READER}:findings")(self.source, self.spec, self.inputs))
-        return found if self.accuracy.tolerance is None else (*found, *tolerance_asked.findings(self))
+            found = (*found, *self.source.findings(self.spec, self.inputs))
+        if self.accuracy.tolerance is None:
+            return found
+        from workflows.studies import tolerance_asked
+
+        return *found, *tolerance_asked.findings(self)
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self.accuracy.mesh_error and self.spec.hidden:
@@ -150,7 +155,11 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
         accuracy = value.get("accuracy") if isinstance(value, dict) else None
         asked = isinstance(accuracy, dict | Accuracy) and "tolerance" in dict(accuracy)
-        return tolerance_asked.completed(value) if asked else value
+        if not asked:
+            return value
+        from workflows.studies import tolerance_asked
+
+        return tolerance_asked.completed(value)
 
     @model_validator(mode="before")
     @classmethod
@@ -167,7 +176,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
         if self.source is not None:
-            wrong = list(named(f"{READER}:mistakes")(self.source, self.model, tuple(self.parameters)))
+            wrong = list(self.source.mistakes(self.model, tuple(self.parameters)))
             yield from wrong
             if wrong:
                 return
@@ -180,6 +189,8 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         yield from mistakes_of_priors(self.spec, self.parameters, self.correlations, lambda: self.inputs, self.draws)
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
+            from workflows.studies import tolerance_asked
+
             yield from tolerance_asked.mistakes(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled

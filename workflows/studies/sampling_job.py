@@ -11,7 +11,7 @@ import numpy as np
 
 from forward.model import SolveError, Stability
 from uq.accuracy.budget import spare_for
-from uq.estimators import branch, of_draws
+from uq.estimators import branch
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -159,6 +159,8 @@ def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset
     if study.source is None:
         return found
     in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
+    from uq.estimators import of_draws
+
     return of_draws.with_errors_of_draws(found, study.inputs, in_turn)
 
 

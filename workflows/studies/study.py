@@ -11,9 +11,8 @@ from pydantic import Field, model_validator
 
 from forward.registry import Kinds
 from forward.settings import Settings
-from workflows.config.blocks import Parallel, Report
+from workflows.config.blocks import AVERAGED, Parallel, Report
 from workflows.config.mistakes import refused
-from workflows.config.source import AVERAGED
 
 if TYPE_CHECKING:
     import xarray as xr
