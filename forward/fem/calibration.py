@@ -19,22 +19,20 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from forward.fem.body import DiscreteBody
 from forward.fem.dolfinx import spaces
+from forward.fem.enriched import Enriched, EnrichedState
+from forward.fem.equations import Discretisation
 from forward.fem.layout import sorted_by_place
 from forward.fem.mesh_error_cost import Finer, finer
-from forward.fem.model import HyperelasticModel
+from forward.fem.solution import FiniteElementSolution
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
-
-if TYPE_CHECKING:
-    from forward.fem.enriched import Enriched, EnrichedState
-    from forward.fem.equations import Discretisation
-    from forward.fem.solution import FiniteElementSolution
-    from forward.loaded import LoadedBody
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders
 USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
@@ -115,6 +113,9 @@ def saturation(seen: FloatArray, found: Limit, of_state: float) -> Saturation:
     return Saturation(outputs, of_state, of_state, shifts=shifts, doubts=found.doubts)
 
 
+Body = DiscreteBody[FiniteElementSolution]
+
+
 class FinerMesh:
     """A body on a finer mesh, made when it is first solved on.
 
@@ -126,7 +127,7 @@ class FinerMesh:
         How many solves it may cost (`forward.fem.mesh_error_cost.allowance`).
     """
 
-    def __init__(self, model: HyperelasticModel, spare: float = math.inf) -> None:
+    def __init__(self, model: Body, spare: float = math.inf) -> None:
         self._model, self._spare = model, spare
         self._scalars = [i for i, path in enumerate(model.parameters) if path in model.spec.scalars]
 
@@ -135,22 +136,22 @@ class FinerMesh:
         return finer(self._model.spec, self._spare)
 
     @cached_property
-    def _tested(self) -> HyperelasticModel:
+    def _tested(self) -> Body:
         """The body there."""
         assert self._finer is not None
         return self._built(self._finer.spec)
 
     @cached_property
-    def _untested(self) -> HyperelasticModel:
+    def _untested(self) -> Body:
         """The same for one solution: not tested for stability, which is one factorisation less, nor is its factor."""
         assert self._finer is not None
         spec = self._finer.spec
         once = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
         return self._built(spec.model_copy(update={"solver": spec.solver.model_copy(update=once)}))
 
-    def _built(self, spec: LoadedBody) -> HyperelasticModel:
+    def _built(self, spec: LoadedBody) -> Body:
         names = tuple(self._model.parameters[i] for i in self._scalars)
-        return HyperelasticModel(spec, self._model.equations.comm, names)
+        return type(self._model)(spec, self._model.equations.comm, names)
 
     def calibrated(self, solution: FiniteElementSolution) -> Saturation | None:
         """Calibrate estimates by the finer mesh at the parameters of a solution; collective.
@@ -186,9 +187,7 @@ class FinerMesh:
         here, moved = brought[:, :n], _everywhere(other.equations, np.array(after))[:, :n]
         return saturation(usual, found, of_states(np.array([here[0] - here[1], here[1]]), moved, times, degree))
 
-    def _solved(
-        self, parameters: FloatArray, richer: FloatArray
-    ) -> tuple[HyperelasticModel, FiniteElementSolution, FloatArray]:
+    def _solved(self, parameters: FloatArray, richer: FloatArray) -> tuple[Body, FiniteElementSolution, FloatArray]:
         """Solve from what richer elements say of the state, with the one factor of the stiffness there.
 
         Returns the rows (k, U⁺_local) of these, the first of which is the state, at its nodes (k, U) too. Where the

@@ -12,22 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
-from forward.fem.enriched_equations import EnrichedEquations
+from forward.fem.enriched_equations import EnrichedEquations, Linearised
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import Way
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
-
-if TYPE_CHECKING:
-    from forward.fem.solution import FiniteElementSolution
-    from forward.loaded import LoadedBody
-
 
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 NEAR = 0.1  # nonlinearity below which the stiffness at the solution will do for further steps
@@ -161,7 +157,7 @@ class Enriched(EnrichedEquations):
     def _rule(self) -> Rule:
         return RULES[self.way == Way.SMOOTHING, self.equations.spec.mixed]
 
-    def state(self, solution: FiniteElementSolution, bent: float | None = None) -> EnrichedState:
+    def state(self, solution: Linearised, bent: float | None = None) -> EnrichedState:
         """Find u_h + e; collective.
 
         Parameters
@@ -193,7 +189,7 @@ class Enriched(EnrichedEquations):
             bent = self._rule.bent
         return self._nearer(solution, found, left, bent, once=True)
 
-    def nearer(self, solution: FiniteElementSolution, found: EnrichedState, bent: float) -> EnrichedState:
+    def nearer(self, solution: Linearised, found: EnrichedState, bent: float) -> EnrichedState:
         """Go on from a state that was found until its nonlinearity is below `bent`; collective.
 
         Raises
@@ -205,7 +201,7 @@ class Enriched(EnrichedEquations):
         return self._nearer(solution, found, self.imbalance(solution, found.state), bent, once=False)
 
     def _nearer(
-        self, solution: FiniteElementSolution, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
+        self, solution: Linearised, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
     ) -> EnrichedState:
         """Take steps of Newton's method, of which `left` is the imbalance at first; one if its stiffness is an old one.
 
@@ -233,7 +229,7 @@ class Enriched(EnrichedEquations):
                 break
         return found._replace(nonlinearity=far, work=equations.work)
 
-    def values(self, solution: FiniteElementSolution, found: EnrichedState) -> FloatArray:
+    def values(self, solution: Linearised, found: EnrichedState) -> FloatArray:
         """Return the outputs (m,) at a state found from a solution; NaN where not estimated.
 
         Outputs of the balance of forces are linearised along the last step, as the equations that it solves: at the
@@ -248,7 +244,7 @@ class Enriched(EnrichedEquations):
         known = [np.nan if f is None or i in linear else f.value() for i, f in enumerate(self._functionals)]
         return np.array([linear.get(i, value) for i, value in enumerate(known)])
 
-    def adjoints(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+    def adjoints(self, solution: Linearised, weights: FloatArray) -> FloatArray:
         """Return z⁺ (k, U⁺_local) with K⁺ᵀz⁺ = ∂ψ/∂u of outputs weighted by `weights` (k, m); collective.
 
         Raises
@@ -266,7 +262,7 @@ class Enriched(EnrichedEquations):
         loads[:, self.equations.fixed] = 0
         return self.solve(solution, loads, self._rule.other, transpose=True)
 
-    def indicators(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+    def indicators(self, solution: Linearised, weights: FloatArray) -> FloatArray:
         """Return contributions (k, n_cells) of this rank's cells to the error of outputs weighted by (k, m); ≥ 0.
 
         The size of the dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i is

@@ -7,7 +7,7 @@ method without a factor leave to the stiffness of the body what a coarser space 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -16,20 +16,28 @@ from forward.fem.equations import Discretisation
 from forward.fem.linearisation import Preconditioner
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
+from forward.loaded import LoadedBody
 from forward.model import FloatArray, ReferenceSolution, Work
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.multigrid import minimised, smoothed
-
-if TYPE_CHECKING:
-    from forward.fem.solution import FiniteElementSolution
-    from forward.loaded import LoadedBody
-
 
 ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
 STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 LITTLE = 0.01  # the same before the steps, after which these forces are met again
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
+
+
+class Linearised(Protocol):
+    """What is asked of a solution of the body (`forward.fem.solution`)."""
+
+    parameters: FloatArray
+    state: FloatArray
+    stiffer: float
+    reference: ReferenceSolution | None
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
+        """Solve with the stiffness there, or its transpose, for rows (k, U_local)."""
 
 
 class EnrichedEquations:
@@ -60,7 +68,7 @@ class EnrichedEquations:
         self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
         cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
         self.way, self._alone = cost.way, cost.alone
-        self._blocks: tuple[ReferenceSolution | FiniteElementSolution, Preconditioner | None] | None = None
+        self._blocks: tuple[ReferenceSolution | Linearised, Preconditioner | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
         """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
@@ -77,7 +85,7 @@ class EnrichedEquations:
         parts = np.split(forces, [3 * self.equations.nodes_owned])
         return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
 
-    def visit(self, solution: FiniteElementSolution, at: FloatArray | None = None) -> Discretisation:
+    def visit(self, solution: Linearised, at: FloatArray | None = None) -> Discretisation:
         """Set parameters, loads and state to those of a solution of the body, or to a state (U⁺_local,) near it."""
         equations, key = self.equations, solution if at is None else at
         if equations.latest.solution is not key:
@@ -87,7 +95,7 @@ class EnrichedEquations:
             equations.latest.solution = key
         return equations
 
-    def imbalance(self, solution: FiniteElementSolution, at: FloatArray | None = None) -> FloatArray:
+    def imbalance(self, solution: Linearised, at: FloatArray | None = None) -> FloatArray:
         """F⁺ (U⁺_local,) at a solution, or at a state near it, zero on prescribed unknowns."""
         equations = self.visit(solution, at)
         forces = equations.imbalance()
@@ -97,7 +105,7 @@ class EnrichedEquations:
 
     def solve(
         self,
-        solution: FiniteElementSolution,
+        solution: Linearised,
         right: FloatArray,
         close: float,
         *,
@@ -126,7 +134,7 @@ class EnrichedEquations:
         return found
 
     def _solve_by_smoothing(
-        self, solution: FiniteElementSolution, right: FloatArray, close: float, *, transpose: bool
+        self, solution: Linearised, right: FloatArray, close: float, *, transpose: bool
     ) -> FloatArray | None:
         """Solve by steps of conjugate gradients and, after them and perhaps before, with the stiffness of the body.
 
@@ -159,7 +167,7 @@ class EnrichedEquations:
         return found + self._on_the_body(solution, left, ORTHOGONAL, transpose=transpose)
 
     def _on_the_body(
-        self, solution: FiniteElementSolution, right: FloatArray, negligible: float, *, transpose: bool
+        self, solution: Linearised, right: FloatArray, negligible: float, *, transpose: bool
     ) -> FloatArray:
         """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
         forces = np.array([self.restrict(row) for row in right])
@@ -174,7 +182,7 @@ class EnrichedEquations:
         self.visit(solution)
         return found
 
-    def _preconditioner(self, solution: FiniteElementSolution) -> Preconditioner | None:
+    def _preconditioner(self, solution: Linearised) -> Preconditioner | None:
         """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
         at = solution.reference or solution
         if self._blocks is None or not _same(self._blocks[0], at):
@@ -193,7 +201,7 @@ class EnrichedEquations:
 
     def _solve_near(
         self,
-        solution: FiniteElementSolution,
+        solution: Linearised,
         reference: ReferenceSolution,
         right: FloatArray,
         close: float,
@@ -219,7 +227,7 @@ class EnrichedEquations:
             ITERATIONS,
         )
 
-    def _factorise(self, solution: FiniteElementSolution, at: FloatArray | None) -> None:
+    def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
         equations, key = self.visit(solution, at), solution if at is None else at
         if equations.latest.factorised is not key:
             if self._alone:
@@ -228,7 +236,7 @@ class EnrichedEquations:
             equations.latest.factorised = equations.latest.solution = key
 
 
-def _same(one: ReferenceSolution | FiniteElementSolution, other: ReferenceSolution | FiniteElementSolution) -> bool:
+def _same(one: ReferenceSolution | Linearised, other: ReferenceSolution | Linearised) -> bool:
     if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
         return one.same(other)
     return one is other

@@ -14,13 +14,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from forward.fem.cost import MOST_BYTES, Linear, together
-from forward.fem.enriched import Enriched
-from forward.fem.equations import Discretisation
-from forward.fem.mesh_error_cost import Way, estimate
-from forward.fem.reference import ReferenceFactor, WayFromReference
+from forward.fem.body import DiscreteBody
+from forward.fem.calibration import FinerMesh
+from forward.fem.cost import Linear, together
+from forward.fem.reference import WayFromReference
 from forward.fem.solution import FiniteElementSolution
-from forward.fem.space import BodySpace, Observation
+from forward.fem.space import Observation
 from forward.loaded import LoadedBody
 from forward.materials.admissible import Admission
 from forward.model import (
@@ -68,53 +67,14 @@ def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool
         yield one is not None, ((point, guess or Guess()) for point, guess in group)
 
 
-def not_estimated(what: str) -> SolveError:
-    """Return the refusal of an estimate of the error of the mesh."""
-    return SolveError(f"the error of the mesh is not estimated with {what}; compare with a finer mesh")
-
-
-class HyperelasticModel(OneByOne):
-    """A hyperelastic body as a `ForwardModel`: one mesh, one set of forms and one solver for every realisation.
-
-    Parameters
-    ----------
-    spec
-        The body.
-    comm
-        Communicator of the ranks that share it.
-    parameters
-        Paths of the random parameters, in the order of the parameter vectors.
-
-    Raises
-    ------
-    ValueError
-        For a path that is not a number of the model, or an output at a point outside the body.
-    """
+class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
+    """A hyperelastic body as a `ForwardModel`; parameters as of `DiscreteBody`."""
 
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
-        scalars = spec.scalars
-        coefficients = set(spec.coefficients)
-        for path in parameters:
-            if path not in scalars and path not in coefficients:
-                known = [*scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
-                message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
-                raise ValueError(message)
-        self.spec = spec
-        self.parameters = parameters
+        super().__init__(spec, comm, parameters)
         self._admission = Admission(spec, parameters)
-        self.outputs = tuple(output.name for output in spec.outputs)
         self._extent = max(high - low for low, high in spec.body.bounds)
-        self.equations = Discretisation(spec, comm, parameters)
-        self.space = BodySpace(self.equations)
         self.differentiable = True
-        self.rows: Observation | None = None  # what is observed in place of the outputs
-        self.functionals = [output.functional(self.equations) for output in spec.outputs]
-        self._richer: dict[int, Enriched] = {}  # by how many degrees; copies share it
-
-    @cached_property
-    def reference(self) -> ReferenceFactor:
-        """The factor at the last reference given."""
-        return ReferenceFactor(self.equations)
 
     def with_rows(self, rows: Observation, names: tuple[str, ...]) -> HyperelasticModel:
         """Return the same model whose outputs, of these names, are what is observed; collective.
@@ -129,38 +89,6 @@ class HyperelasticModel(OneByOne):
         other = copy.copy(self)
         other.outputs, other.rows = names, rows
         return other
-
-    def with_own_reference(self) -> HyperelasticModel:
-        """Return the same model with a reference factor of its own, which shares everything else with this one."""
-        other = copy.copy(self)
-        vars(other).pop("reference", None)
-        return other
-
-    @property
-    def enriched(self) -> Enriched:
-        """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used.
-
-        Raises
-        ------
-        SolveError
-            If something acts on it that has no place there.
-        """
-        if self.spec.remembers:
-            raise not_estimated(self.spec.remembers)
-        if 1 not in self._richer:
-            self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
-        return self._richer[1]
-
-    @property
-    def enriched_twice(self) -> Enriched | None:
-        """The same of two degrees more, to calibrate that; None where they take too much or are solved too roughly."""
-        spec = self.spec.enriched().enriched()
-        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
-        rough = spec.mixed and cost.way == Way.SMOOTHING
-        if cost.bytes <= MOST_BYTES and not rough and 2 not in self._richer:
-            self._richer[2] = Enriched(self.equations, spec, self.functionals)
-        return self._richer.get(2)
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -192,6 +120,10 @@ class HyperelasticModel(OneByOne):
         if equations.symmetric and equations.latest.factorised_at is found.state:  # to count its eigenvalues
             equations.latest.factorised = solution
         return solution
+
+    def finer_mesh(self, spare: float) -> FinerMesh:
+        """Return the body on a finer mesh, which may cost so many solves."""
+        return FinerMesh(self, spare)
 
     def way(self, parameters: FloatArray, guess: Guess) -> WayFromReference | None:
         """Return the path from the reference of a guess, whose factor is computed if it is another's; None without."""

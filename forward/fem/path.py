@@ -19,9 +19,9 @@ import numpy as np
 from scipy.sparse import eye
 
 from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped, side_by_side
-from forward.fem.calibration import FinerMesh
+from forward.fem.body import not_estimated
 from forward.fem.equations import Discretisation
-from forward.fem.model import RAISES, STIFFER, HyperelasticModel, not_estimated
+from forward.fem.model import RAISES, STIFFER, HyperelasticModel
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace
 from forward.loaded import LoadedBody
@@ -159,7 +159,7 @@ class PathSolution(JoinedSolution):
 
     def saturations(self, spare: float) -> list[Saturation | None]:
         """Calibrate each step on one finer mesh; collective."""
-        finer = FinerMesh(self.body, spare)
+        finer = self.body.finer_mesh(spare)
         return [one.solution.saturation(spare, finer) for one in self.solutions]
 
 

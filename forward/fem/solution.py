@@ -10,23 +10,20 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from forward.fem.body import Calibrating, DiscreteBody, not_estimated
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.fem.reference import WayFromReference
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
-from forward.registry import named
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
-
-if TYPE_CHECKING:
-    from forward.fem.model import HyperelasticModel
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
@@ -45,7 +42,7 @@ class FiniteElementSolution:
 
     def __init__(
         self,
-        model: HyperelasticModel,
+        model: DiscreteBody[Any],
         parameters: FloatArray,
         found: Found,
         work: Work,
@@ -297,7 +294,7 @@ class FiniteElementSolution:
         (of_energy,) = factors(once.energy, found.energy, degree)
         return twice, found, float(of_state), float(of_energy)
 
-    def saturation(self, spare: float = math.inf, finer: Any | None = None) -> Saturation:
+    def saturation(self, spare: float = math.inf, finer: Calibrating[Self] | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
         Where that is too large, by elements of two degrees more (`factors`); typical values where this
@@ -318,13 +315,13 @@ class FiniteElementSolution:
         """
         if self._model.rows is not None:
             return self._by_degrees()
-        if finer is None:
-            finer = named("forward.fem.calibration:FinerMesh")(self._model, spare)
+        spec = self._model.spec
+        if spec.remembers:
+            raise not_estimated(spec.remembers)
         with suppress(SolveError):
-            found: Saturation | None = finer.calibrated(self)
+            found: Saturation | None = (finer or self._model.finer_mesh(spare)).calibrated(self)
             if found is not None:
                 return found
-        spec = self._model.spec
         if richer(spec) > allowance(spec, spare):
             return typical(self.mesh_error().outputs, spec.body.degree)
         return self._by_degrees()

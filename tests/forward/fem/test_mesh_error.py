@@ -397,7 +397,7 @@ def test_elements_of_two_degrees_more_say_too_little_by_steps_with_pressures(mon
         ways.append(Way.SMOOTHING)
         return replace(estimate(*bodies, **form), way=Way.SMOOTHING)
 
-    monkeypatch.setattr("forward.fem.model.estimate", by_steps)
+    monkeypatch.setattr("forward.fem.body.estimate", by_steps)
     model = loaded_body("neo-hookean mixed").build(MPI.COMM_SELF, ())
     assert model.enriched_twice is None
     assert ways

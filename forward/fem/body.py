@@ -1,0 +1,115 @@
+"""A discrete body, and what is made of it once: equations, outputs, a reference factor, the same in richer elements.
+
+Its equilibria are found by `forward.fem.model`, and are `forward.fem.solution`.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import cached_property
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+from forward.fem.cost import MOST_BYTES
+from forward.fem.enriched import Enriched
+from forward.fem.equations import Discretisation
+from forward.fem.mesh_error_cost import Way, estimate
+from forward.fem.reference import ReferenceFactor
+from forward.fem.space import BodySpace, Observation
+from forward.loaded import LoadedBody
+from forward.model import FloatArray, Guess, Saturation, SolveError
+
+S = TypeVar("S")
+S_contra = TypeVar("S_contra", contravariant=True)
+
+
+class Calibrating(Protocol[S_contra]):
+    """What calibrates estimates of the error of the mesh at solutions."""
+
+    def calibrated(self, solution: S_contra) -> Saturation | None:
+        """Calibrate those at a solution; None where that takes too much."""
+
+
+def not_estimated(what: str) -> SolveError:
+    """Return the refusal of an estimate of the error of the mesh."""
+    return SolveError(f"the error of the mesh is not estimated with {what}; compare with a finer mesh")
+
+
+class DiscreteBody(Generic[S]):
+    """A body on one mesh, with one set of forms and one solver for every realisation, and solutions of one kind.
+
+    Parameters
+    ----------
+    spec
+        The body.
+    comm
+        Communicator of the ranks that share it.
+    parameters
+        Paths of the random parameters, in the order of the parameter vectors.
+
+    Raises
+    ------
+    ValueError
+        For a path that is not a number of the model, or an output at a point outside the body.
+    """
+
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
+        scalars = spec.scalars
+        coefficients = set(spec.coefficients)
+        for path in parameters:
+            if path not in scalars and path not in coefficients:
+                known = [*scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
+                message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
+                raise ValueError(message)
+        self.spec = spec
+        self.parameters = parameters
+        self.outputs = tuple(output.name for output in spec.outputs)
+        self.equations = Discretisation(spec, comm, parameters)
+        self.space = BodySpace(self.equations)
+        self.rows: Observation | None = None  # what is observed in place of the outputs
+        self.functionals = [output.functional(self.equations) for output in spec.outputs]
+        self._richer: dict[int, Enriched] = {}  # by how many degrees; copies share it
+
+    @cached_property
+    def reference(self) -> ReferenceFactor:
+        """The factor at the last reference given."""
+        return ReferenceFactor(self.equations)
+
+    def with_own_reference(self) -> Self:
+        """Return the same model with a reference factor of its own, which shares everything else with this one."""
+        other = copy.copy(self)
+        vars(other).pop("reference", None)
+        return other
+
+    @property
+    def enriched(self) -> Enriched:
+        """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used.
+
+        Raises
+        ------
+        SolveError
+            If something acts on it that has no place there.
+        """
+        if self.spec.remembers:
+            raise not_estimated(self.spec.remembers)
+        if 1 not in self._richer:
+            self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
+        return self._richer[1]
+
+    @property
+    def enriched_twice(self) -> Enriched | None:
+        """The same of two degrees more, to calibrate that; None where they take too much or are solved too roughly."""
+        spec = self.spec.enriched().enriched()
+        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
+        rough = spec.mixed and cost.way == Way.SMOOTHING
+        if cost.bytes <= MOST_BYTES and not rough and 2 not in self._richer:
+            self._richer[2] = Enriched(self.equations, spec, self.functionals)
+        return self._richer.get(2)
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> S:
+        """Find the equilibrium at `parameters` (d,); collective."""
+        raise NotImplementedError
+
+    def finer_mesh(self, spare: float) -> Calibrating[S]:
+        """Return the body on a finer mesh, which may cost so many solves."""
+        raise NotImplementedError
