@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from forward.fem import ranks
 from forward.fem.dolfinx import spaces
 from forward.fem.forms import Forms
-from forward.fem.linearisation import Linearisation
+from forward.fem.sensitivities import Sensitivities
 from forward.loaded import LoadedBody
 from forward.materials.admissible import moduli
 from forward.materials.material import constants
@@ -36,7 +36,7 @@ KEPT = 64  # sizes of loads
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that counts as rounding, over displacements relative to the body
 
 
-class Discretisation(Linearisation):
+class Discretisation(Sensitivities):
     """The discrete equations of a body, set to one state and one parameter vector at a time.
 
     It is the `System` on which Newton's method works. Meshes, compiled forms and solver objects are made once.

@@ -354,17 +354,6 @@ class Forms:
                 terms.append(ufl.Form([integral.reconstruct(changed)]))
         return sum(terms[1:], terms[0]) if terms else None
 
-    def along_parameters(self, integrand: Any) -> Any | None:
-        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction dω that is set; None if it depends on no parameter."""
-        present = set(ufl.algorithms.analysis.extract_constants(integrand * self.dx))
-        terms = [
-            direction * ufl.diff(integrand, self._variables[path])
-            for path, direction in self._directions.items()
-            if self._constants[path] in present
-        ]
-        terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
-        return sum(terms[1:], terms[0]) if terms else None
-
     def stiffness_form(self, imbalance: Any) -> Any:
         """Derivative of the imbalance by the state, in which the curvature of tools can be left out."""
         trial = ufl.TrialFunction(self.unknowns.whole)
@@ -374,46 +363,6 @@ class Forms:
             left_out = load.straight_stiffness(at, along) - self.derivative(work, trial)
             exact += (1 - self._curved) * left_out
         return exact
-
-    def derivative_before(self, form: Any) -> assembly.VectorAssembler | None:
-        """Derivative of a functional by the state at the end of the increment before; None if it depends on none."""
-        if self._before is None or self._before not in form.coefficients():
-            return None
-        return self.vector(ufl.derivative(form, self._before, self._variation))
-
-    @cached_property
-    def _rubbing_action(self) -> assembly.VectorAssembler:
-        """Derivative of the imbalance by the state before, along `_along`."""
-        return self.vector(ufl.derivative(self._rubbing_work, self._before, self._along))
-
-    @cached_property
-    def _rubbing_transposed(self) -> assembly.VectorAssembler:
-        """Its transpose."""
-        return self.vector(ufl.derivative(ufl.action(self._rubbing_work, self._along), self._before, self._variation))
-
-    @property
-    def _rubbing_work(self) -> Any:
-        return sum((work for work, _, _ in self._rubbing[1:]), self._rubbing[0][0])
-
-    @cached_property
-    def _parameter_force(self) -> assembly.VectorAssembler | None:
-        form = self._imbalance_form(self.along_parameters)
-        return None if form is None else self.vector(form, often=True)
-
-    @cached_property
-    def _field_forces(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
-        """The fields on which forces depend, each with ∂(wᵀF)/∂m by its values m at the vertices, with w = `_along`."""
-        found = []
-        for field in self.fields:
-
-            def by_vertices(integrand: Any, field: VertexField = field) -> Any | None:
-                return field.test * ufl.diff(integrand, field.log) if field.inside(integrand) else None
-
-            form = self._imbalance_form(by_vertices)
-            if form is not None:
-                form = ufl.replace(form, {self._variation: self._along})
-                found.append((field, self.by_vertices(form)))
-        return tuple(found)
 
     @cached_property
     def _weighted_imbalance(self) -> assembly.VectorAssembler:

@@ -1,9 +1,9 @@
-"""The linearised equations of a body: K = ∂F/∂u, solvers for it, and ∂F/∂ω."""
+"""The linearised equations of a body: K = ∂F/∂u, and solvers for it."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,7 +44,7 @@ class Preconditioner(NamedTuple):
 
 
 class Linearisation(Forms):
-    """Stiffness and derivatives of the forces, assembled at the current state and parameters.
+    """The stiffness, assembled at the current state and parameters.
 
     Vectors hold this rank's part (U_local,); rows of prescribed unknowns are those of the identity.
     """
@@ -357,65 +357,6 @@ class Linearisation(Forms):
         y[:, self.fixed] = x[:, self.fixed]
         return y
 
-    def set_before(self, u: FloatArray, share: float, shifts: Mapping[str, FloatArray]) -> None:
-        """Set the state (U_local,) at the end of the increment before, and what tools have moved since.
-
-        Parameters
-        ----------
-        u
-            The state.
-        share
-            The part of the load by which it has grown.
-        shifts
-            What tools have moved besides (m), by their labels.
-        """
-        self.latest.moved()
-        self.unknowns.give(self._before, u)
-        self._share.value = share
-        for label, shift in shifts.items():
-            self._shifts[label].value = shift
-
-    @property
-    def size_before(self) -> int:
-        """Number of values on this rank that an increment leaves: its unknowns, and what items keep behind them."""
-        return self.size + self.items.kept_size if self.items else self.size
-
-    def rubbed(self, w: FloatArray, *, transpose: bool = True) -> FloatArray:
-        """Product of the derivative of the imbalance by what the increment before has left with such a vector.
-
-        Or of its transpose with w (U_local,).
-        """
-        found = np.zeros(self.size)
-        if self._rubbing:
-            self.unknowns.give(self._along, w[: self.size])
-            self.work.residuals += 1
-            found = (self._rubbing_transposed if transpose else self._rubbing_action)()
-        if not self.items:
-            return found
-        if transpose:
-            return np.append(found, self.items.to_past(w))
-        return found + self.items.from_past(w[self.size :])
-
-    def left(self, states: FloatArray, before: FloatArray, directions: FloatArray) -> FloatArray:
-        """Return the changes of what the increment that is set leaves.
-
-        Parameters
-        ----------
-        states, before, directions
-            Changes of its state (k, U_local), of what the one before has left, and of the parameters (k, d).
-        """
-        if not self.items:
-            return states
-        return np.hstack([states, self.items.kept_along(states, before[:, self.size :], directions)])
-
-    def left_adjoint(self, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the transpose of `left` for weights (k, size_before): by state, by what was left before, (k, d)."""
-        states, before = weights[:, : self.size], np.zeros_like(weights)
-        if not self.items:
-            return states, before, np.zeros((len(weights), len(self.parameters)))
-        of_states, before[:, self.size :], of_parameters = self.items.kept_adjoint(weights[:, self.size :])
-        return states + of_states, before, of_parameters
-
     def assembled_stiffness(self) -> Any:
         """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
         self.latest.factorised = None
@@ -446,74 +387,3 @@ class Linearisation(Forms):
 
     def _condensed(self, negative: int | None) -> int | None:
         return None if negative is None else negative - self.unknowns.pressures
-
-    def unit_directions(self) -> Iterator[str]:
-        """Set the direction to each unit vector of the s parameters that are numbers of the model in turn."""
-        self._set_field_directions(np.zeros(len(self.parameters)))
-        for i in self.scalars:
-            path = self.parameters[i]
-            for other, direction in self._directions.items():
-                direction.value = 1.0 if other == path else 0.0
-            yield path
-
-    def _set_field_directions(self, direction: FloatArray) -> None:
-        for field in self.fields:
-            field.set_direction(direction)
-
-    def parameter_forces(self) -> FloatArray:
-        """∂F/∂ω (s, U_local) over all unknowns, at the state that is set, by the numbers of the model."""
-        forces = np.zeros((len(self.scalars), self.size))
-        for i, path in enumerate(self.unit_directions()):
-            if path in self._directions and self._parameter_force is not None:
-                self.work.residuals += 1
-                forces[i] = self._parameter_force()
-        if self.items:
-            rows = {self.parameters[i]: row for i, row in zip(self.scalars, forces, strict=True)}
-            for path, force in self.items.by_number():
-                if path in rows:
-                    rows[path] += force
-        return forces
-
-    def right_sides(self) -> FloatArray:
-        """Right-hand sides (s, U_local) of the tangents at the state that is set: K du/dω_i = b_i."""
-        right = -self.parameter_forces()
-        for i, path in enumerate(self.parameters[j] for j in self.scalars):
-            right[i, self.fixed] = 0
-            if path in self._movers:
-                w = np.zeros(right.shape[1])
-                w[self.fixed] = float(self._load.value) * self._movers[path]
-                right[i] -= self.stiffness_times(w)
-                right[i, self.fixed] = w[self.fixed]
-        return right
-
-    def right_sides_along(self, directions: FloatArray) -> FloatArray:
-        """Right-hand sides (k, U_local) of the tangents along directions (k, d) of the parameters, at the state set."""
-        right = directions[:, self.scalars] @ self.right_sides()
-        return right + self.field_right_sides(directions) if self.fields else right
-
-    def field_right_sides(self, directions: FloatArray) -> FloatArray:
-        """Right-hand sides (k, U_local) of tangents along the fields' part of directions (k, d), at the state set."""
-        right = np.zeros((len(directions), self.size))
-        for direction in self._directions.values():
-            direction.value = 0.0
-        positions = np.concatenate([field.positions for field in self.fields])
-        for row, direction in zip(right, directions, strict=True):
-            if self._parameter_force is not None and direction[positions].any():
-                self._set_field_directions(direction)
-                self.work.residuals += 1
-                row[:] = -self._parameter_force()
-        right[:, self.fixed] = 0
-        return right
-
-    def field_products(self, w: FloatArray) -> FloatArray:
-        """Products wᵀ∂F/∂ω (d,) with w (U_local,) at the state that is set; zero for the numbers of the model.
-
-        One assembly for each field, however many parameters it has.
-        """
-        products = np.zeros(len(self.parameters))
-        if self._field_forces:
-            self.unknowns.give(self._along, w)
-        for field, assemble in self._field_forces:
-            self.work.residuals += 1
-            products[field.positions] = field.vjp(assemble())
-        return products
