@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs

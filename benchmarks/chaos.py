@@ -15,7 +15,8 @@ from mpi4py import MPI
 from scipy.linalg import cho_solve
 
 from benchmarks.beams import CONFIG
-from forward.model import WORK, FloatArray, ForwardModel, FunctionModel, displacements
+from forward.model import WORK, FloatArray, ForwardModel, displacements
+from forward.pointwise import FunctionModel
 from uq.estimators.indices import coefficient_moments
 from uq.evaluation.block import Merger
 from uq.evaluation.evaluate import SerialEvaluate

@@ -15,7 +15,8 @@ import time
 
 import numpy as np
 
-from forward.model import FloatArray, FunctionModel
+from forward.model import FloatArray
+from forward.pointwise import FunctionModel
 from inverse.criticism.answer import answer
 from inverse.criticism.assessment import assess
 from inverse.criticism.predictive import examine_few

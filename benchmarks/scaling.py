@@ -38,7 +38,7 @@ SCRIPT = """
 import sys, time
 import numpy as np
 from mpi4py import MPI
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.turns import counter as shared_counter
 from uq.evaluation.request import Request

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from forward.model import FloatArray, FunctionModel
+from forward.model import FloatArray
+from forward.pointwise import FunctionModel
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from forward.model import FloatArray, FunctionModel
+from forward.model import FloatArray
+from forward.pointwise import FunctionModel
 from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal, Uniform

@@ -17,8 +17,6 @@ from forward.model import (
     Guess,
     MeshError,
     NodalSpace,
-    OfOne,
-    OneByOne,
     ReferenceSolution,
     Saturation,
     Solution,
@@ -26,6 +24,7 @@ from forward.model import (
     Stability,
     Work,
 )
+from forward.pointwise import OfOne, OneByOne
 
 
 def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:

@@ -1,18 +1,15 @@
-"""The contract of a forward model, and a model made of a plain Python function.
+"""The contract of a forward model.
 
 A model maps parameters (d,) to a solution; the solution is immutable and carries its own linearisation, so that a
 stale derivative cannot be written. Nothing here knows FEniCSx or MPI.
-
-The module is longer than others because the whole contract, most of it documentation, is in one place.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from itertools import repeat
 from typing import Protocol, Self
 
 import numpy as np
@@ -351,18 +348,6 @@ class Solution(Protocol):
         """
 
 
-class NamedOutput(Protocol):
-    """What a specification says about an output."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def unit(self) -> str:
-        """SI unit of its value; "1" for ratios."""
-
-
 class NodalSpace(Protocol):
     """The nodes of a body, the cells between them, and states over them, distributed over a group's ranks.
 
@@ -446,52 +431,6 @@ class ForwardModel(Protocol):
         """
 
 
-class OneByOne:
-    """`solve_many` for models that solve one point at a time."""
-
-    @property
-    def together(self) -> int:
-        """One."""
-        return 1
-
-    def solve_many(
-        self: ForwardModel, points: FloatArray, guesses: Iterable[Guess | None] | None = None
-    ) -> Iterator[Solution | SolveError]:
-        """Yield the solution at each of points (n, d), or why there is none; each is solved on demand."""
-        for point, guess in zip(points, guesses or repeat(None), strict=False):
-            try:
-                found: Solution | SolveError = self.solve(point, guess)
-            except SolveError as error:
-                found = error
-            yield found
-
-
-class OfOne(OneByOne):
-    """What a model has of the one `model` that it is made of."""
-
-    model: ForwardModel
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.model.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.model.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have tangents and adjoints."""
-        return self.model.differentiable
-
-    @property
-    def space(self) -> NodalSpace | None:
-        """Where the states live."""
-        return self.model.space
-
-
 def displacements(model: ForwardModel) -> int:
     """Return the number of displacements with which a state of a model begins; 0 without states."""
     return 0 if model.space is None else model.space.displacements
@@ -505,130 +444,3 @@ def gathered(model: ForwardModel, rows: FloatArray) -> FloatArray | None:
 def scattered(model: ForwardModel, rows: FloatArray) -> FloatArray:
     """Take this rank's part (k, U_local) of states (k, U) of a model; the (empty) rows without states."""
     return rows if model.space is None else model.space.scatter(rows)
-
-
-def real(returned: object, what: str) -> FloatArray:
-    """Return what a user's function has returned as an array of real numbers.
-
-    Raises
-    ------
-    ModelError
-        If it is not such an array: text, complex numbers, rows of different lengths.
-    """
-    try:
-        found = np.asarray(returned)
-        if found.dtype.kind in "biufO":
-            return found.astype(float)
-        given = {"c": "complex numbers", "U": "text", "S": "bytes"}.get(found.dtype.kind, str(found.dtype))
-    except (TypeError, ValueError, OverflowError):
-        given = f"{type(returned).__name__} that holds more than numbers, or rows of different lengths"
-    message = f"the model's {what} returned {given}, expected real numbers"
-    raise ModelError(message)
-
-
-@dataclass(frozen=True)
-class FunctionModel(OneByOne):
-    """A forward model made of a Python function of a parameter vector.
-
-    Parameters
-    ----------
-    function
-        (d,) → (m,), or a number when there is one output. It may raise `SolveError`.
-    parameters, outputs
-        Names.
-    jacobian
-        (d,) → (m, d); without it, solutions have no derivatives.
-    """
-
-    function: Callable[[FloatArray], ArrayLike]
-    parameters: tuple[str, ...]
-    outputs: tuple[str, ...]
-    jacobian: Callable[[FloatArray], ArrayLike] | None = None
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether a jacobian was given."""
-        return self.jacobian is not None
-
-    @property
-    def space(self) -> None:
-        """No states."""
-        return
-
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FunctionSolution:
-        """Evaluate the function at `parameters` (d,); there is no state to guess, and nothing to iterate on."""
-        # Copies: neither the caller nor the function can change a solution afterwards.
-        point = np.array(parameters, dtype=float)
-        point.flags.writeable = False
-        outputs = np.array(real(self.function(point), "function"), ndmin=1)
-        if outputs.shape != (len(self.outputs),):
-            message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
-            raise ModelError(message)
-        if not np.isfinite(outputs).all():
-            raise SolveError("the model's function returned a value that is not finite")
-        outputs.flags.writeable = False
-        return FunctionSolution(self, point, outputs)
-
-
-class ExplicitSolution:
-    """A solution without a mesh, of which the derivatives (m, d) of the outputs are known, or quickly found."""
-
-    residual, converged, stability = 0.0, True, Stability.NOT_TESTED
-
-    @property
-    def state(self) -> FloatArray:
-        """No state: an empty array."""
-        return np.empty(0)
-
-    @property
-    def jacobian(self) -> FloatArray:
-        """Derivatives (m, d) of the outputs."""
-        raise NotImplementedError
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along `direction` (d,), or (k, m) for k of them."""
-        return np.asarray(direction) @ self.jacobian.T
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return np.asarray(weights) @ self.jacobian
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """No state: empty."""
-        return np.empty((*np.shape(direction)[:-1], 0))
-
-    def mesh_error(self) -> None:
-        """No mesh."""
-        return
-
-    def saturation(self, spare: float = math.inf) -> None:
-        """No mesh."""
-        return
-
-
-@dataclass(frozen=True)
-class FunctionSolution(ExplicitSolution):
-    """The value of a `FunctionModel` at one parameter vector."""
-
-    model: FunctionModel
-    parameters: FloatArray
-    outputs: FloatArray
-    work: Work = field(default_factory=Work)
-
-    @property
-    def jacobian(self) -> FloatArray:
-        """Derivatives (m, d) of the outputs.
-
-        Raises
-        ------
-        DerivativeError
-            If there are none.
-        """
-        if self.model.jacobian is None:
-            raise DerivativeError("this model was given without a jacobian, so it has no derivatives")
-        jacobian = real(self.model.jacobian(self.parameters), "jacobian")
-        expected = self.outputs.size, self.parameters.size
-        if jacobian.size != np.prod(expected) or (jacobian.shape != expected and 1 not in expected):
-            message = f"the model's jacobian returned shape {jacobian.shape}, expected {expected}"
-            raise ModelError(message)
-        return jacobian.reshape(expected)

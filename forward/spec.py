@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 from forward.model import ModelError
 from forward.registry import Kinds, OfKind
@@ -24,12 +24,24 @@ if TYPE_CHECKING:
     from forward.fem.mesh_error_cost import Estimate
     from forward.findings import Finding
     from forward.materials.admissible import Materials
-    from forward.model import FloatArray, ForwardModel, NamedOutput
+    from forward.model import FloatArray, ForwardModel
 
 UNREFINED = (
     "meshes are refined by studies that sample a model; run one, and name the mesh that it leaves: "
     "body = { kind = 'mesh', file = 'DIR/mesh.npz' }"
 )
+
+
+class NamedOutput(Protocol):
+    """What a specification says about an output."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def unit(self) -> str:
+        """SI unit of its value; "1" for ratios."""
 
 
 class ModelSpec(Settings):

@@ -20,7 +20,7 @@
 # %matplotlib inline
 import numpy as np
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 
 
 def deflection(p):

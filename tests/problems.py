@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.criticism.answer import quantiles
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from forward.model import FunctionModel, FunctionSolution
+from forward.pointwise import FunctionModel, FunctionSolution
 
 
 class Everywhere:

@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from benchmarks.simulated import calibrate, rank_by_laplace, rank_by_weights
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior

@@ -21,7 +21,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from forward.external.own_modules import imported
 from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_stop
-from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
+from forward.model import FloatArray, ModelError, SolveError
+from forward.pointwise import FunctionModel, real
 from forward.scalars import Scalar
 from forward.settings import Settings, nearest
 from forward.spec import ModelSpec

@@ -30,7 +30,8 @@ from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
 from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows
-from forward.model import FloatArray, ForwardModel, Guess, ModelError, OfOne, OneByOne, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError
+from forward.pointwise import OfOne, OneByOne
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel

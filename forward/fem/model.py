@@ -22,16 +22,8 @@ from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import Observation
 from forward.loaded import LoadedBody
 from forward.materials.admissible import Admission
-from forward.model import (
-    FloatArray,
-    Guess,
-    InadmissibleError,
-    OneByOne,
-    ReferenceSolution,
-    Solution,
-    SolveError,
-    Work,
-)
+from forward.model import FloatArray, Guess, InadmissibleError, ReferenceSolution, Solution, SolveError, Work
+from forward.pointwise import OneByOne
 from forward.solvers.equilibrium import solve, solving
 from forward.solvers.steps import Task, failed, finish_all
 from forward.solvers.system import Found

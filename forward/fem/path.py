@@ -25,7 +25,8 @@ from forward.fem.model import RAISES, STIFFER, HyperelasticModel
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace
 from forward.loaded import LoadedBody
-from forward.model import FloatArray, Guess, OneByOne, Saturation, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, Saturation, SolveError, Stability, Work
+from forward.pointwise import OneByOne
 from forward.solvers.acceptance import Diverged
 from forward.solvers.newton import newton
 from forward.solvers.system import Found

@@ -38,7 +38,8 @@ from forward.materials.material import (
     measures,
     of_volume,
 )
-from forward.model import FloatArray, FunctionModel, FunctionSolution, Guess, InadmissibleError, OneByOne, SolveError
+from forward.model import FloatArray, Guess, InadmissibleError, SolveError
+from forward.pointwise import FunctionModel, FunctionSolution, OneByOne
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]

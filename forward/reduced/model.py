@@ -16,17 +16,8 @@ from numpy.typing import NDArray
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
-from forward.model import (
-    ExplicitSolution,
-    FloatArray,
-    ForwardModel,
-    Guess,
-    OneByOne,
-    Solution,
-    SolveError,
-    Stability,
-    Work,
-)
+from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError, Stability, Work
+from forward.pointwise import ExplicitSolution, OneByOne
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools

@@ -7,7 +7,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from forward.combine import Joined
-from forward.model import ExplicitSolution, FloatArray, Guess, OfOne, Stability, Work
+from forward.model import FloatArray, Guess, Stability, Work
+from forward.pointwise import ExplicitSolution, OfOne
 
 if TYPE_CHECKING:
     from forward.fem.space import Observation

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from forward.model import FloatArray, FunctionModel, SolveError
+from forward.model import FloatArray, SolveError
+from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer, Solved
 from inverse.methods.invert import LEAST_SHARED
 from uq.evaluation.request import Evaluate, Request

@@ -9,7 +9,8 @@ from scipy.sparse import csr_matrix
 from forward.combine import Joined, Mapped, Rows, Sparse, selected
 from forward.conformance import check_derivatives
 from forward.fem.finer import FromStart, Otherwise, limit
-from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, Work
+from forward.model import MeshError, Saturation, Work
+from forward.pointwise import FunctionModel, FunctionSolution
 
 pytestmark = pytest.mark.unit
 POINT = np.array([0.7, 1.2])

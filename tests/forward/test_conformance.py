@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from forward.conformance import check_derivatives
-from forward.model import DerivativeError, FunctionModel, FunctionSolution
+from forward.model import DerivativeError
+from forward.pointwise import FunctionModel, FunctionSolution
 from tests.launch import run_script
 
 POINT = np.array([0.7, 1.3])

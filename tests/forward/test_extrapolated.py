@@ -6,7 +6,8 @@ from scipy.sparse import csr_matrix
 
 from forward.combine import Joined
 from forward.fem.finer import FromStart, Otherwise, limit
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 
 pytestmark = pytest.mark.unit
 

@@ -17,7 +17,6 @@ from forward.model import (
     Guess,
     InadmissibleError,
     MeshError,
-    OfOne,
     Saturation,
     Solution,
     SolveError,
@@ -26,6 +25,7 @@ from forward.model import (
     gathered,
     scattered,
 )
+from forward.pointwise import OfOne
 from uq.evaluation.checkpoint import read
 from uq.evaluation.request import Evaluations, Failure
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from forward.external.derivatives import contradicted, mistrusted
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 
 pytestmark = pytest.mark.unit
 

@@ -11,7 +11,8 @@ from forward.combine import selected
 from forward.external.models import PythonModel
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.hyperelastic import Hyperelastic
-from forward.model import FunctionModel, Guess, ReferenceSolution
+from forward.model import Guess, ReferenceSolution
+from forward.pointwise import FunctionModel
 from forward.specimen import Specimen
 from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
 from tests.launch import ROOT, UP_TO_RANKS, run_script

@@ -8,7 +8,8 @@ import pytest
 from mpi4py import MPI
 
 from forward.hyperelastic import Hyperelastic
-from forward.model import WORK, FunctionModel, Guess, ReferenceSolution
+from forward.model import WORK, Guess, ReferenceSolution
+from forward.pointwise import FunctionModel
 from forward.solvers import newton as newtons
 from forward.solvers.acceptance import Diverged
 from forward.solvers.joined import same

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
 from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
 from inverse.criticism.predictive import examine, examine_few

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from inverse.criticism.predictive import (
     examine,
     examine_few,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.errors import NormalErrors, StudentErrors
 from inverse.data.measurements import Measurements

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 
 from forward.materials.admissible import Materials
 from forward.materials.material_point import HomogeneousModel, MaterialTest
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import own_seconds
 from inverse.criticism.weights import pareto_shape
 from inverse.low_dimensional.evidence import evidence

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from inverse.criticism.answer import answer, by_gaussian, counts, gaussian_points
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains

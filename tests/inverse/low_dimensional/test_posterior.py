@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from tests.rubber import CURVED, FACTOR, LINEAR, on_treloar

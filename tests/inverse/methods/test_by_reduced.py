@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from forward.reduced.spec import Reduced
 from inverse.criticism.doubts import reduced_off
 from inverse.data.outputs import stated

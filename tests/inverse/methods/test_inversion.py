@@ -14,7 +14,8 @@ from mpi4py import MPI
 
 import inverse.methods.invert_field
 from benchmarks import buckling
-from forward.model import FunctionModel, SolveError, Stability
+from forward.model import SolveError, Stability
+from forward.pointwise import FunctionModel
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.measurements import Measurements
 from inverse.data.rigid import turned

@@ -8,7 +8,7 @@ import xarray as xr
 
 from forward.combine import selected
 from forward.conformance import check_derivatives
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from tests.rubber import CONFIGS
 from workflows.__main__ import main
 from workflows.config.study import StudyError, document, load, parse

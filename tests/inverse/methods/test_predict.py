@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode

@@ -18,7 +18,7 @@ from scipy.stats import multivariate_normal
 
 import forward.fem.finer
 from forward.fem.finer import OtherMesh, extrapolated
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from inverse.methods.shared_expansion import shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform

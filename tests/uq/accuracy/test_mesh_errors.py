@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
+from forward.model import MeshError, Saturation, SolveError, Work
+from forward.pointwise import FunctionModel, FunctionSolution
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
 from uq.accuracy.doubts import Told
 from uq.accuracy.effects import CHANGED, DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors

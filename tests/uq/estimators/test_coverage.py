@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.estimators.moments import estimate, monomials
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform

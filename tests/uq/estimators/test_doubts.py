@@ -6,7 +6,7 @@ import xarray as xr
 
 from benchmarks import tails
 from benchmarks.coverage import CASES, Vectorised, measure
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from tests.states import WithState
 from uq.estimators.doubts import of_indices
 from uq.evaluation.evaluate import SerialEvaluate

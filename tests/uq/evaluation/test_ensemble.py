@@ -14,7 +14,8 @@ import time
 import weakref
 import numpy as np
 from mpi4py import MPI
-from forward.model import FunctionModel, SolveError
+from forward.pointwise import FunctionModel
+from forward.model import SolveError
 from uq.inputs.distributions import Uniform
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate

@@ -6,7 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, ModelError, SolveError
+from forward.model import ModelError, SolveError
+from forward.pointwise import FunctionModel
 from uq.evaluation.block import merge
 from uq.evaluation.checkpoint import Checkpoint, DamagedError, read
 from uq.evaluation.checkpoint import load as load_evaluations

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.model import FunctionModel, Guess, InadmissibleError, OneByOne, SolveError
+from forward.model import Guess, InadmissibleError, SolveError
+from forward.pointwise import FunctionModel, OneByOne
 from tests.states import WithState
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder, SerialEvaluate

@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble

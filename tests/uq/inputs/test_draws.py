@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.estimators.of_draws import with_errors_of_draws
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal, Uniform

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.accuracy.goal import Goal
 from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import Recorder, SerialEvaluate

@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble

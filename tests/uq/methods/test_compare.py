@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from tests.launch import ROOT, run
 from uq.estimators.scores import gains, plain_samples
 from uq.evaluation.checkpoint import Checkpoint

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import roots_jacobi
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
 from uq.inputs.distributions import Uniform

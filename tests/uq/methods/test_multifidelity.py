@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, Guess, OneByOne, SolveError, Stability, Work
+from forward.model import Guess, SolveError, Stability, Work
+from forward.pointwise import FunctionModel, OneByOne
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import SerialEvaluate

@@ -12,7 +12,8 @@ from scipy import stats
 
 from benchmarks import coverage, skewed, tails
 from benchmarks.coverage import Vectorised, measure
-from forward.model import FunctionModel, SolveError
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
 from tests.functions import higher_moments
 from tests.launch import run_script
 from uq.evaluation.evaluate import SerialEvaluate
@@ -628,7 +629,7 @@ def test_quantiles_and_their_errors():
 RANKS = """
 import numpy as np
 from mpi4py import MPI
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.inputs.distributions import Uniform
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel, OneByOne, Solution, SolveError
+from forward.model import Solution, SolveError
+from forward.pointwise import FunctionModel, OneByOne
 from tests.launch import run_script
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
 from uq.evaluation.evaluate import SerialEvaluate

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.distributions import Uniform

@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from forward.external.models import Value
 from forward.scalars import Scalar
 from forward.settings import Settings

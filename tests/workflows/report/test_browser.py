@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from tests.browser import executable, without_fault
 from tests.workflows.report.test_report import CUBE, HEXAHEDRON, solve, study, write
 from uq.evaluation.evaluate import SerialEvaluate

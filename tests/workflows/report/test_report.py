@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from forward import readable
 from forward import words as numbers
-from forward.model import WORK, FunctionModel, SolveError
+from forward.model import WORK, SolveError
+from forward.pointwise import FunctionModel
 from uq.estimators.indices import field_indices
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal, Uniform

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from tests.launch import TISSUQ, environment
 from tests.launch import run as on_ranks
 from uq.estimators.averaged import average

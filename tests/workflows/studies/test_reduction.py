@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel
+from forward.pointwise import FunctionModel
 from forward.reduced.data import load as load_model
 from forward.reduced.model import ReducedModel
 from tests import launch
