@@ -336,7 +336,7 @@ class JoinedSolution:
     @cached_property
     def state(self) -> FloatArray:
         """This rank's part of the states (U_local,)."""
-        found = side_by_side([one.state for one in self.solutions], self.order)
+        found = side_by_side([one.state for one in self.solutions], self.order) if self.order else np.zeros(0)
         found.flags.writeable = False
         return found
 

@@ -244,3 +244,41 @@ def _unpacked(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
             return tuple(_unpacked(one, arrays) for one in value["tuple"])
         case _:
             return value["table"]
+
+
+class ReducedSpace:
+    """The `NodalSpace` of a reduced model: every rank has all of it."""
+
+    def __init__(self, data: ReducedData, places: NDArray[np.int64], base: FloatArray) -> None:
+        self._data, self._places, self._base = data, places, base
+        self.coordinates = data.places
+        self.displacements = data.places.size
+
+    def cells(self) -> tuple[NDArray[np.int64], int]:
+        """Return all cells as nodes, and VTK's number of their type."""
+        return self._data.cells, self._data.cell_kind
+
+    def regions(self) -> NDArray[np.int64] | None:
+        """Return the region of each cell; None without regions."""
+        return self._data.regions
+
+    def gather(self, rows: FloatArray) -> FloatArray:
+        """Return the rows: they are whole."""
+        return rows
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Return the rows: they are whole."""
+        return rows
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d), at the nodes."""
+        whole = np.tile(self._base, (len(points), 1))
+        whole[:, self._places] = points
+        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
+        return {label: np.exp(log + whole[:, which] @ slopes.T) for (label, which), (log, slopes, _) in pairs}
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
+        return {label: kept for (label, _), (_, _, kept) in pairs}

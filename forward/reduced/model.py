@@ -7,21 +7,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from forward.combine import Joined
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError, Stability, Work
 from forward.pointwise import ExplicitSolution, OneByOne
-from forward.reduced.data import ReducedData
+from forward.reduced.data import ReducedData, ReducedSpace
 from forward.reduced.level import Level
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
 from forward.reduced.together import SINGLE, TOGETHER, TOLERANCE, equilibria
+
+if TYPE_CHECKING:
+    from forward.fem.space import Observation
+    from forward.fem.specimen import SpecimenModel
 
 BEYOND = 0.25  # of the range of an output in the snapshots, how far beyond it is cut off
 
@@ -107,6 +113,7 @@ class ReducedModel(OneByOne):
         self.way: Way = under_tools if touched and not self.level.pressures else newton
         self.touched = touched
         self._tolerance, self._full, self._unbalanced = tolerance, full, unbalanced
+        self.observed: tuple[FloatArray, Observation] | None = None  # what is observed in place of the outputs
         self.range: tuple[FloatArray, FloatArray] | None = None
         if within and "highest" in data.about:  # not in older files
             lowest, highest = (np.array(data.about[name])[self.which] for name in ("lowest", "highest"))
@@ -116,7 +123,24 @@ class ReducedModel(OneByOne):
     @property
     def together(self) -> int:
         """How many points are solved in lockstep; one where the stiffness at each is needed, as under tools."""
-        return TOGETHER if not self.tested and not self.touched and self._tolerance is None else 1
+        alone = self.tested or self.touched or self._tolerance is not None or self.observed is not None
+        return 1 if alone else TOGETHER
+
+    def with_rows(self, seen: FloatArray, rows: Observation, names: tuple[str, ...]) -> ReducedModel:
+        """Return the same model with what is observed of it as outputs.
+
+        Parameters
+        ----------
+        seen
+            What is observed (n, N) of its coordinate fields.
+        rows
+            Which outputs of the body are observed besides.
+        names
+            Of what is observed.
+        """
+        other = copy(self)
+        other.outputs, other.observed = names, (seen, rows)
+        return other
 
     def solve_many(
         self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
@@ -221,44 +245,6 @@ class ReducedModel(OneByOne):
         return predictor(self.data, self.level)
 
 
-class ReducedSpace:
-    """The `NodalSpace` of a reduced model: every rank has all of it."""
-
-    def __init__(self, data: ReducedData, places: NDArray[np.int64], base: FloatArray) -> None:
-        self._data, self._places, self._base = data, places, base
-        self.coordinates = data.places
-        self.displacements = data.places.size
-
-    def cells(self) -> tuple[NDArray[np.int64], int]:
-        """Return all cells as nodes, and VTK's number of their type."""
-        return self._data.cells, self._data.cell_kind
-
-    def regions(self) -> NDArray[np.int64] | None:
-        """Return the region of each cell; None without regions."""
-        return self._data.regions
-
-    def gather(self, rows: FloatArray) -> FloatArray:
-        """Return the rows: they are whole."""
-        return rows
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Return the rows: they are whole."""
-        return rows
-
-    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
-        """Return the factors (n, N) of each random field at parameters (n, d), at the nodes."""
-        whole = np.tile(self._base, (len(points), 1))
-        whole[:, self._places] = points
-        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
-        return {label: np.exp(log + whole[:, which] @ slopes.T) for (label, which), (log, slopes, _) in pairs}
-
-    @property
-    def variance_kept(self) -> dict[str, float]:
-        """Fraction of the variance of each random field that its modes make."""
-        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
-        return {label: kept for (label, _), (_, _, kept) in pairs}
-
-
 class ReducedSolution(ExplicitSolution):
     """An equilibrium of a reduced model, with its linearisation and an estimate of its error."""
 
@@ -277,6 +263,10 @@ class ReducedSolution(ExplicitSolution):
         self.outputs = model.level.outputs(c, whole) if outputs is None else outputs
         if model.range is not None:
             self.outputs = np.clip(self.outputs, *model.range)
+        if model.observed is not None:
+            seen, rows = model.observed
+            own = self.outputs
+            self.outputs = rows.with_outputs(seen @ c, lambda: own)
         self.stability = self._stability()
         for array in (self.parameters, self.c, self.outputs):
             array.flags.writeable = False
@@ -326,11 +316,16 @@ class ReducedSolution(ExplicitSolution):
     @cached_property
     def jacobian(self) -> FloatArray:
         """Derivatives (m, d) of the outputs."""
+        if self._model.observed is None:
+            return self._own_jacobian()
+        seen, rows = self._model.observed
+        return rows.with_outputs((seen @ self.slopes).T, lambda: self._own_jacobian().T).T
+
+    def _own_jacobian(self) -> FloatArray:
         model = self._model
         by_state, directly = model.level.output_slopes(self.c, self._whole, self.stiffness, self._F)
         free = model.level.free
-        found = by_state[:, free] @ self.slopes[free] + directly[:, model.places]
-        return np.asarray(found)
+        return np.asarray(by_state[:, free] @ self.slopes[free] + directly[:, model.places])
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U,) along a `direction` (d,), or (k, U) for k of them."""
@@ -396,6 +391,17 @@ class ReducedSolution(ExplicitSolution):
         F = larger.by_parameters(c, self._whole, K)
         by_state, directly = larger.output_slopes(c, self._whole, K, F)
         return np.asarray((by_state[:, free] @ _slopes(larger, K, F)[free] + directly)[:, model.places])
+
+
+def observed_by(specimen: SpecimenModel, models: tuple[ReducedModel, ...]) -> Joined:
+    """Return reduced models of the load cases with parameters and outputs of a specimen; collective over its ranks."""
+    found = []
+    for one, body, model in zip(specimen.models, specimen.bodies, models, strict=True):
+        assert body.rows is not None
+        equations, fields = body.equations, body.space.scatter(model.data.fields[: model.level.count])
+        seen = equations.total((body.rows.matrix(equations) @ fields.T).T).T
+        found.append(replace(one, model=model.with_rows(seen, body.rows, body.outputs)))
+    return Joined(tuple(found), specimen.outputs, specimen.labels)
 
 
 def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:

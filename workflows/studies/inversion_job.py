@@ -335,7 +335,7 @@ def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
     found = zip(study.reduced.values(), bodies, acting, strict=True)
     models = tuple(one.standing_for(body, paths) for one, body, paths in found)
-    observed_by = named("forward.reduced.specimen:observed_by")
+    observed_by = named("forward.reduced.model:observed_by")
     return lambda observed: cast("ForwardModel", observed_by(observed, models))
 
 
