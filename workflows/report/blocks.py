@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
 
 Row = TypeVar("Row")
+Level = Literal[1, 2, 3]  # of a heading
 CURVE = 48  # points
 ALIKE = 1e-12  # standard deviation over the mean up to which values are the same
 HALF = 8.0  # inches: wider pictures are not legible on half a page
@@ -40,7 +41,7 @@ class Heading(Block):
     """A heading; level 1 is the title of the page."""
 
     text: str
-    level: Literal[1, 2, 3] = 2
+    level: Level = 2
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ class Table(Block):
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    text: frozenset[int] = frozenset({0})
-    long: frozenset[int] = frozenset()
+    text: Collection[int] = (0,)
+    long: Collection[int] = ()
     strong: int | None = None
 
     @classmethod
@@ -82,8 +83,7 @@ class Table(Block):
         long: Collection[int] = (),
     ) -> Table:
         """Write rows of anything by what each column says of one."""
-        cells = [[cell(row) for cell in columns.values()] for row in rows]
-        return cls(tuple(columns), cells, frozenset(text), frozenset(long))
+        return cls(tuple(columns), [[cell(row) for cell in columns.values()] for row in rows], text, long)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from forward.words import NONE, with_error
 from uq.estimators.estimate import PARTS, holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
-from workflows.report.blocks import Block, Table
+from workflows.report.blocks import Block, Heading, Level, Table
 from workflows.report.words import solves
 
 if TYPE_CHECKING:
@@ -174,12 +174,29 @@ class Section(ABC):
         """Headings, sentences, tables and pictures, from top to bottom."""
 
 
-def section(*needs: str, when: Callable[[Results], bool] | None = None) -> Callable[[Content], type[Section]]:
-    """Make a section of a function from results to blocks: of what it needs, and when it applies if that says less."""
+def section(
+    *needs: str, heading: str = "", level: Level = 2, when: Callable[[Results], bool] | None = None
+) -> Callable[[Content], type[Section]]:
+    """Make a section of a function from results to blocks, under a heading that is always the same.
+
+    Parameters
+    ----------
+    needs
+        Variables of the results without which there is nothing to say.
+    heading, level
+        What stands above it, if that does not depend on the results.
+    when
+        Whether it applies to results that hold what it needs.
+    """
 
     def made(content: Content) -> type[Section]:
+        def whole(_: Section, results: Results) -> Iterator[Block]:
+            if heading:
+                yield Heading(heading, level)
+            yield from content(results)
+
         members: dict[str, Any] = {"__doc__": content.__doc__, "__module__": content.__module__, "needs": needs}
-        members["content"] = lambda _, results: content(results)
+        members["content"] = whole
         if when is not None:
             members["applies"] = lambda self, results: Section.applies(self, results) and when(results)
         return type(content.__name__, (Section,), members)

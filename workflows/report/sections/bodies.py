@@ -113,9 +113,7 @@ def largest(dataset: xr.Dataset) -> str:
     return f"at most {size(float(np.linalg.norm(field, axis=1).max()), 'm', 4)}"
 
 
-@section(
-    when=lambda results: "contact_pressure" in results.dataset and bool((results.dataset["contact_pressure"] > 0).any())
-)
+@section("contact_pressure", when=lambda results: bool((results.dataset["contact_pressure"] > 0).any()))
 def contact(results: Results) -> Iterator[Block]:
     """A map of the pressure of each tool."""
     dataset = results.dataset
@@ -137,18 +135,16 @@ def contact(results: Results) -> Iterator[Block]:
 
 
 def _curve_applies(results: Results) -> bool:
-    """Whether there are steps."""
-    drawn = {"mean", "nominal"} & set(results.dataset.variables)
-    return "output_of" in results.dataset.coords and bool(drawn) and isinstance(results.study.model, PathOfLoads)
+    """Whether outputs at steps were estimated."""
+    return bool({"mean", "nominal"} & set(results.dataset)) and isinstance(results.study.model, PathOfLoads)
 
 
-@section(when=_curve_applies)
+@section("output_of", heading="Over the path", when=_curve_applies)
 def curve(results: Results) -> Iterator[Block]:
     """Curves with bands, and which parameters matter at which step."""
     dataset, spec = results.dataset, results.study.model
     along = spec.leading
     unit = spec.unit_of(along)
-    yield Heading("Over the path")
     yield Text(f"{spoken(along)}: {spec.in_words(along)}; every step is solved from the one before.")
     drawn = []
     for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
@@ -166,11 +162,10 @@ LEAST = 3  # places that make a map
 
 
 # If outputs of load cases of a specimen were inverted.
-@section("datum_axis", when=lambda results: bool((results.dataset["datum_axis"] >= len(AXES)).any()))
+@section("datum_axis", heading="Forces", when=lambda results: bool((results.dataset["datum_axis"] >= len(AXES)).any()))
 def places(results: Results) -> Iterator[Block]:
     """Measured and predicted forces, and a map of what each place tells."""
     model: Specimen = results.study.model
-    yield Heading("Forces")
     several = results.dataset.sizes["data_set"] > 1
     for one in first(results):
         drawn = list(_measured(one, model))
@@ -220,7 +215,7 @@ def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Ta
         told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
         rows.append((case, name, *misses(one.isel(datum=k), unit), *told))
     more = ["information alone (nat)"] if alone else []
-    return Table(["load case", "output", *MISSES, *more], rows, text=frozenset({0, 1}))
+    return Table(["load case", "output", *MISSES, *more], rows, text={0, 1})
 
 
 MISSES = ("measured", "predicted", "residual over its error")

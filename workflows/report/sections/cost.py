@@ -23,10 +23,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-@section("row_method")
+@section("row_method", heading="Error against cost")
 def error_against_cost(results: Results) -> Iterator[Block]:
     """Errors of several methods against their cost."""
-    yield Heading("Error against cost")
     yield Text(
         "The reference, with its own standard errors; the error due to the tolerance of the solver (against the "
         "textbook solver, on some draws); the error of the mesh, by estimate or (method.mesh_error) by a "
@@ -108,10 +107,9 @@ CHOSEN = (
 )
 
 
-@section("fidelity_cost")
+@section("fidelity_cost", heading="Models")
 def fidelities(results: Results) -> Iterator[Block]:
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
-    yield Heading("Models")
     yield models(results)
     yield Text(
         "A correlation is that with the outputs of the model of the study, in the pilot; in brackets, that of what "
@@ -171,10 +169,9 @@ def worth(results: Results) -> Table:
     return Table((*head, *(f"{words[name]}, predicted" for name in others)), rows)
 
 
-@section("level_change")
+@section("level_change", heading="Levels")
 def levels(results: Results) -> Iterator[Block]:
     """Costs and accuracy of the levels of multilevel chaos."""
-    yield Heading("Levels")
     yield Text(
         "Every level starts its samples from the expansion of the previous level. Residuals are relative to the loads."
     )

@@ -22,12 +22,11 @@ BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
 ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at the mean parameters"}
 
 
-@section(when=lambda results: "nominal" in results.dataset and bool(results.study.spec.meshed))
+@section("nominal", heading="Error budget", when=lambda results: bool(results.study.spec.meshed))
 def error_budget(results: Results) -> Iterator[Block]:
     """The errors of sampling, the mesh and the solver in each estimate."""
     shown = [name for name in ESTIMATES if name in results.dataset]
     shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
-    yield Heading("Error budget")
     yield Text(sentence(results, shown[0]))
     counts = counting(results) & np.isin(results.outputs, results.drawn)
     outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
@@ -126,12 +125,11 @@ def table(results: Results, names: list[str]) -> Table:
     return Table(head, rows)
 
 
-@section(when=lambda results: "accuracy" in results.summary)
+@section(heading="Tolerance", when=lambda results: "accuracy" in results.summary)
 def tolerance(results: Results) -> Iterator[Block]:
     """The budget of a tolerance."""
     told = results.summary["accuracy"]
     worst = f"the {told['worst']['of']} of {told['worst']['output']}"
-    yield Heading("Tolerance")
     asked, reached = number(100 * told["tolerance"]), number(100 * told["reached"], 2)
     yield Text(
         f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
@@ -166,10 +164,9 @@ def tolerance(results: Results) -> Iterator[Block]:
         yield Text("Values are corrected by the estimated error of the mesh. Shares are of the tolerance.")
 
 
-@section("mesh_samples")
+@section("mesh_samples", heading="Meshes")
 def meshes(results: Results) -> Iterator[Block]:
     """The meshes of a multilevel method, and the contribution of each."""
-    yield Heading("Meshes")
     dataset, told = results.dataset, results.summary["meshes"]
     yield Table.of(
         range(len(told)),
@@ -247,7 +244,7 @@ def finer_meshes(results: Results) -> Iterator[Block]:
         rows.append((str(model), corrected, moved, size, most, ", ".join(listed)))
     unknowns = "unknowns, in deviations of the posterior"
     head = ("model", "corrected", "ln Z", "data, over the errors", "at most", unknowns)
-    yield Table(head, rows, text=frozenset({0, 1, 5}), long=frozenset({5}))
+    yield Table(head, rows, text={0, 1, 5}, long={5})
 
 
 @section("mesh_indicator")
@@ -285,4 +282,4 @@ def cycles(results: Results) -> Table:
             found += [size(at.value, unit, 4), NONE if np.isnan(at.mesh) else sign + size(at.mesh, unit, like=at.value)]
         rows.append((f"{told['cells']:,}", f"{told['unknowns']:,}", duration(told["cpu_seconds"]), *found))
     head = ("cells", "unknowns", "processor time")
-    return Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=frozenset())
+    return Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=())

@@ -16,10 +16,9 @@ from workflows.report.plots.moments import WORDS
 from workflows.report.section import Results, section
 
 
-@section("mean", "nominal")
+@section("mean", "nominal", heading="Mean and standard deviation")
 def moments(results: Results) -> Iterator[Block]:
     """Mean and standard deviation of the outputs, with their errors."""
-    yield Heading("Mean and standard deviation")
     yield Text("± is one standard error; a 95\u00a0% interval is about twice as wide on either side.")
     kinds = [
         *WORDS.items(),
@@ -29,10 +28,9 @@ def moments(results: Results) -> Iterator[Block]:
     yield results.estimates({name: word for name, word in kinds if name in results.dataset})
 
 
-@section("bias_error")
+@section("bias_error", heading="Total errors", level=3)
 def total_errors(results: Results) -> Iterator[Block]:
     """Errors of means and standard deviations by source."""
-    yield Heading("Total errors", level=3)
     yield Text("The error of the mesh is estimated from the differences between meshes.")
     rows = []
     for output in results.outputs:
@@ -45,10 +43,9 @@ def total_errors(results: Results) -> Iterator[Block]:
     yield Table(("estimate", "sampling", "mesh", "total"), rows)
 
 
-@section("quantiles")
+@section("quantiles", heading="Quantiles", level=3)
 def quantiles(results: Results) -> Iterator[Block]:
     """Quantiles of the outputs."""
-    yield Heading("Quantiles", level=3)
     rows = []
     for output in results.outputs:
         found = estimate_of(results.of(output), "quantiles")
@@ -62,20 +59,20 @@ def quantiles(results: Results) -> Iterator[Block]:
     yield Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 
-@section("nominal")
+@section("nominal", heading="Outputs at the mean parameters")
 def nominal(results: Results) -> Iterator[Block]:
     """The outputs at the mean parameters."""
-    yield Heading("Outputs at the mean parameters")
     values = results.dataset["nominal"].to_numpy()
     rows = [(o, size(float(v), results.unit(o), 6)) for o, v in zip(results.outputs, values, strict=True)]
     yield Table(("output", "value"), rows)
 
 
-@section(when=lambda results: {"values", "nominal"} <= set(results.dataset) and "density" not in results.dataset)
+@section(
+    "values", "nominal", heading="Distribution and convergence", when=lambda results: "density" not in results.dataset
+)
 def distribution(results: Results) -> Iterator[Block]:
     """Samples of the outputs, and how their estimates converge."""
     dataset = results.dataset
-    yield Heading("Distribution and convergence")
     for output in results.drawn:
         yield Heading(output, level=3)
         yield Pictures.of(
@@ -86,10 +83,9 @@ def distribution(results: Results) -> Iterator[Block]:
         )
 
 
-@section("density")
+@section("density", heading="Distribution and convergence")
 def density(results: Results) -> Iterator[Block]:
     """Densities of the outputs by an expansion."""
-    yield Heading("Distribution and convergence")
     drawn = {output: plots.histogram(results.dataset, output) for output in results.drawn}
     captions = ((ax, f"Density of {output} by the expansion, mean and quantiles.") for output, ax in drawn.items())
     yield Pictures.of(*captions, small=True)
@@ -125,10 +121,9 @@ def control_variate(results: Results) -> Iterator[Block]:
         yield Text(text, "warning" if worse else "")
 
 
-@section("multi_index")
+@section("multi_index", heading="Polynomial chaos")
 def expansion(results: Results) -> Iterator[Block]:
     """The polynomials of an expansion, and their errors."""
-    yield Heading("Polynomial chaos")
     yield Text("The leave-one-out error is that at each sample of the expansion fitted to the others.")
     dataset = results.dataset
     sizes = (f"{int(dataset['order'])}", f"{dataset.sizes['term']}", f"{int(dataset['ok'].sum())}")

@@ -60,10 +60,9 @@ def gravest(results: Results) -> list[str]:
     return [one.text for one in of_results.findings(results.dataset) if one.severity == "error"][:FIRST]
 
 
-@section("nominal")
+@section("nominal", heading="What was computed")
 def model(results: Results) -> Iterator[Block]:
     """The model in words, and its random parameters."""
-    yield Heading("What was computed")
     yield Pairs(list(model_in_words(results.study)))
     rows = []
     for name, distribution in results.study.given.items():
@@ -80,7 +79,7 @@ def model(results: Results) -> Iterator[Block]:
         for c in results.study.correlations
     ]
     head = ("random parameter", "distribution", "mean", "standard deviation", "unit")
-    yield Table(head, rows, text=frozenset({0, 1, 4}))
+    yield Table(head, rows, text={0, 1, 4})
 
 
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
@@ -93,10 +92,9 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     return study.spec.words(said, " on the coarsest mesh" if len(study.meshes) > 1 else "")
 
 
-@section("alone_eigenvalue")
+@section("alone_eigenvalue", heading="Priors")
 def priors(results: Results) -> Iterator[Block]:
     """The priors of the unknowns."""
-    yield Heading("Priors")
     config = tomllib.loads(results.dataset.attrs["config"])
     rows = [
         (path, f"{block['kind']}: {settings(block, 'kind')}", results.parameter_unit(path))
@@ -110,14 +108,13 @@ def priors(results: Results) -> Iterator[Block]:
     if noise is not None:
         rows.append(("factor on all sigma", f"{noise['kind']}: {settings(noise, 'kind')}", "1"))
     rows = [(unknown, prior, NONE if unit == "1" else unit) for unknown, prior, unit in rows]
-    yield Table(("unknown", "prior", "unit"), rows, text=frozenset(range(3)))
+    yield Table(("unknown", "prior", "unit"), rows, text=range(3))
 
 
-@section()
+@section(heading="Failed solves")
 def failures(results: Results) -> Iterator[Block]:
     """Which solves failed, and why."""
     failed, listed = results.summary["failed"], len(results.summary["failures"])
-    yield Heading("Failed solves")
     if "stability" in results.summary:
         yield Text(f"{stability(results.summary['stability']).capitalize()}.")
     if "joined" in results.summary:
@@ -138,13 +135,12 @@ def failures(results: Results) -> Iterator[Block]:
         shown = (NONE if name not in at else size(at[name], results.parameter_unit(name, model), 6) for name in names)
         rows.append((*([model] if first else []), *shown, failure["reason"]))
     head, last = (*first, *names, "reason"), len(first) + len(names)
-    yield Table(head, rows, text=frozenset({last, *range(len(first))}), long=frozenset({last}))
+    yield Table(head, rows, text={last, *range(len(first))}, long={last})
 
 
-@section()
+@section(heading="Run time")
 def run_time(results: Results) -> Iterator[Block]:
     """What the study took."""
-    yield Heading("Run time")
     yield Pairs.of(*_times(results))
 
 
@@ -161,10 +157,9 @@ def _times(results: Results) -> Iterator[tuple[str, str]]:
             yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
 
 
-@section()
+@section(heading="Provenance")
 def provenance(results: Results) -> Iterator[Block]:
     """When, from which study and on which machine the results were made."""
-    yield Heading("Provenance")
     found = results.summary["provenance"]
     ranks, groups = found["ranks"], found["groups"]
     yield Pairs.of(

@@ -25,10 +25,9 @@ if TYPE_CHECKING:
 TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
 
 
-@section(when=lambda results: "alone_eigenvalue" in results.dataset and results.dataset.sizes["data_set"] > 1)
+@section("alone_eigenvalue", heading="All data sets", when=lambda results: results.dataset.sizes["data_set"] > 1)
 def batch(results: Results) -> Iterator[Block]:
     """All data sets that were inverted, one row each."""
-    yield Heading("All data sets")
     yield Text(
         "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
         "inverted follow one by one."
@@ -56,7 +55,7 @@ def _batch(results: Results) -> Table:
         rows.append((str(label), count, TRUSTED[int(one["trust"])], *values, *rest))
     units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
-    return Table(head, rows, text=frozenset({0, 2}))
+    return Table(head, rows, text={0, 2})
 
 
 def _sizes(results: Results, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
@@ -69,11 +68,10 @@ SHOWN = 24  # rows of the table of a data set
 SETS = 12  # data sets that have a table
 
 
-@section("prediction_share")
+@section("prediction_share", heading="Predictions")
 def predictions(results: Results) -> Iterator[Block]:
     """What is predicted from each data set, and what its data added."""
     of = results.dataset
-    yield Heading("Predictions")
     yield Text(
         "Outputs that were not measured, by the posterior: mean ± standard deviation, and the interval that holds "
         "95 %. Beside it what was known before the data, and the share of the variance that the data have removed. "
@@ -107,11 +105,10 @@ def _predicted(one: xr.Dataset) -> Table:
     return Table(head, rows)
 
 
-@section("population_draw")
+@section("population_draw", heading="The population")
 def population_of_specimens(results: Results) -> Iterator[Block]:
     """Tables of the population and of its specimens."""
     of = results.dataset
-    yield Heading("The population")
     logarithmic = bool(int(of["logarithmic"]))
     what = "ln |parameter|, whose standard deviation is given, is normal" if logarithmic else "parameters are normal"
     yield Text(
@@ -128,7 +125,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
     if pairs:
         correlations = of["correlation_quantiles"]
         pairwise = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
-        yield Table(("parameter", "with", "correlation"), pairwise, text=frozenset({0, 1}))
+        yield Table(("parameter", "with", "correlation"), pairwise, text={0, 1})
     if "slope_quantiles" in of:
         yield Text("How means change with what specimens differ in, by one unit of it:")
         slopes = of["slope_quantiles"]
@@ -137,7 +134,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
             for by in of["covariate"].values
             for name in results.parameters
         ]
-        yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
+        yield Table(("covariate", "parameter", "change"), changes, text={0, 1})
     yield Heading("Its specimens")
     caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
     drawn = [plots.specimens(of, name, results.parameter_unit(name)) for name in results.parameters]
@@ -219,12 +216,11 @@ WORTH = {
 FIRST = 5  # observations on the card
 
 
-@section("chosen")
+@section("chosen", heading="Which observations tell most")
 def chosen_observations(results: Results) -> Iterator[Block]:
     """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
     found, design = results.dataset, results.summary["design"]
     against = against_random(design)
-    yield Heading("Which observations tell most")
     method, known = results.study.method, number(float(found["information"][-1]))
     tell = (
         f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
@@ -244,7 +240,7 @@ def chosen_observations(results: Results) -> Iterator[Block]:
         cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
         rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
     head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
-    yield Table(head, rows, text=frozenset({1, 2, 3, 4}))
+    yield Table(head, rows, text={1, 2, 3, 4})
     if "log_bayes_factor" in found:
         names, factors = [str(name) for name in found["model"].values], found["log_bayes_factor"].to_numpy()
         rows = [(name, *(number(float(x)) for x in row)) for name, row in zip(names, factors, strict=True)]

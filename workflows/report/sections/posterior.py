@@ -216,7 +216,7 @@ def iterations(one: xr.Dataset) -> Block:
         [str(int(x)) if name in whole else number(float(x), 5) for name, x in zip(names, row, strict=True)]
         for row in steps
     ]
-    table = Table([name.replace("_", " ") for name in names], rows, text=frozenset())
+    table = Table([name.replace("_", " ") for name in names], rows, text=())
     return Folded("Iterations of the search for the mode", [table], printed=False)
 
 

@@ -97,10 +97,9 @@ def _evidences(dataset: xr.Dataset) -> Table:
     )
 
 
-@section("probability")
+@section("probability", heading="What the evidences depend on")
 def dependence(results: Results) -> Iterator[Block]:
     """Evidences with other errors, other data and other priors."""
-    yield Heading("What the evidences depend on")
     yield Text(
         "Probability of each model with other errors, other data, and priors of half and twice the width (in "
         "standard normal coordinates)."
@@ -118,10 +117,9 @@ def dependence(results: Results) -> Iterator[Block]:
 UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
 
 
-@section("probability")
+@section("probability", heading="Averaged predictions")
 def averages(results: Results) -> Iterator[Block]:
     """Predictions averaged over the models."""
-    yield Heading("Averaged predictions")
     yield Text("At the end of each test, or where the largest displacement was measured, without measurement errors.")
     dataset = results.dataset
     quantity, last = str(dataset.attrs["quantity"]), last_of_tests(dataset)
@@ -136,7 +134,7 @@ def averages(results: Results) -> Iterator[Block]:
         rows.append((str(one["output_group"].item()), str(one["output_test"].item()), at, *means, *stds))
     place = "at" if quantity == "stress" else "datum"
     head = ("group", "test", place, "measured", "averaged prediction", "spread within models", "spread between models")
-    yield Table(head, rows, text=frozenset({0, 1}))
+    yield Table(head, rows, text={0, 1})
     caption = "Parts of the variance: within the models, and between them: what it matters which of them is right."
     yield Pictures.of((plots.within_and_between(last), caption))
 
@@ -155,11 +153,10 @@ def last_of_tests(dataset: xr.Dataset) -> dict[str, xr.Dataset]:
     return found
 
 
-@section("candidate_mean")
+@section("candidate_mean", heading="Averaged over candidates")
 def averaged_candidates(results: Results) -> Iterator[Block]:
     """A table for each output, and a bar of the parts of its variance."""
     of = results.dataset
-    yield Heading("Averaged over candidates")
     stacked = of.attrs.get("weights") == "stacked"
     what = "weight in the mixture that predicts left-out data best" if stacked else "probability"
     yield Text(
@@ -179,11 +176,10 @@ def averaged_candidates(results: Results) -> Iterator[Block]:
     yield Pictures.of((plots.parts_of_variance(of), caption))
 
 
-@section("probability")
+@section("probability", heading="Constants")
 def constants(results: Results) -> Iterator[Block]:
     """Constants of the models: posteriors and priors."""
     dataset, study = results.dataset, results.study
-    yield Heading("Constants")
     yield posteriors(results)
     several, best = dataset.sizes["group"] > 1, by_probability(dataset, dataset["log_evidence"])[0]
     yield Heading("Posteriors of the constants" + (f" of {best}" if several else ""), level=3)
@@ -219,7 +215,7 @@ def posteriors(results: Results) -> Table:
                 like = float(of_name["constant_mean"])
                 rows.append((str(model), str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
     head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
-    return Table(head, rows, text=frozenset({0, 1, 2}))
+    return Table(head, rows, text={0, 1, 2})
 
 
 def _priors(results: Results) -> Table:
@@ -231,13 +227,12 @@ def _priors(results: Results) -> Table:
             block = distribution.model_dump()
             unit = results.parameter_unit(constant, name)
             rows.append((name, study.described(name), constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
-    return Table(("candidate", "model", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
+    return Table(("candidate", "model", "constant", "prior", "unit"), rows, text=range(5))
 
 
-@section("probability")
+@section("probability", heading="Is the best one good?")
 def criticism(results: Results) -> Iterator[Block]:
     """Predictions of left-out data, and residuals."""
-    yield Heading("Is the best one good?")
     yield Text(
         "Each datum is left out and predicted from the others, by weights that are judged in the same way; "
         "residuals are compared with those of a true model."

@@ -15,11 +15,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-@section("derivative")
+@section("derivative", heading="Local sensitivities")
 def local_sensitivities(results: Results) -> Iterator[Block]:
     """Effects of parameters, to first order."""
     dataset = results.dataset
-    yield Heading("Local sensitivities")
     yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
     for output in results.drawn:
         yield Heading(output, level=3)
@@ -49,10 +48,9 @@ def largest_of(dataset: xr.Dataset) -> str:
     return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
 
 
-@section("field_derivative_rms")
+@section("field_derivative_rms", heading="Displacement field", level=3)
 def local_field(results: Results) -> Iterator[Block]:
     """Effects of parameters on the displacement field, to first order."""
-    yield Heading("Displacement field", level=3)
     yield Text(
         "Root mean square of the derivative of the displacement over the body: its L² norm over the root of the volume."
     )
@@ -68,11 +66,10 @@ def local_field(results: Results) -> Iterator[Block]:
     yield Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
 
 
-@section("sobol_first")
+@section("sobol_first", heading="Sobol' indices")
 def sobol_indices(results: Results) -> Iterator[Block]:
     """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
     dataset = results.dataset
-    yield Heading("Sobol' indices")
     yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
     for output in results.drawn:
         yield Heading(output, level=3)
@@ -109,13 +106,12 @@ def second_order(results: Results, output: str) -> Table:
             at = {"output": output, "parameter": name, "partner": partner}
             rows.append((name, partner, *results.cells(("sobol_second",), at)))
     head = results.heads({"sobol_second": "second order"})
-    return Table(("parameter", "with", *head), rows, text=frozenset({0, 1}))
+    return Table(("parameter", "with", *head), rows, text={0, 1})
 
 
-@section("field_sobol_first")
+@section("field_sobol_first", heading="Displacement field", level=3)
 def sobol_field(results: Results) -> Iterator[Block]:
     """Generalised Sobol' indices of the displacement field."""
-    yield Heading("Displacement field", level=3)
     yield Text("Generalised indices: the variances of all nodes and components together.")
     rows = []
     for name in results.parameters:
@@ -124,11 +120,10 @@ def sobol_field(results: Results) -> Iterator[Block]:
     yield Table(("parameter", "first order", "total"), rows)
 
 
-@section("shapley")
+@section("shapley", heading="Shapley effects")
 def shapley_effects(results: Results) -> Iterator[Block]:
     """Shares of the variance that parameters are responsible for, a column for each output."""
     outputs, of = results.drawn, results.dataset
-    yield Heading("Shapley effects")
     yield Text(
         "The share of the variance that a parameter is responsible for, with what it shares with others split "
         "evenly: parameters that are given by the same draws depend on each other, and have no Sobol' indices."
@@ -140,11 +135,10 @@ def shapley_effects(results: Results) -> Iterator[Block]:
     yield Table(("parameter", *outputs), rows)
 
 
-@section("total_bound")
+@section("total_bound", heading="Sensitivity from derivatives")
 def derivative_based(results: Results) -> Iterator[Block]:
     """Bounds on total indices, and active subspaces."""
     dataset = results.dataset
-    yield Heading("Sensitivity from derivatives")
     yield Text(
         "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
         "distribution over the variance of the output. The active subspace is spanned by the directions along "
