@@ -16,6 +16,7 @@ Candidates are arrays (c, k, r) for each draw: k rows for each of c candidates, 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -179,3 +180,37 @@ def along(criterion: Criterion, order: Sequence[int]) -> Iterator[float]:
         worth += float(criterion.gains(np.array([one]))[0])
         criterion.take(one)
         yield worth
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Candidates and goals at draws.
+
+    Attributes
+    ----------
+    rows
+        (c, k, r) of each draw, over the standard deviations of the errors.
+    goals
+        GᵀG (r, r) of each draw, with prior variances that add up to one.
+    """
+
+    rows: Sequence[FloatArray]
+    goals: Sequence[FloatArray]
+
+    def along(self, order: IntArray) -> FloatArray:
+        """Return what the first, the first two, … of candidates (n,) in an order tell together (draws, n)."""
+        return np.array([told_along(rows[order]) for rows in self.rows])
+
+    def roots(self, chosen: Sequence[int]) -> list[FloatArray]:
+        """Return roots (r, r) of the covariances once all chosen observations were made, of each draw."""
+        criterion = Information(self.rows)
+        for one in chosen:
+            criterion.take(one)
+        return criterion.roots
+
+
+def scaled(goals: FloatArray) -> list[FloatArray]:
+    """Return GᵀG of goals (draws, q, d), each over its prior standard deviation and √q; constants count nothing."""
+    size = np.linalg.norm(goals, axis=2, keepdims=True)
+    scaled = np.divide(goals, size, out=np.zeros_like(goals), where=size > 0) / np.sqrt(goals.shape[1])
+    return [one.T @ one for one in scaled]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -13,21 +14,20 @@ from forward.findings import Finding
 from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.designs.candidates import Candidates, Each, Values
-from inverse.designs.compared import compared, with_values
+from inverse.designs.compared import compared, with_mesh_errors, with_values
 from inverse.designs.criteria import (
     Criterion,
     Information,
     IntArray,
+    Linearised,
     Variance,
     along,
     grouped,
-    told_along,
+    scaled,
 )
 from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.fields import left_out
 from inverse.designs.greedy import Choice, choose
-from inverse.designs.linearised import Linearised, scaled
-from inverse.designs.of_mesh import with_mesh_errors
 from inverse.methods.synthesize import SyntheticNoise
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
@@ -337,14 +337,12 @@ class Design(Settings):
 
     def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
         """Choose among candidates (c,) with costs (c,), and compare with random choices."""
-        along_random = None
         if self.criterion == "information":
-
-            def along_random(order: IntArray) -> FloatArray:
-                return np.asarray(np.mean([told_along(rows[order]) for rows in told.rows], axis=0))
-
-        choice, found = self._compared(lambda: self._criterion(told), candidates, costs, along_random)
-        known = np.array([told_along(rows[list(choice.order)]) for rows in told.rows])  # (draws, n)
+            make = partial(Information, told.rows)
+            choice, found = self._compared(make, candidates, costs, lambda order: told.along(order).mean(axis=0))
+        else:
+            choice, found = self._compared(lambda: Variance(told.rows, told.goals), candidates, costs)
+        known = told.along(np.array(choice.order))
         alone = Information(told.rows).of_draws(np.arange(len(costs))).mean(axis=0)
         found = found.assign(
             gain=("choice", np.diff(np.concatenate([[0.0], known.mean(axis=0)]))),
@@ -367,13 +365,6 @@ class Design(Settings):
         short = worth_along or (lambda order: np.array(list(along(make(), order.tolist()))))
         return choice, compared(choice, candidates, costs, short, self.random, self.seed)
 
-    def _best(self, rows: FloatArray, costs: FloatArray) -> float:
-        """What those observations tell that are best at one draw."""
-        return choose(lambda: Information([rows]), costs, number=self.number, budget=self.budget).worth
-
-    def _criterion(self, told: Linearised) -> Criterion:
-        return Information(told.rows) if self.criterion == "information" else Variance(told.rows, told.goals)
-
     def _doubts(self, told: Linearised, choice: Choice, found: xr.Dataset) -> list[Finding]:
         """Say where draws disagree, and where observations add little."""
         doubts = []
@@ -389,7 +380,8 @@ class Design(Settings):
         if self.criterion == "information" and len(told.rows) > 1:
             shared = found["information_of_draw"].to_numpy()[:, -1]
             costs = found["candidate_cost"].to_numpy()
-            own = [self._best(rows, costs) for rows in told.rows]
+            alone = (partial(Information, [rows]) for rows in told.rows)
+            own = [choose(one, costs, number=self.number, budget=self.budget).worth for one in alone]
             shares = shared / np.maximum(own, shared)
             worst = int(shares.argmin())
             if shares[worst] < ALIKE:
