@@ -26,14 +26,7 @@ from inverse.data.errors import StudentErrors
 from inverse.data.rigid import Rigid, check_rigid, orthonormal, slopes, turned
 from inverse.data.table import DataError
 
-MOTIONS = (
-    "rotation about x",
-    "rotation about y",
-    "rotation about z",
-    "shift along x",
-    "shift along y",
-    "shift along z",
-)
+MOTIONS = tuple(f"{what} {axis}" for what in ("rotation about", "shift along") for axis in "xyz")
 STEPS, SETTLED = 100, 1e-8
 UNSEEN = 1e-2  # of the largest eigenvalue of the information, below which a motion cannot be found
 LEAST = 6  # points of a surface

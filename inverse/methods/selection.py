@@ -216,8 +216,9 @@ class Select(Settings):
                 pair: one.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, one in stated.items()
             }
         for label, noise in self.other_noises.items():
+            sigma = {group: noise.sigma_of(data.seen()) for group, data in data_groups.items()}
             variants[label] = {
-                pair: value(_with_noise(posteriors[pair], data_groups[pair[1]], noise), pair) for pair in pairs
+                pair: value(replace(posteriors[pair], sigma=sigma[pair[1]], noise=noise.factor), pair) for pair in pairs
             }
         for label, tests in self.subsets.items():
             variants[label] = {
@@ -229,11 +230,8 @@ class Select(Settings):
         if self.check is not None:
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
-        left_out = (
-            {test: _without(test, data_groups, posteriors, value) for test in _testnames(data_groups)}
-            if self.held_out
-            else {}
-        )
+        tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
+        left_out = {test: _without(test, data_groups, posteriors, value) for test in dict.fromkeys(tests_of)}
         points = {pair: _standing(posteriors[pair], one) for pair, one in stated.items()}
         verdicts = {pair: verdict_on_points(one.gaussian, one.evidence, one.chains) for pair, one in stated.items()}
         result = comparison(
@@ -298,15 +296,6 @@ def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
     assert posterior.shared is not None
     at = posterior.at(gaussian.mode[None], derivatives=True)
     return determined(spectrum_of(posterior, at), posterior.whitening, posterior.shared, np.ones(posterior.data.size))
-
-
-def _with_noise(posterior: Posterior, data: Measurements, noise: Noise) -> Posterior:
-    """The same with other errors."""
-    return replace(posterior, sigma=noise.sigma_of(data.seen()), noise=noise.factor)
-
-
-def _testnames(data_groups: Mapping[str, Measurements]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(test for data in data_groups.values() for test in data.measured_tests))
 
 
 def _only(posterior: Posterior, data: Measurements, tests: tuple[str, ...]) -> Posterior:
