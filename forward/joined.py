@@ -14,11 +14,10 @@ from forward.combine import Joined, Mapped, Sparse
 from forward.fem.cost import Times, sum_of
 from forward.findings import Finding
 from forward.materials.admissible import Materials
-from forward.model import NamedOutput
 from forward.registry import OfKind
 from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import nearest
-from forward.spec import MODELS, ModelSpec
+from forward.spec import MODELS, ModelSpec, NamedOutput
 
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges

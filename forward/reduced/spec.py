@@ -54,6 +54,11 @@ def _digest(content: bytes) -> str:
     return sha256(content).hexdigest()[:LETTERS]
 
 
+def digest_of(file: str) -> str:
+    """Return the hash of a reduced model; a ModelError says that its file cannot be read."""
+    return _digest(_content(file))
+
+
 class Reduced(ModelSpec):
     """A reduced model of a body: few modes at few points, with estimates of its errors.
 
@@ -89,7 +94,7 @@ class Reduced(ModelSpec):
     accept_unstable: bool = False
     unbalanced: Annotated[float, Field(gt=0, lt=1)] = 1e-9
     within: bool = False
-    digest: str = Field(default_factory=lambda known: _digest(_content(known["file"])))
+    digest: str = Field(default_factory=lambda known: digest_of(known["file"]))
 
     @model_validator(mode="after")
     def _check(self) -> Reduced:

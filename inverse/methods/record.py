@@ -24,7 +24,7 @@ from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
-from uq.estimators.estimate import part
+from uq.estimators.estimate import BAND, part
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,7 +38,6 @@ COLUMNS = {
     "parameters": ("start", "log_posterior", "decrement", "damping"),
     "field": ("misfit", "penalty", "gradient", "pairs", "products", "length", "solves"),
 }
-BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")  # of what is predicted
 Record = dict[str, FloatArray | str]
 
 # What is found of a data set, by its dimensions: of both, of few parameters, of a field, of what is predicted.

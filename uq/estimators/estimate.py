@@ -25,6 +25,7 @@ PARTS = {
     "left": "_corrected_error",
 }
 ESTIMATED = ("mean", "std")  # of an output, always
+BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")  # of what is predicted
 OF_MESH = ("mesh", "doubt", "corrected", "left")
 # First words of names, where errors that are not of sampling alone stand under others than the value.
 SHORT = {"mean": "", "prediction_mean": "prediction", "cycle_value": "cycle"}

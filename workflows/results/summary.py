@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
-from inverse.methods.record import BAND
-from uq.estimators.estimate import ESTIMATED, OF_MESH, PARTS, holds, part
+from uq.estimators.estimate import BAND, ESTIMATED, OF_MESH, PARTS, holds, part
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
 

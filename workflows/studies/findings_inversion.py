@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from uq.inputs.distributions import Distribution
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion_blocks import InversionBlocks
 
 NEITHER, DOUBTFUL = 2, 3  # values of `trust`, see docs/results.md
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
 
-def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
+def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
     """Look for everything that makes the posteriors of an inversion doubtful; return the results with verdicts."""
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
@@ -68,7 +68,7 @@ def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Finding]:
     return reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
 
 
-def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
+def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
     """Say what is doubtful about one data set, given by its number."""
     from inverse.criticism import doubts as criticism
     from uq.inputs.distributions import Normal
@@ -119,7 +119,7 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
     return found + _of_mesh(one, study, number)
 
 
-def _of_mesh(one: xr.Dataset, study: Inversion, number: int) -> list[Finding]:
+def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
     """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
     from inverse.criticism import doubts_of_meshes as of_meshes
 

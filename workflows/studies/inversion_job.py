@@ -24,7 +24,7 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
-from workflows.studies.inversion import PREDICTED, Inversion
+from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
 from workflows.studies.measured import motion_of
@@ -49,7 +49,7 @@ BY_REDUCED = "an inversion of the body itself with method.reduced corrects that,
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
-def job(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
+def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
     made = _outputs(study, ensemble) if study.specimen is None else _specimen(study, study.specimen, ensemble)
     derivable(made.model, study.model.kind)
@@ -97,7 +97,7 @@ class _Made:
     look: Look | None = None
 
 
-def _outputs(study: Inversion, ensemble: Ensemble) -> _Made:
+def _outputs(study: InversionBlocks, ensemble: Ensemble) -> _Made:
     """Make a model with outputs, of which the data tell which were measured; collective."""
     model, there = study.spec.build(ensemble.group, study.inputs.names), None
     if has_mesh(study.spec):
@@ -108,7 +108,7 @@ def _outputs(study: Inversion, ensemble: Ensemble) -> _Made:
     return _Made(model, lambda number: _Observed(model, there))
 
 
-def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
+def _specimen(study: InversionBlocks, spec: Specimen, ensemble: Ensemble) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
     model: SpecimenModel = spec.build(ensemble.group, names)
@@ -132,14 +132,16 @@ def _specimen(study: Inversion, spec: Specimen, ensemble: Ensemble) -> _Made:
     return _Made(model, observed, vertices, look)
 
 
-def _meshes(study: Inversion, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
+def _meshes(
+    study: InversionBlocks, model: ForwardModel, start: FloatArray
+) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked
     return finer_meshes(model, start)
 
 
-def _written(study: Inversion, made: _Made) -> dict[str, Any]:
+def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
     """Return what every job of an inversion leaves beside its results."""
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
@@ -157,7 +159,7 @@ def _written(study: Inversion, made: _Made) -> dict[str, Any]:
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
-def _problem(study: Inversion, number: int, seen: _Observed, on: On, say: Callable[[str], None]) -> Problem:
+def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, say: Callable[[str], None]) -> Problem:
     """Return what is inverted of a data set, by its number."""
     finer = None
     if seen.there is not None:
@@ -168,7 +170,7 @@ def _problem(study: Inversion, number: int, seen: _Observed, on: On, say: Callab
 
 
 def _inverted(
-    study: Inversion,
+    study: InversionBlocks,
     made: _Made,
     seen: _Observed,
     problem: Problem,
@@ -188,7 +190,7 @@ def _inverted(
 
 
 def _with_predictions(
-    study: Inversion, found: xr.Dataset, model: ForwardModel, on: On, before: Callable[[], Band]
+    study: InversionBlocks, found: xr.Dataset, model: ForwardModel, on: On, before: Callable[[], Band]
 ) -> xr.Dataset:
     """Add what the posterior of few parameters says on the model of what is predicted, beside what the prior says."""
     from workflows.studies.predicted import of_few
@@ -196,7 +198,7 @@ def _with_predictions(
     return with_record(found, of_few(study, found, on(PREDICTED, model), on(f"{PREDICTED}, mesh", model), before))
 
 
-def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
+def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
     names = [one.name for one in study.data.sets]
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
@@ -263,7 +265,7 @@ def _many(study: Inversion, made: _Made, ensemble: Ensemble, directory: Path, ch
 
 
 def _expanded(
-    study: Inversion, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint
+    study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint
 ) -> tuple[SharedExpansion, list[Evaluations]]:
     """Solve for the expansion that all data sets share; every group does so, or reads what others have solved."""
 
@@ -278,7 +280,9 @@ def _expanded(
     return shared_expansion(study.inputs, own, fine, samples, why), own.log
 
 
-def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Callable[[str], None]) -> xr.Dataset:
+def _by_expansion(
+    study: InversionBlocks, found: SharedExpansion, number: int, say: Callable[[str], None]
+) -> xr.Dataset:
     """Invert a data set with the expansion, whose errors are among those of the data."""
     data = study.measured(number)
     missed = found.error[data.axes]
@@ -291,7 +295,7 @@ def _by_expansion(study: Inversion, found: SharedExpansion, number: int, say: Ca
 
 
 def _inverting_field(
-    study: Inversion, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
+    study: InversionBlocks, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
 ) -> Callable[[str, ForwardModel, Problem], xr.Dataset]:
     """Return what inverts a data set, by its name, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
@@ -314,14 +318,12 @@ def _inverting_field(
     return invert
 
 
-def _predicted(study: Inversion, ensemble: Ensemble) -> ForwardModel:
+def _predicted(study: InversionBlocks, ensemble: Ensemble) -> ForwardModel:
     """Make the model of what is predicted; collective over the group."""
-    from workflows.studies.predicted import parameters
-
-    return study.predicted.build(ensemble.group, parameters(study))
+    return study.predicted.build(ensemble.group, study.acting)
 
 
-def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
+def _reduced(study: InversionBlocks) -> Callable[[ForwardModel], ForwardModel] | None:
     """Load what stands for a model with which data are compared; None where that is asked itself.
 
     What it returns is collective over the ranks of that model.
@@ -339,7 +341,7 @@ def _reduced(study: Inversion) -> Callable[[ForwardModel], ForwardModel] | None:
     return lambda observed: cast("ForwardModel", observed_by(observed, models))
 
 
-def _one(study: Inversion, made: _Made, ensemble: Ensemble) -> MethodJob:
+def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     seen, reduced = made.observed(0), _reduced(study)
     recorders: dict[str, Recorder] = {}

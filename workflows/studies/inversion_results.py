@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from forward.bodies.random_fields import NodalPrior
     from inverse.data.measurements import Measurements
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion_blocks import InversionBlocks
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
 
 
-def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
+def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
     """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
     Parameters
@@ -89,7 +89,7 @@ def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Vertices | 
 
 
 def _of_specimen(
-    study: Inversion, record: Mapping[str, FloatArray], vertices: Vertices, prior: NodalPrior | None
+    study: InversionBlocks, record: Mapping[str, FloatArray], vertices: Vertices, prior: NodalPrior | None
 ) -> dict[str, Any]:
     """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
     places, cells, kind = vertices
@@ -121,7 +121,7 @@ def _moves(found: Sequence[Measurements | None], count: int) -> FloatArray:
     return whole
 
 
-def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
+def _volumes(study: InversionBlocks, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
     """Posterior of the volumes (m³) of inclusions whose radii are unknown, from the stored draws."""
     names = study.inputs.names
     before = derived(study.model.inclusions, names, prior_draws(study)) if not study.field else {}
@@ -150,7 +150,7 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
     }
 
 
-def _prior_moments(study: Inversion, prior: NodalPrior | None) -> tuple[FloatArray, FloatArray]:
+def _prior_moments(study: InversionBlocks, prior: NodalPrior | None) -> tuple[FloatArray, FloatArray]:
     """Prior mean and standard deviation (c,) of the parameters."""
     if prior is not None:
         field = study.model.fields[0]
@@ -166,19 +166,19 @@ def _prior_moments(study: Inversion, prior: NodalPrior | None) -> tuple[FloatArr
     return mean, std
 
 
-def _prior_stiffness_std(study: Inversion, places: FloatArray, prior: NodalPrior | None) -> FloatArray:
+def _prior_stiffness_std(study: InversionBlocks, places: FloatArray, prior: NodalPrior | None) -> FloatArray:
     """Return the prior standard deviation (N,) of ln stiffness at places (N, 3)."""
     if prior is not None:
         return np.asarray(np.sqrt(prior.variance))
     return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
 
 
-def prior_draws(study: Inversion) -> FloatArray:
+def prior_draws(study: InversionBlocks) -> FloatArray:
     """Prior draws (n, d) of the parameters."""
     return admissible(study.inputs, np.random.default_rng(study.method.seed), PRIOR_DRAWS)
 
 
-def _true_at(study: Inversion, measurement: Measurements | None, places: FloatArray) -> FloatArray:
+def _true_at(study: InversionBlocks, measurement: Measurements | None, places: FloatArray) -> FloatArray:
     """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is unknown."""
     if measurement is None:
         return np.full(len(places), np.nan)
@@ -251,7 +251,7 @@ class Rows:
         Writes the table.
     """
 
-    def __init__(self, study: Inversion, vertices: Vertices | None, write: Callable[[str], None]) -> None:
+    def __init__(self, study: InversionBlocks, vertices: Vertices | None, write: Callable[[str], None]) -> None:
         self._study, self._vertices, self._write = study, vertices, write
         self._rows: dict[int, Mapping[str, Any]] = {}
 
@@ -271,7 +271,7 @@ class Rows:
         self._write(_table(self._study.names, self._study.parts, rows))
 
 
-def arviz_groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
+def arviz_groups(study: InversionBlocks, found: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
     import xarray as xr
 

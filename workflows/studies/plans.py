@@ -27,7 +27,7 @@ from workflows.studies.predictions import (
 if TYPE_CHECKING:
     from forward.specimen import Specimen
     from inverse.data.measurements import Measurements
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion_blocks import InversionBlocks
     from workflows.studies.sampling_blocks import SamplingBlocks
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
@@ -156,15 +156,15 @@ def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compil
 # --- inversions ------------------------------------------------------------------------------------------------------
 
 
-def of_inversion(study: Inversion) -> list[str]:
+def of_inversion(study: InversionBlocks) -> list[str]:
     """Say what is inverted, and how long that will take."""
     lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
     refused = (f"warning     {one.refused}" for one in study.data.sets if one.refused)
     return [f"method      {study.method.kind}", *lines, *refused]
 
 
-def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
-    from workflows.studies.inversion import SOLVES_OF_FIELD
+def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
+    from workflows.studies.inversion_blocks import SOLVES_OF_FIELD
 
     usable = [m for m in study.measurements if m is not None]
     counts = [len(m) for m in usable]
@@ -197,7 +197,7 @@ def _of_specimen(study: Inversion, spec: Specimen) -> list[str]:
     ]
 
 
-def _predicted(study: Inversion) -> list[str]:
+def _predicted(study: InversionBlocks) -> list[str]:
     """Say what is predicted, and by how many solves."""
     if study.predict is None:
         return []
@@ -207,7 +207,7 @@ def _predicted(study: Inversion) -> list[str]:
     return [f"predicts    {', '.join(names[:LISTED])}{more}, by {solves} solves, and as many of the prior"]
 
 
-def _seconds_of_predictions(study: Inversion) -> float:
+def _seconds_of_predictions(study: InversionBlocks) -> float:
     """Predict the processor time (s) of what is predicted."""
     cost = None if study.predict is None else study.predicted.cost()
     if cost is None:
@@ -216,7 +216,7 @@ def _seconds_of_predictions(study: Inversion) -> float:
     return 2 * (cost.textbook + study.predicted_by * (cost.sample + own))
 
 
-def _own_seconds(study: Inversion, data: int) -> float:
+def _own_seconds(study: InversionBlocks, data: int) -> float:
     """Predict the most processor time (s) that an inversion of so many data takes besides solves."""
     from inverse.criticism.assessment import own_seconds
 
@@ -235,7 +235,7 @@ def _moved(count: int, usable: list[Measurements]) -> str:
     return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
 
 
-def _of_outputs(study: Inversion) -> list[str]:
+def _of_outputs(study: InversionBlocks) -> list[str]:
     from inverse.methods.invert import derivable
 
     spec, method = study.spec, study.method

@@ -12,14 +12,13 @@ from pydantic import ValidationError
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import SHARED, LoadCase, Specimen, in_words, shared_paths
+from forward.specimen import Specimen, in_words, shared_paths
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
-from workflows.config.priors import ranges
-from workflows.studies.inversion import LEAST, PREDICTED
+from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED
 from workflows.studies.predictions import has_mesh, never_estimable
 
 if TYPE_CHECKING:
@@ -31,11 +30,10 @@ if TYPE_CHECKING:
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
     from uq.evaluation.request import Evaluate
-    from workflows.studies.inversion import Inversion, Predict
+    from workflows.studies.inversion_blocks import InversionBlocks, Predict
 
 # From the name of a data set, the posterior of its field, and what corrects that.
 FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
-ACTING = ("clamp", "displacements", "loads")
 POINTS = 4096  # that stand for the prior
 LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 
@@ -43,40 +41,7 @@ LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 # --- what is asked ---------------------------------------------------------------------------------------------------
 
 
-def spec(study: Inversion) -> ModelSpec:
-    """Return the model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
-    asked = study.predict
-    assert asked is not None
-    if isinstance(study.model, Specimen):
-        own = study.model.over(ranges(study.parameters))
-        known = {case.name: case for case in own.cases}
-        cases = tuple(_acting(case, known) for case in asked.cases) or own.cases
-        shared = {name: getattr(own, name) for name in SHARED}
-        return Specimen(formulation=own.formulation, cases=cases, observed=asked.observed, **shared)
-    kept = {name: getattr(study.model, name) for name in type(study.model).model_fields}
-    made: ModelSpec = type(study.model).model_validate(kept | asked.model)
-    return made.over(ranges({name: one for name, one in study.parameters.items() if name in made.scalars}))
-
-
-def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:
-    """Return a load case with what acts in the measured one of that name, where it says nothing itself."""
-    if case.name not in known or any(getattr(case, name) for name in ACTING):
-        return case
-    return known[case.name].model_copy(update={"outputs": case.outputs})
-
-
-def parameters(study: Inversion) -> tuple[str, ...]:
-    """Names of the unknowns that act in what is predicted."""
-    made = study.predicted
-    known = {*made.scalars, *made.coefficients}
-    return tuple(name for name in _unknown(study) if name in known)
-
-
-def _unknown(study: Inversion) -> tuple[str, ...]:
-    return study.model.coefficients if study.field else study.inputs.names
-
-
-def mistakes(study: Inversion) -> Iterator[Mistake]:
+def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
     """Find what cannot be predicted."""
     asked, specimen = study.predict, isinstance(study.model, Specimen)
     assert asked is not None
@@ -96,7 +61,7 @@ def mistakes(study: Inversion) -> Iterator[Mistake]:
     if wrong:
         return
     try:
-        made = spec(study)
+        made = study.predicted
     except ValidationError as error:
         for line in error.errors(include_url=False):
             where = () if specimen else ("model",)
@@ -110,8 +75,8 @@ def mistakes(study: Inversion) -> Iterator[Mistake]:
     if not outputs:
         yield ("predict",), "nothing is predicted, expected outputs or places", {}
         return
-    yield from _of_shared_paths(study.model, made, _unknown(study))
-    if not {*made.scalars, *made.coefficients} & set(_unknown(study)):
+    yield from _of_shared_paths(study.model, made, study.unknown)
+    if not {*made.scalars, *made.coefficients} & set(study.unknown):
         message = f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted"
         yield ("predict",), message, {}
 
@@ -126,7 +91,7 @@ def _of_shared_paths(measured: ModelSpec, made: ModelSpec, unknown: tuple[str, .
             yield ("predict", "cases"), in_words(path, values), path
 
 
-def _of_cases(study: Inversion, asked: Predict) -> Iterator[Mistake]:
+def _of_cases(study: InversionBlocks, asked: Predict) -> Iterator[Mistake]:
     known = tuple(case.name for case in study.model.cases)
     if not asked.cases and not asked.observed:
         yield ("predict",), "nothing is predicted, expected predict.cases or predict.observed", {}
@@ -141,7 +106,7 @@ def _of_cases(study: Inversion, asked: Predict) -> Iterator[Mistake]:
             yield ("predict", "cases", i), message, case.name
 
 
-def _of_model(study: Inversion, asked: Predict) -> Iterator[Mistake]:
+def _of_model(study: InversionBlocks, asked: Predict) -> Iterator[Mistake]:
     known = tuple(name for name in type(study.model).model_fields if name != "kind")
     if asked.model.get("kind", study.model.kind) != study.model.kind:
         yield ("predict", "model", "kind"), f"expected '{study.model.kind}', as what was measured", asked.model["kind"]
@@ -154,7 +119,7 @@ def _of_model(study: Inversion, asked: Predict) -> Iterator[Mistake]:
 
 
 def of_few(
-    study: Inversion, found: xr.Dataset, evaluate: Evaluate, of_mesh: Evaluate, before: Callable[[], Band]
+    study: InversionBlocks, found: xr.Dataset, evaluate: Evaluate, of_mesh: Evaluate, before: Callable[[], Band]
 ) -> Record:
     """Return what the posterior of few parameters, in the dataset of its inversion, says on what is predicted.
 
@@ -167,7 +132,7 @@ def of_few(
     before
         What the prior says.
     """
-    names = parameters(study)
+    names = study.acting
     weights = found["point_weight"].to_numpy()
     used = weights > 0
     columns = [study.names.index(name) for name in names]
@@ -180,16 +145,16 @@ def of_few(
     return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
 
 
-def prior_band(study: Inversion, evaluate: Evaluate) -> Band:
+def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
     """Return what the prior says, which is solved for once for all data sets."""
-    names, every = parameters(study), study.inputs.names
+    names, every = study.acting, study.inputs.names
     points = study.inputs.points(sobol_points(study.method.seed, 0, 0, POINTS, len(every)))
     values = points[study.inputs.allowed(points)][:, [every.index(name) for name in names]]
     draws = Draws(names, values, np.full(len(values), 1 / len(values)), float(len(values)))
     return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
 
 
-def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> FieldPredictions:
+def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> FieldPredictions:
     """Return what predicts from the posterior of a field of a data set.
 
     Parameters
@@ -200,7 +165,7 @@ def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> FieldPre
         The model of what is predicted, whose solves are kept under a name.
     """
     prior, looked = study.model.fields[0].prior(study.model.body), study.method.treatment is not None
-    pairs, seed, size = study.predicted_by // 2, study.method.seed, len(parameters(study))
+    pairs, seed, size = study.predicted_by // 2, study.method.seed, len(study.acting)
 
     @cache
     def before() -> Band:
@@ -216,7 +181,7 @@ def of_field(study: Inversion, model: Callable[[str], ForwardModel]) -> FieldPre
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-def keep_unknown_meshes(study: Inversion, dataset: xr.Dataset) -> None:
+def keep_unknown_meshes(study: InversionBlocks, dataset: xr.Dataset) -> None:
     """Keep which predictions have an error of a mesh that nobody knows, of any data set."""
     spec = study.predicted
     if not has_mesh(spec):

@@ -1,0 +1,225 @@
+"""What stands in a study that infers what is unknown of a model, and what follows from it before anything is solved."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.json_schema import SkipJsonSchema
+
+from forward.bodies.inclusions import log_factor
+from forward.settings import Settings
+from forward.spec import MEASURED
+from forward.specimen import SHARED, LoadCase, Observed, Specimen
+from inverse.methods.invert import Invert, names_of
+from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.random_parameters import Inputs
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.priors import inputs_of, ranges
+from workflows.studies.measured import DataFiles, as_block, data_as
+from workflows.studies.measured_outputs import MeasuredOutputs
+from workflows.studies.predictions import never_estimable
+
+if TYPE_CHECKING:
+    from forward.model import FloatArray
+    from forward.reduced.spec import Reduced
+    from forward.spec import ModelSpec
+    from inverse.data.measurements import Measurements
+
+SOLVES_OF_FIELD = 12  # for a mode
+PREDICTED = "predicted"  # name of the solves for what is predicted
+LEAST = 8  # solves of an expansion of what is predicted
+ACTING = ("clamp", "displacements", "loads")
+
+
+class Predict(Settings):
+    """Outputs that the posterior predicts: under other loads, at other places, of another kind.
+
+    Parameters
+    ----------
+    cases
+        Of a specimen: load cases in which something is predicted, with what acts in them and `outputs`. One that has
+        the name of a measured load case and nothing that acts is that load case. By default the measured ones.
+    observed
+        Of a specimen: places at which displacements are predicted, as `model.observed` has them.
+    model
+        Of other models: settings that replace those of the model, such as { loads = [...], outputs = [...] }; all of
+        the outputs are predicted. By default the model as it is.
+    samples
+        Solves for the posterior, and as many for the prior: those of an expansion over draws of few parameters (by
+        default 32); of a field, pairs of draws (8 pairs), without which it is not seen what derivatives leave out.
+    """
+
+    cases: tuple[LoadCase, ...] = ()
+    observed: tuple[Observed, ...] = ()
+    model: dict[str, Any] = Field(default={})
+    samples: Annotated[int, Field(ge=0)] | None = None
+
+    def solves(self, *, field: bool) -> int:
+        """Number of solves beside the first, for the posterior as for the prior."""
+        if self.samples is None:
+            return 16 if field else 32
+        return self.samples
+
+
+class InversionBlocks(Settings):
+    """The blocks of an inversion, as `workflows.studies.inversion.Inversion` explains them."""
+
+    model: Annotated[Any, MEASURED]
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(as_block)]
+    method: Invert = Invert()
+    predict: Predict | None = None
+    measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
+
+        def units_of(self, label: str) -> dict[str, str]:
+            """SI units of numbers of the model, by their paths."""
+
+    # --- the model ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        found: ModelSpec = self.model.over(ranges(self.parameters))
+        return found
+
+    @property
+    def specimen(self) -> Specimen | None:
+        """The model, if it is a specimen, of which displacements were measured."""
+        return self.spec if isinstance(self.spec, Specimen) else None
+
+    @property
+    def field(self) -> bool:
+        """Whether values of a field at the vertices are what is unknown."""
+        return self.specimen is not None and any(field.basis == "nodes" for field in self.model.fields)
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """The unknown parameters; none for a field of nodal values."""
+        coefficients = () if self.field else self.model.coefficients
+        return inputs_of(self.parameters, self.correlations, coefficients, self.model.materials(self.parameters))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in results; for a field, its mean."""
+        if self.field:
+            label = f"fields.{self.model.fields[0].label}.mean"
+            return names_of(Inputs({label: Normal(mean=0.0, std=1.0)}), self.method)
+        return names_of(self.inputs, self.method)
+
+    @cached_property
+    def predicted(self) -> ModelSpec:
+        """The model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
+        asked = self.predict
+        assert asked is not None
+        if isinstance(self.model, Specimen):
+            own = self.model.over(ranges(self.parameters))
+            known = {case.name: case for case in own.cases}
+            cases = tuple(_acting(case, known) for case in asked.cases) or own.cases
+            shared = {name: getattr(own, name) for name in SHARED}
+            return Specimen(formulation=own.formulation, cases=cases, observed=asked.observed, **shared)
+        kept = {name: getattr(self.model, name) for name in type(self.model).model_fields}
+        made: ModelSpec = type(self.model).model_validate(kept | asked.model)
+        return made.over(ranges({name: one for name, one in self.parameters.items() if name in made.scalars}))
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Paths of the unknown numbers, and of coefficients."""
+        return tuple(self.model.coefficients) if self.field else self.inputs.names
+
+    @property
+    def acting(self) -> tuple[str, ...]:
+        """Those that act in what is predicted."""
+        known = {*self.predicted.scalars, *self.predicted.coefficients}
+        return tuple(name for name in self.unknown if name in known)
+
+    @property
+    def predicted_by(self) -> int:
+        """Number of solves for what is predicted, beside the first, for the posterior as for the prior."""
+        return 0 if self.predict is None else self.predict.solves(field=self.field)
+
+    @cached_property
+    def reduced(self) -> dict[str, Reduced]:
+        """The reduced models that stand for the load cases of a specimen, by name, or for the model, as "".
+
+        None where the model is asked itself.
+
+        Raises
+        ------
+        ValueError
+            If a file cannot be used.
+        """
+        asked = self.method.reduced
+        if asked is None:
+            return {}
+        from forward.reduced.spec import Reduced
+
+        files = asked.file if isinstance(asked.file, dict) else {"": asked.file}
+        digests = asked.digest if isinstance(asked.digest, dict) else {"": asked.digest}
+        names = self.parts if isinstance(asked.file, dict) else ("",)
+        hashes = {name: {} if digests.get(name) is None else {"digest": digests[name]} for name in names}
+        return {name: Reduced.model_validate({"file": files[name], **hashes[name]}) for name in names}
+
+    def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
+        return log_factor(self.model.inclusions, self.inputs.names, points, places)
+
+    # --- the data ----------------------------------------------------------------------------------------------------
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts of the data (load cases, outputs) for which results of each alone are given."""
+        if self.specimen is not None:
+            return tuple(case.name for case in self.model.cases)
+        return next((found.parts for found in self.measurements if found is not None), ())
+
+    def measured(self, number: int) -> Measurements:
+        """Return a data set that can be used."""
+        found: Measurements = self.measurements[number]
+        return found
+
+    def not_estimable(self, number: int) -> tuple[str, ...]:
+        """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
+        return (
+            ()
+            if self.specimen is not None
+            else never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
+        )
+
+    @property
+    def together(self) -> bool:
+        """Whether all groups of ranks work on one data set, point by point."""
+        alone = self.specimen is None or not self.model.fields
+        return alone and len(self.data.sets) == 1 == self.parallel.ranks_per_model and self.method.expansion is None
+
+    @property
+    def solves(self) -> int:
+        """Approximate number of solves for all data sets: the searches for the modes are not predictable."""
+        method, field = self.method, self.field
+        if method.expansion is not None:
+            return method.expansion
+        if method.reduced is not None:  # at the mode, and draws
+            return (1 + method.reduced.solves) * sum(measurement is not None for measurement in self.measurements)
+        each = method.solves(len(self.names), field=field) + method.chain_solves(len(self.names), field=field)
+        each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
+        more = 0 if self.predict is None else 1 + self.predicted_by
+        count = sum(measurement is not None for measurement in self.measurements)
+        return (each + more) * count + more
+
+    @model_validator(mode="before")
+    @classmethod
+    def _data_of_model(cls, blocks: Any) -> Any:
+        """Choose the block of the data by the model."""
+        return data_as(blocks, DataFiles, MeasuredOutputs)
+
+
+def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:
+    """Return a load case with what acts in the measured one of that name, where it says nothing itself."""
+    if case.name not in known or any(getattr(case, name) for name in ACTING):
+        return case
+    return known[case.name].model_copy(update={"outputs": case.outputs})
