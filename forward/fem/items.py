@@ -14,7 +14,7 @@ from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial import cKDTree
 
 from forward.fem import ranks
-from forward.model import FloatArray
+from forward.model import FloatArray, ModelError
 from forward.terms.acting import Entries, Kept, Now, Past
 
 NONE = Entries(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
@@ -33,7 +33,7 @@ class Items:
 
     Raises
     ------
-    ValueError
+    ModelError
         If the mesh has no node where an item has one.
     """
 
@@ -51,8 +51,8 @@ class Items:
         apart, found = cKDTree(layout.coordinates).query(places)
         for load, far in zip(np.repeat([load.label for load in loads], self._counts), apart, strict=True):
             if far > NEAR * np.ptp(layout.coordinates, axis=0).max():
-                message = f"the item '{load}' acts {1e3 * far:.3g} mm from the nearest node of the mesh"
-                raise ValueError(message)
+                message = f"the load '{load}' acts {1e3 * far:.3g} mm from the nearest node of the mesh, not at one"
+                raise ModelError(message)
         local = np.full(len(layout.coordinates), -1)
         local[layout.positions] = np.arange(equations.nodes_owned)
         unknowns = (3 * local[found][:, None] + np.arange(3)).ravel()

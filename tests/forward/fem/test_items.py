@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic, Path
-from forward.model import Guess, ReferenceSolution, SolveError, Stability
+from forward.model import Guess, ModelError, ReferenceSolution, SolveError, Stability
 from forward.reduced.limits import mistakes
 from forward.specimen import Specimen
 from forward.terms.acting import Entries
@@ -214,5 +214,5 @@ def test_what_an_item_cannot_have():
     ]
     with pytest.raises(ValidationError, match="not estimated with 'cable', expected neither"):
         cube(CABLE, adapt={"tolerance": 0.1})
-    with pytest.raises(ValueError, match=r"the item 'cable' acts 1.* mm from the nearest node of the mesh"):
+    with pytest.raises(ModelError, match=r"the load 'cable' acts 1.* mm from the nearest node of the mesh"):
         solved(cube(CABLE | {"end": (0.9, 1.0, 1.0)}))
