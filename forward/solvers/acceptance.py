@@ -14,7 +14,12 @@ STALLED = 0.5  # a residual that falls by less may have reached rounding
 
 
 class Diverged(Exception):  # noqa: N818 - control flow of the solvers
-    """An attempt at one load failed, for the reason given; `closest` is a state from which to try again, if known."""
+    """An attempt at one load failed, for the reason given; `closest` is a state from which to try again, if known.
+
+    Its `stability` is that of an equilibrium that was refused.
+    """
+
+    stability = Stability.NOT_TESTED
 
     def __init__(self, reason: str, closest: FloatArray | None = None) -> None:
         super().__init__(reason)

@@ -145,8 +145,7 @@ class _Search:
 
     def failed(self, stop: Diverged) -> None:
         """Note that an attempt has failed."""
-        if isinstance(stop, Unstable):
-            self.refused = max(self.refused, stop.stability)
+        self.refused = max(self.refused, stop.stability)
 
     def few(self, start: FloatArray, iterations: int, *, alone: bool) -> Steps[Found]:
         """Make a few iterations; what is reached `alone`, without a reference, has no branch."""

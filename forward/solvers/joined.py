@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.acceptance import Diverged, Unstable
+from forward.solvers.acceptance import Diverged
 from forward.solvers.corrections import NEAR, mix, straight
 from forward.solvers.newton import newton
 from forward.solvers.settings import SolverSettings
@@ -115,12 +115,11 @@ def load_steps(
             there, iterations = _step(system, settings, found.state, history, load, limit, near=near)
         except Diverged as stop:
             step = (load - reached) / 2
-            if isinstance(stop, Unstable):
+            smallest, refusal = settings.minimum_load_step, stop.stability != Stability.NOT_TESTED
+            if refusal:
                 barrier, unstable, refused = load, True, max(refused, stop.stability)
-            refusals += isinstance(stop, Unstable) or not near
-            smallest = settings.minimum_load_step
-            if isinstance(stop, Unstable):
                 smallest = max(smallest, LOCATED)
+            refusals += refusal or not near
             if near and (step < smallest or 2 * step <= SHORTEST * load):
                 history.append(f"the branch from rest ends at {100 * reached:.4g} % of the load")
                 if beyond is not None:
