@@ -246,11 +246,14 @@ def _lasting(
 
 def _changed(solution: Solution, outputs: FloatArray, state: FloatArray) -> Iterator[str]:
     """Try to write into a solution; name what is no longer what it was."""
-    for what, expected in (("outputs", outputs), (STATE, state)):
-        with suppress(ValueError):
-            getattr(solution, what)[...] = np.nan
-        if not np.array_equal(getattr(solution, what), expected):
-            yield what
+    with suppress(ValueError):
+        solution.outputs[...] = np.nan
+    with suppress(ValueError):
+        solution.state[...] = np.nan
+    if not np.array_equal(solution.outputs, outputs):
+        yield "outputs"
+    if not np.array_equal(solution.state, state):
+        yield STATE
 
 
 def _rows(rows: list[FloatArray], what: str, length: int) -> FloatArray:

@@ -169,7 +169,8 @@ class Path(Hyperelastic):
     @property
     def whole(self) -> Hyperelastic:
         """The body at the last step, with the numbers that change among the others."""
-        return Hyperelastic(**{name: getattr(self, name) for name in Hyperelastic.model_fields if name != "kind"})
+        names = Hyperelastic.model_fields.keys() - {"kind"}
+        return Hyperelastic(**{name: value for name, value in self if name in names})
 
     @property
     def scalars(self) -> dict[str, Scalar]:

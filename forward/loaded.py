@@ -16,7 +16,6 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from forward.adapt import Adapt, Refinable
 from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
 from forward.bodies.inclusions import too_narrow
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
@@ -179,7 +178,7 @@ class LoadedBody(Refinable):
 
         Not of bodies with inclusions or random fields, which vary everywhere.
         """
-        if isinstance(self.body, MeshFile) or self.inclusions or self.fields:
+        if self.body.kind == "mesh" or self.inclusions or self.fields:
             return ()
         held = {on: set(AXES) for on in self.clamp}
         for item in self.displacements:
@@ -198,7 +197,7 @@ class LoadedBody(Refinable):
             If the mesh is divided already, or coefficients of fields are those of its vertices.
         """
         self.require_modes()
-        if isinstance(self.body, MeshFile):
+        if self.body.kind == "mesh":
             return self.refined(math.ceil(math.log2(times) - 1e-9))
         return self.model_copy(update={"body": self.body.with_cells(times, self.plane)})
 
@@ -240,8 +239,12 @@ class LoadedBody(Refinable):
 
     def tighter(self, factor: float) -> Self:
         """Return the same problem with the solver's tolerances multiplied by a factor."""
-        tolerances = {name: factor * getattr(self.solver, name) for name in ("tolerance", "derivative_tolerance")}
-        return self.model_copy(update={"solver": self.solver.model_copy(update=tolerances)})
+        solver = self.solver
+        tolerances = {
+            "tolerance": factor * solver.tolerance,
+            "derivative_tolerance": factor * solver.derivative_tolerance,
+        }
+        return self.model_copy(update={"solver": solver.model_copy(update=tolerances)})
 
     def solved_to(self, tolerance: Any) -> Self:
         """Return the same problem with another tolerance of its solver."""
@@ -310,22 +313,23 @@ class LoadedBody(Refinable):
         """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
         boundaries = self.body.boundaries
         places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
-        for block in ("displacements", "loads", "outputs"):
-            for i, item in enumerate(getattr(self, block)):
+        named = {"displacements": self.displacements, "loads": self.loads, "outputs": self.outputs}
+        for block, items in named.items():
+            for i, item in enumerate(items):
                 if hasattr(item, "on"):
                     places.append(((block, i, "on"), item.on))
         unknown = [(place, on) for place, on in places if on not in boundaries]
         for place, on in unknown:
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
-        for block, label in (
-            ("inclusions", "label"),
-            ("fields", "label"),
-            ("displacements", "label"),
-            ("loads", "label"),
-            ("outputs", "name"),
-        ):
-            names = Counter(getattr(item, label) for item in getattr(self, block))
-            for name, count in names.items():
+        labels = {
+            "inclusions": [item.label for item in self.inclusions],
+            "fields": [item.label for item in self.fields],
+            "displacements": [item.label for item in self.displacements],
+            "loads": [item.label for item in self.loads],
+            "outputs": [item.name for item in self.outputs],
+        }
+        for block, names in labels.items():
+            for name, count in Counter(names).items():
                 if count > 1:
                     yield (block,), f"{count} of them are called '{name}', expected different names", name
         yield from self.own_mistakes()

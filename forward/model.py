@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from enum import IntEnum
 from typing import Protocol, Self
 
@@ -56,7 +56,7 @@ class Work:
 
     def as_array(self) -> NDArray[np.int64]:
         """Return the counts in the order of `WORK`."""
-        return np.array([getattr(self, name) for name in WORK], dtype=np.int64)
+        return np.array(astuple(self), dtype=np.int64)
 
     @classmethod
     def sum_of(cls, works: Iterable[Work]) -> Work:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from difflib import get_close_matches
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -43,11 +43,16 @@ class Named(Settings):
 
     name: str = Field(default="", pattern=r"^[^.\s]*$")
 
+    if TYPE_CHECKING:
+
+        @property
+        def kind(self) -> str:
+            """What it is; a field of every subclass."""
+
     @property
     def label(self) -> str:
         """The name in parameter paths."""
-        kind = str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
-        return self.name or kind.rpartition(".")[2]
+        return self.name or self.kind.rpartition(".")[2]
 
 
 LONGEST = 80  # letters of a value in a message

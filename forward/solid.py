@@ -94,24 +94,28 @@ class Solid(ModelSpec):
         return {"kind": given} if isinstance(given, str) else given
 
     @property
+    def numbers(self) -> dict[str, Any]:
+        """What the block of the material holds, whose names depend on its kind."""
+        return dict(self.material)
+
+    @property
     def own_scalars(self) -> dict[str, Scalar]:
         """Numbers of the material, of regions and of inclusions that can be made parameters, by their paths."""
         found = {}
         for name in constants(self.energy):
-            found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+            found[f"material.{name}"] = Scalar(self.numbers[name], type(self.material), name)
         for region, numbers in self.regions.items():
             for name, value in numbers.items():
                 block = RegionNumbers if name == CONTRAST else type(self.material)
                 if name in block.model_fields:
                     found[f"regions.{region}.{name}"] = Scalar(value, block, name)
         for inclusion in self.inclusions:
-            for name in type(inclusion).model_fields:
+            for name, value in inclusion:
                 if name not in {"kind", "name"}:
                     within: tuple[Any, ...] = ()
                     if name in AXES:  # the centre stays in the body
                         low, high = self.body.bounds[AXES.index(name)]
                         within = Ge(low), Le(high)
-                    value = getattr(inclusion, name)
                     found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         return found
 
@@ -123,12 +127,12 @@ class Solid(ModelSpec):
     @property
     def energy(self) -> str:
         """Kind of the material."""
-        return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
+        return str(self.numbers["kind"])
 
     @property
     def fibres(self) -> tuple[Vector, ...]:
         """Unit vectors along the families of fibres in the undeformed body."""
-        given = getattr(self.material, "fibres", ())
+        given = self.numbers.get("fibres", ())
         return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
@@ -139,7 +143,7 @@ class Solid(ModelSpec):
             return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
 
         names = constants(self.energy)
-        shared = own("material", {name: getattr(self.material, name) for name in names})
+        shared = own("material", {name: self.numbers[name] for name in names})
         found = {"material": shared}
         for region, numbers in self.regions.items():
             place = f"regions.{region}"

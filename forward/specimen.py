@@ -151,8 +151,8 @@ class Specimen(Solid):
 
     def loaded(self, case: LoadCase) -> Hyperelastic:
         """Return the body in one load case."""
-        shared = {name: getattr(self, name) for name in SHARED}
-        acting = {name: getattr(case, name) for name in ("clamp", "displacements", "loads", "outputs")}
+        shared = {name: value for name, value in self if name in SHARED}
+        acting = {name: value for name, value in case if name in {"clamp", "displacements", "loads", "outputs"}}
         return _Loaded(formulation=self.formulation, **shared, **acting)
 
     def seen(self, case: LoadCase) -> tuple[Observed, ...]:

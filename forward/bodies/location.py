@@ -7,7 +7,7 @@ returned, and the caller decides how far is too far.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ FEW = 2**21  # pairs of a point and a cell, all of which are looked at
 FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])  # of a tetrahedron
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
+class Located(NamedTuple):
     """Where points lie.
 
     Attributes
@@ -57,7 +56,7 @@ def locate(corners: FloatArray, points: FloatArray) -> Located:
     lows, highs = corners.min(axis=1), corners.max(axis=1)
     tiny = ROUNDING * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     parts = [_some(corners, (lows, highs), part, tiny) for part in np.array_split(points, -(-n // AT_ONCE))]
-    return Located(*(np.concatenate([getattr(part, name) for part in parts]) for name in Located.__annotations__))
+    return Located(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _some(corners: FloatArray, boxes: tuple[FloatArray, FloatArray], points: FloatArray, tiny: float) -> Located:

@@ -62,8 +62,8 @@ class Training:
         """Return an even part of the snapshots, at most so many."""
         count = len(self.parameters)
         few = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
-        few_of = {name: getattr(self, name)[few] for name in ("coordinates", "parameters", "adjoints")}
-        return replace(self, **few_of)
+        some = self.coordinates[few], self.parameters[few], self.adjoints[few]
+        return replace(self, coordinates=some[0], parameters=some[1], adjoints=some[2])
 
     def shaken(self, count: int) -> Training:
         """Return these snapshots and so many more, moved at random in all modes: these tell the whole stiffness."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,7 @@ DIRECTIONS = 16  # parameters up to which states are differentiated by each of t
 FEW = 6  # random directions otherwise
 
 
-@dataclass(frozen=True, eq=False)
-class Snapshots:
+class Snapshots(NamedTuple):
     """Solutions of the full model, in canonical order.
 
     Attributes
@@ -40,8 +38,7 @@ class Snapshots:
 
     def with_others(self, others: Snapshots) -> Snapshots:
         """Return these and others."""
-        names = ("parameters", "states", "adjoints", "tangents", "outputs")
-        return Snapshots(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in names))
+        return Snapshots(*map(np.concatenate, zip(self, others, strict=True)))
 
 
 def solved(model: HyperelasticModel, points: FloatArray, spread: FloatArray) -> Snapshots:

@@ -8,8 +8,7 @@ one. Like σ itself they are to be doubled for 95 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -44,8 +43,7 @@ def part(name: str, which: str) -> str:
     return f"{first}{PARTS[which]}".removeprefix("_")
 
 
-@dataclass(frozen=True)
-class Estimate(Generic[Values]):
+class Estimate(NamedTuple, Generic[Values]):
     """A value and its errors, all of one shape; NaN where something is not known.
 
     Attributes
@@ -86,7 +84,7 @@ def single(results: Mapping[Any, Any], name: str) -> Estimate[float]:
     there = {key: results[key] for key in (name, *(part(name, which) for which in PARTS)) if key in results}
     numbers = {key: np.nan if value is None else float(value) for key, value in there.items()}
     found = estimate_of({name: np.nan} | numbers, name)
-    return Estimate(*(float(getattr(found, field.name)) for field in fields(Estimate)))
+    return Estimate(*map(float, found))
 
 
 def with_mesh(
@@ -100,7 +98,8 @@ def with_mesh(
 
 def parts_of(found: Estimate[FloatArray], name: str, dims: Sequence[str], which: Sequence[str]) -> Variables:
     """Return parts of an estimate as variables of results."""
-    return {part(name, one): (tuple(dims), getattr(found, one)) for one in which}
+    values = found._asdict()
+    return {part(name, one): (tuple(dims), values[one]) for one in which}
 
 
 def holds(results: Mapping[Any, Any], name: str, which: str) -> bool:

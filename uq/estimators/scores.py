@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,7 @@ RESOLVED = 2.0  # an error counts as measured if it is this many times the refer
 UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Errors of repeats, by row and output (n, m).
 
     Attributes

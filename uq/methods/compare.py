@@ -11,7 +11,7 @@ Points that several methods or budgets ask for are solved once, and charged to e
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -84,7 +84,7 @@ class Given(Method):
         if missing:
             raise ValueError(f"the reference gives no values of {', '.join(missing)}, expected those of every output")
         values = [self.values[name] for name in evaluate.outputs]
-        return xr.Dataset({name: ("output", [getattr(known, name) for known in values]) for name in ESTIMATES})
+        return xr.Dataset({name: ("output", [dict(known)[name] for known in values]) for name in ESTIMATES})
 
 
 class Entry(Settings):
@@ -442,7 +442,7 @@ def _compared(
             f"{name}_error": (by_output, error),
             f"{name}_estimate": (by_repeat, estimates[shown]),
             f"{name}_estimate_error": (by_repeat, claims[shown]),
-            **{f"{name}_{f.name}": (by_row, getattr(scored, f.name)[shown]) for f in fields(scored)},
+            **{f"{name}_{which}": (by_row, values[shown]) for which, values in scored._asdict().items()},
             f"{name}_single": (by_output, single),
             f"{name}_rate": (("estimator", "output"), rates[..., 0]),
             f"{name}_rate_error": (("estimator", "output"), rates[..., 1]),

@@ -27,9 +27,10 @@ The bounds, the active subspace and their errors are computed from the same prod
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Literal, assert_never
+from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
@@ -280,14 +281,12 @@ class _Samples:
         assert found.tangents is not None
         self.each = each
         self._reasons |= {failure.reason for failure in found.failures}
-        for name, new in (
-            ("points", points),
-            ("outputs", found.outputs),
-            ("tangents", found.tangents),
-            ("ok", found.ok),
-        ):
-            kept = getattr(self, name)
-            setattr(self, name, np.concatenate([kept, new.reshape(R, -1, *kept.shape[2:])], axis=1))
+
+        def longer(kept: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            return np.concatenate([kept, new.reshape(R, -1, *kept.shape[2:])], axis=1)
+
+        self.points, self.outputs = longer(self.points, points), longer(self.outputs, found.outputs)
+        self.tangents, self.ok = longer(self.tangents, found.tangents), longer(self.ok, found.ok)
 
     def _sums(self, each: int) -> tuple[FloatArray, FloatArray]:
         """Sums (R', J, m) of what is averaged, over the scrambles that have answers, and their numbers (R',)."""
