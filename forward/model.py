@@ -99,6 +99,8 @@ class SolveError(Exception):
         Outputs (m,) that are known all the same, as of the first steps of a path; NaN for the others.
     """
 
+    inadmissible = False  # whether there is nothing to solve
+
     def __init__(
         self,
         reason: str,
@@ -121,6 +123,8 @@ class SolveError(Exception):
 
 class InadmissibleError(SolveError):
     """The material is inadmissible, or its energy undefined: there is nothing to solve, and the likelihood is zero."""
+
+    inadmissible = True
 
 
 class ModelError(ValueError):

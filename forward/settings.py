@@ -26,12 +26,13 @@ class Settings(BaseModel):
     @classmethod
     def _checked(cls, value: Any, handler: Any) -> Self:
         try:
-            return handler(_freeze(value))  # type: ignore[no-any-return]
+            found: Self = handler(_freeze(value))
         except ValidationError as error:
             raise ValidationError.from_exception_data(
                 cls.__name__,
                 [_explain(cls, line) for line in error.errors(include_url=False) if not _follows(line)],
             ) from None
+        return found
 
     def __hash__(self) -> int:
         """Hash the contents of the block: the tables in it are dictionaries, which are not hashable."""

@@ -152,7 +152,7 @@ def _compiled(source: str, spare: str, name: str) -> Any | None:
     found = library(source, against=("-lmvec", "-lm")) or library(source.replace(spare, ""))
     if found is None:
         return None
-    function = getattr(found, name)
+    function = found[name]
     longs = 4 if name == "spread" else 1
     function.argtypes = [ctypes.c_long] * longs + [ctypes.c_void_p] * 3
     function.restype = None

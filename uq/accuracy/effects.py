@@ -193,8 +193,8 @@ class _Effect:
         along = covariances(self.functions, exact[:, None])[:, 0] / after if after else np.zeros(len(self.coefficients))
         return share * (after - before), share * max(self.left(along), self.unseen)
 
-    def along(self, of: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Error of what follows from values of the output (n, c) → (c, …), and what its estimates leave open of it.
+    def along(self, of: Callable[[FloatArray, int], FloatArray], i: int) -> tuple[FloatArray, FloatArray]:
+        """Error of what follows from values of output i, (n, c) and i → (c, …), and what its estimates leave open.
 
         Open is how it changes along the principal directions of what is open of the coefficients.
         """
@@ -204,7 +204,7 @@ class _Effect:
         scale = np.sqrt(max(float(np.trace(self.covariance)) / float(kept.sum()), 1.0)) if kept.sum() > 0 else 0.0
         exact = self.outputs + self.errors
         others = exact[:, None] + self.functions @ (directions[:, leading] * np.sqrt(kept) * scale)
-        before, after, *moved = of(np.column_stack([self.outputs, exact, others]))
+        before, after, *moved = of(np.column_stack([self.outputs, exact, others]), i)
         return after - before, np.sqrt(((np.array(moved) - after) ** 2).sum(axis=0))
 
     def left(self, weights: FloatArray) -> float:
@@ -265,7 +265,7 @@ def _of_consequence(
     error, doubt = np.full((2, *stated.shape), np.nan)
     for i, one in enumerate(effects):
         if one is not None:
-            error[i], rest = one.along(lambda values, i=i: of.of(values, i))  # type: ignore[misc]
+            error[i], rest = one.along(of.of, i)
             std = float(one.outputs.std())
             missed = of.missed(stated[i], one.unseen / std if std else 0.0, std)
             doubt[i] = np.hypot(unknown[i] * error[i], np.maximum(rest, missed))

@@ -13,7 +13,6 @@ from forward.model import (
     FloatArray,
     ForwardModel,
     Guess,
-    InadmissibleError,
     MeshError,
     Solution,
     SolveError,
@@ -87,7 +86,7 @@ class BlockSolver:
                     tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
                 row = None
-                lost = isinstance(error, InadmissibleError)
+                lost = error.inadmissible
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history, lost))
                 work[i], stability[i] = error.work.as_array(), error.stability
                 outputs[i] = np.nan if error.reached is None else error.reached

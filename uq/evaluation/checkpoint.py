@@ -13,9 +13,9 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, is_dataclass
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import h5py
 import numpy as np
@@ -199,9 +199,9 @@ def _write(path: Path, body: bytes, key: str = "") -> None:
     write_whole(path, _checksum(BytesIO(body), key).encode().ljust(HEAD, b"\0") + body)
 
 
-def _checksum(file: BinaryIO, key: str) -> str:
+def _checksum(file: BytesIO | BufferedReader, key: str) -> str:
     """Return a hash of the rest of a file and of its key."""
-    return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()  # type: ignore[arg-type]
+    return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()
 
 
 def _check(path: Path, key: str) -> None:

@@ -199,7 +199,7 @@ def _answered(model: ForwardModel, point: FloatArray, solution: Solution, second
 
 def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:
     """A solve without an answer."""
-    failure = Failure(0, (), error.reason, error.history, isinstance(error, InadmissibleError))
+    failure = Failure(0, (), error.reason, error.history, error.inadmissible)
     return Evaluations(
         np.zeros((1, 0)),
         np.full((1, len(outputs)), np.nan),

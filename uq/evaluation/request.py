@@ -123,13 +123,14 @@ class Evaluations:
     @classmethod
     def of(
         cls,
-        rows: Mapping[str, NDArray[Any]],
+        rows: Mapping[str, Any],
         failures: Sequence[Failure],
         fields: FloatArray,
         sketches: FloatArray | None = None,
     ) -> Evaluations:
         """Return evaluations from arrays with a row for each point, by their names."""
-        return cls(**{**dict.fromkeys(ON_REQUEST), **rows}, failures=tuple(failures), fields=fields, sketches=sketches)  # type: ignore[arg-type]
+        known: dict[str, Any] = {**dict.fromkeys(ON_REQUEST), **rows}
+        return cls(**known, failures=tuple(failures), fields=fields, sketches=sketches)
 
     @property
     def joined(self) -> NDArray[np.bool_]:

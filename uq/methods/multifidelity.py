@@ -281,7 +281,7 @@ def described(
         others["expansion"] = expanded.left**2 / squares + sizes_of[0]
     dataset = dataset.assign_coords(alternative=list(others))
     dataset = dataset.assign(alternative_solves=(("alternative", "output"), np.array(list(others.values()))))
-    add(dataset, compared(others, team.spent, expanded_used=isinstance(way, ByExpansion)))
+    add(dataset, compared(others, team.spent, expanded_used=way is expanded))
     values = np.isfinite(dataset["fidelity_values"].to_numpy()).all(axis=2)
     asked = np.repeat(inside, sizes_of, axis=0)
     lost, filled = int((asked & ~values)[:, 0].sum()), int((asked & ~values)[:, 1:].any(axis=1).sum())
