@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +22,7 @@ from forward.model import (
     SolveError,
     Stability,
     Work,
+    displacements,
 )
 
 
@@ -44,10 +46,14 @@ class OneByOne:
             yield found
 
 
-class OfOne(OneByOne):
-    """What a model has of the one `model` that it is made of."""
+class OfModel:
+    """What is said of the one `model` that something is made of."""
 
-    model: ForwardModel
+    if TYPE_CHECKING:  # a field, or a property
+
+        @property
+        def model(self) -> ForwardModel:
+            """The model."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -63,6 +69,15 @@ class OfOne(OneByOne):
     def differentiable(self) -> bool:
         """Whether solutions have tangents and adjoints."""
         return self.model.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return displacements(self.model)
+
+
+class OfOne(OfModel, OneByOne):
+    """A model that is made of another `model`."""
 
     @property
     def space(self) -> NodalSpace | None:

@@ -19,9 +19,9 @@ import numpy as np
 
 from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.pointwise import OfModel
 from uq.evaluation.block import BlockSolver, Merger
 from uq.evaluation.checkpoint import Checkpoint, read
-from uq.evaluation.evaluate import OfModel
 from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
 

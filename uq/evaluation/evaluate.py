@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, ModelError, displacements
+from forward.model import FloatArray, ForwardModel, ModelError
+from forward.pointwise import OfModel
 from uq.evaluation.block import BlockSolver, merge
 from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 
@@ -20,36 +21,6 @@ BLOCKS = 16  # into which a request of one rank group is cut: an interruption co
 LEAST = 4  # points in such a block, unless a request has fewer
 LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers must not overflow or underflow
 MANY = 8  # points among which at least one should have an output that is not small by chance
-
-
-class OfModel:
-    """What an evaluation of a model says of it."""
-
-    if TYPE_CHECKING:  # a field, or a property
-
-        @property
-        def model(self) -> ForwardModel:
-            """The model."""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.model.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.model.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
-        return self.model.differentiable
-
-    @property
-    def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
-        return displacements(self.model)
 
 
 class OfEvaluate:
