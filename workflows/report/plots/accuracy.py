@@ -25,7 +25,7 @@ from workflows.report.plots.figure import (
     stacked,
     text_of,
 )
-from workflows.report.plots.moments import WORDS, Estimated
+from workflows.report.plots.outputs import WORDS, Estimated
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -14,7 +14,7 @@ from forward.model import SolveError
 from forward.readable import and_error, size, spoken
 from forward.words import named, number
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
-from workflows.report.plots import moments
+from workflows.report.plots import outputs
 from workflows.report.plots import places as maps
 from workflows.report.section import Results, section
 
@@ -148,13 +148,13 @@ def curve(results: Results) -> Iterator[Block]:
     yield Text(f"{spoken(along)}: {spec.in_words(along)}; every step is solved from the one before.")
     drawn = []
     for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
-        drawn.append((moments.over_path(dataset, output, along, unit), f"Over the path: {output}."))
+        drawn.append((outputs.over_path(dataset, output, along, unit), f"Over the path: {output}."))
         if "sobol_total" in dataset:
             caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
-            drawn.append((moments.shares_over_path(dataset, output, along, unit), caption))
+            drawn.append((outputs.shares_over_path(dataset, output, along, unit), caption))
         elif "derivative_per_std" in dataset:
             caption = f"What moves {output}, step by step."
-            drawn.append((moments.slopes_over_path(dataset, output, along, unit), caption))
+            drawn.append((outputs.slopes_over_path(dataset, output, along, unit), caption))
     yield Pictures.of(*drawn)
 
 

@@ -16,7 +16,7 @@ from workflows.report import plots
 from workflows.report.blocks import Answer, Block, Card, Heading, Pairs, Pictures, Table, Text
 from workflows.report.plots import accuracy
 from workflows.report.plots.accuracy import Cost
-from workflows.report.plots.moments import WORDS
+from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
 
 if TYPE_CHECKING:

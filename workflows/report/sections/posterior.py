@@ -13,7 +13,7 @@ from forward.words import margin, named, number, rounded, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import places as maps
-from workflows.report.plots.moments import measured_over_path
+from workflows.report.plots.outputs import measured_over_path
 from workflows.report.plots.posterior import told_by_case
 from workflows.report.section import Results, section
 from workflows.report.sections.bodies import MISSES, first, misses, specimen

@@ -14,7 +14,7 @@ from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
-from workflows.report.plots.moments import WORDS
+from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
 from workflows.studies.selection_results import bayes_factor, by_probability, chance, conflicts, grade, ranking
 
