@@ -82,8 +82,7 @@ def still(scene: Scene, quantity: Quantity) -> Figure:
     ]
     if len(equal[1]):
         at, between = equal
-        paint = np.tile(colours(HALF)[:3], (len(between), 1))
-        faces.append(_faces(at @ view.T, between, paint, 1.0, culled=False))
+        faces.append(_faces(at @ view.T, between, np.tile(colours(HALF)[:3], (len(between), 1)), 1.0, culled=False))
     faces.append(_faces(moved @ view.T, triangles, rgb, TRANSPARENT if hidden else 1.0, culled=True))
     # From far to near; a transparent skin is in front of what is inside.
     layers = [faces[:-1], faces[-1:]] if hidden else [faces]

@@ -124,8 +124,7 @@ def _made(name: str, section: Section, results: Results) -> list[Block] | None:
     except Exception as error:
         if name in SECTIONS.own:
             raise
-        why = f"{type(error).__name__}: {error}"
-        return [Heading(name), Text(f"This section could not be made: {why}", "error")]
+        return [Heading(name), Text(f"This section could not be made: {type(error).__name__}: {error}", "error")]
 
 
 def _read(directory: Path, refusals: list[str]) -> Results:
@@ -136,8 +135,7 @@ def _read(directory: Path, refusals: list[str]) -> Results:
         raise FileNotFoundError(f"{directory}: holds no summary.json, expected the directory of a finished study")
     own_code.make_visible(directory)
     try:
-        study = parse(tomllib.loads(dataset.attrs["config"]), folder=directory)
-        return Results(dataset, summary, study, directory)
+        return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"]), folder=directory), directory)
     except StudyError as error:
         if refusals:
             return Results(dataset, summary, _Withheld(), directory)

@@ -141,8 +141,7 @@ def _ticks(one: float) -> Any:
             for decimals in range(12):
                 if np.abs(np.round(places, decimals) - places).max() < 1e-3 * step:
                     break
-            text = f"{round(x / one, decimals) + 0.0:,.{decimals}f}"
-            return text.replace("-", "\N{MINUS SIGN}")
+            return f"{round(x / one, decimals) + 0.0:,.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
     return Ticks()
 
@@ -161,12 +160,9 @@ def _points(artist: Any) -> int:
 
 def axes(height: float = 3.2, width: float = 5.4) -> Axes:
     """Return axes on a new figure (inches) that needs no display and is not kept elsewhere."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    ax: Axes = figure.add_subplot()
+    ax: Axes = Figure(figsize=(width, height), layout="constrained").add_subplot()
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -193,13 +189,11 @@ def grid(
     below
         Height that is left free under all of them, for a legend.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows, (width, height), (left, bottom, right, top) = -(-count // columns), size, inside
     whole = width * columns, height * rows + below
     figure = Figure(figsize=whole)
-    FigureCanvasAgg(figure)
     places = [(width * (i % columns) + left, whole[1] - height * (i // columns + 1) + bottom) for i in range(count)]
     extent = (width - left - right) / whole[0], (height - bottom - top) / whole[1]
     return [figure.add_axes((x / whole[0], y / whole[1], *extent)) for x, y in places]

@@ -294,8 +294,7 @@ def _by_parameter(ax: Axes, dataset: xr.Dataset, x: FloatArray, values: FloatArr
 
 def _steps(dataset: xr.Dataset, output: str) -> xr.Dataset:
     """Return the results of an output at every step, in their order."""
-    here = dataset.isel(output=np.flatnonzero(dataset["output_of"].to_numpy() == output))
-    return here.sortby("step")
+    return dataset.isel(output=np.flatnonzero(dataset["output_of"].to_numpy() == output)).sortby("step")
 
 
 def _along(ax: Axes, path: str, unit: str, y: str, **legend: Any) -> Axes:
@@ -324,8 +323,7 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the Sobol' indices of an output with 95 % confidence intervals, the parameter with the largest on top."""
-    totals = dataset["sobol_total"].sel(output=output).to_numpy()
-    order = np.argsort(-totals)[:BARS]
+    order = np.argsort(-dataset["sobol_total"].sel(output=output).to_numpy())[:BARS]
     ax = ax or axes(height=1.3 + 0.5 * len(order))
     places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
     for which, colour, side in (("first", CONTROLLED, 0.19), ("total", HIGH, -0.19)):

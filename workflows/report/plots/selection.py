@@ -117,8 +117,7 @@ def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, 
     over, of
         What is drawn at the two axes, with its unit.
     """
-    here = [k for k, test in enumerate(dataset["output_test"].values) if str(test) in places]
-    one = dataset.isel(output=here)
+    one = dataset.isel(output=[k for k, test in enumerate(dataset["output_test"].values) if str(test) in places])
     return _over(dataset, one, np.array([places[str(test)] for test in one["output_test"].values]), over, of, ax)
 
 
@@ -131,8 +130,7 @@ def _over(dataset: xr.Dataset, one: xr.Dataset, at: FloatArray, over: str, of: s
         faint = 0.3 if style["zorder"] > 2 else 0.1
         ax.fill_between(at, low, high, color=style["color"], alpha=faint, linewidth=0, zorder=style["zorder"])
         ax.plot(at, one["prediction_mean"].sel(model=model).values, label=label, **style)
-    error = one["sigma"].values
-    ax.errorbar(at, one["measured"].values, yerr=error, fmt=".", color=DARK, label="measured", zorder=4)
+    ax.errorbar(at, one["measured"].values, one["sigma"].values, fmt=".", color=DARK, label="measured", zorder=4)
     ax.locator_params(axis="x", nbins=6)
     return finished(ax, over, of)
 

@@ -82,8 +82,7 @@ def forward(results: Results) -> Card:
         errors |= {"reduced model": own[output]} if output in own else {}
         spread = distribution(one) if sampled else None
         lines = [] if spread is None else [f"95\u00a0%: {interval(*spread.inside, unit, value)}{spread.by}"]
-        unknown = output in results.meshes_unknown
-        lines += known(errors, unit, value, mesh=not unknown)
+        lines += known(errors, unit, value, mesh=output not in results.meshes_unknown)
         estimate = single(one, name)
         if np.isfinite(estimate.corrected):
             lines.append(f"corrected for the mesh: {and_error(estimate.corrected, estimate.left, unit)}")
@@ -204,8 +203,7 @@ def inversion(results: Results) -> Card:
     if "stiffness_mean" in one and "draw" not in one:
         # The one number beside the values at the nodes is the mean of their logarithm.
         said = [answer.name.replace("stiffness mean", "mean of ln stiffness") for answer in answers]
-        named = [replace(answer, name=name) for answer, name in zip(answers, said, strict=True)]
-        answers = [_stiffness(one), *named]
+        answers = [_stiffness(one), *(replace(answer, name=name) for answer, name in zip(answers, said, strict=True))]
     if "prediction_share" in one:
         goals = [str(name) for name in one["goal"].values]
         asked = listed([_goal(name) for name in goals])

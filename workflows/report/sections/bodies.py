@@ -90,8 +90,7 @@ def specimen(one: xr.Dataset, results: Results) -> Viewer:
     """A specimen that was inverted, with its inclusions, and measured points."""
     from workflows.report.scene.scene import posterior_scene
 
-    scene = posterior_scene(one, results.study)
-    return turning(scene, "The undeformed specimen, with what was found inside")
+    return turning(posterior_scene(one, results.study), "The undeformed specimen, with what was found inside")
 
 
 def turning(scene: Scene, label: str, also: str = "") -> Viewer:

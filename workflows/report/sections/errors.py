@@ -121,8 +121,7 @@ def table(results: Results, names: list[str]) -> Table:
                 of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
                 corrected = and_error(one.corrected, one.left, unit)
             rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
-    head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")
-    return Table(head, rows)
+    return Table(("estimate", "value", "sampling", "mesh", "total error", "corrected"), rows)
 
 
 @section(heading="Tolerance", when=lambda results: "accuracy" in results.summary)

@@ -123,8 +123,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
     yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
     pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
     if pairs:
-        correlations = of["correlation_quantiles"]
-        pairwise = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
+        pairwise = [(a, b, _interval(of["correlation_quantiles"].sel(parameter=a, partner=b))) for a, b in pairs]
         yield Table(("parameter", "with", "correlation"), pairwise, text={0, 1})
     if "slope_quantiles" in of:
         yield Text("How means change with what specimens differ in, by one unit of it:")

@@ -41,9 +41,8 @@ def total_errors(results: Results) -> Iterator[Block]:
         of_output = results.of(output)
         for name, word in WORDS.items():
             one, bias = single(of_output, name), "bias_error" if name == "mean" else "std_bias_error"
-            found = (one.error, float(of_output[bias]), one.total)
-            errors = [margin(error, results.unit(output)) for error in found]
-            rows.append((f"{word} of {output}", *errors))
+            errors = (one.error, float(of_output[bias]), one.total)
+            rows.append((f"{word} of {output}", *(margin(error, results.unit(output)) for error in errors)))
     yield Table(("estimate", "sampling", "mesh", "total"), rows)
 
 
@@ -159,8 +158,7 @@ def sensitivities(results: Results, output: str) -> Table:
         _, *corrected = results.cells(("derivative",), {"output": output, "parameter": name}, by)
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
         rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
-    head = results.heads({"derivative": "derivative"})
-    return Table(("parameter", *head, "× standard deviation", "× range"), rows)
+    return Table(("parameter", *results.heads({"derivative": "derivative"}), "× standard deviation", "× range"), rows)
 
 
 def largest_of(dataset: xr.Dataset) -> str:
@@ -226,8 +224,7 @@ def second_order(results: Results, output: str) -> Table:
         for partner in names[i + 1 :]:
             at = {"output": output, "parameter": name, "partner": partner}
             rows.append((name, partner, *results.cells(("sobol_second",), at)))
-    head = results.heads({"sobol_second": "second order"})
-    return Table(("parameter", "with", *head), rows, text={0, 1})
+    return Table(("parameter", "with", *results.heads({"sobol_second": "second order"})), rows, text={0, 1})
 
 
 @section("field_sobol_first", heading="Displacement field", level=3)

@@ -275,8 +275,7 @@ def of_spectrum(one: xr.Dataset) -> tuple[Axes, str]:
 def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
     """Draw the stiffness, if it is not the same everywhere, and the spectrum of the data."""
     if float(one["stiffness_prior_std"].max()) > 0:
-        drawn = ", ".join(plots.panels(one))
-        yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {drawn}."
+        yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {', '.join(plots.panels(one))}."
     yield of_spectrum(one)
     if not has_points(one):
         return
@@ -290,8 +289,7 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
 
 def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
     """Draw the misfits of the load cases."""
-    words = f"|r|² of each {_part(one)}, and what is expected: mean and two standard deviations."
-    return plots.misfits(one), words
+    return plots.misfits(one), f"|r|² of each {_part(one)}, and what is expected: mean and two standard deviations."
 
 
 def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[str, str]) -> Iterator[tuple[Axes, str]]:
