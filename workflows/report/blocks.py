@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -28,12 +28,18 @@ HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 @dataclass(frozen=True)
 class Block:
-    """Something on the page."""
+    """Something on the page; a style and a script that it needs are there once."""
+
+    style = script = ""
 
     @property
     def macro(self) -> str:
         """The name of what draws it in report.html.jinja: its own."""
         return type(self).__name__.lower()
+
+    def whole(self) -> Iterator[Block]:
+        """Go through this block and all that it holds."""
+        yield self
 
 
 @dataclass(frozen=True)
@@ -210,6 +216,12 @@ class Folded(Block):
     title: str
     blocks: Sequence[Block]
     printed: bool = True
+
+    def whole(self) -> Iterator[Block]:
+        """Go through this block and all that it holds."""
+        yield self
+        for block in self.blocks:
+            yield from block.whole()
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from workflows.config.blocks import Report, located
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse
 from workflows.report import plots
-from workflows.report.blocks import Block, Folded, Heading, Html, Pictures, Table, Text
+from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 from workflows.run import own_code
@@ -156,15 +156,14 @@ def render(title: str, parts: Parts) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    blocks = [block for _, found in parts for block in _inside(found)]
-    markup = [block for block in blocks if isinstance(block, Html)]
+    blocks = [block for _, found in parts for outer in found for block in outer.whole()]
     return environment.get_template("report.html.jinja").render(
         title=title,
         groups=_grouped(parts),
         asset=lambda name: markupsafe.Markup((HERE / "assets" / name).read_text(encoding="utf-8")),
         turning=any(block.macro == "viewer" for block in blocks),
-        styles=dict.fromkeys(block.style for block in markup if block.style),
-        scripts=dict.fromkeys(block.script for block in markup if block.script),
+        styles=dict.fromkeys(block.style for block in blocks if block.style),
+        scripts=dict.fromkeys(block.script for block in blocks if block.script),
     )
 
 
@@ -187,14 +186,6 @@ def _grouped(parts: Parts) -> list[_Group]:
         return [_Group(parts)]
     first, last = numbers[0], numbers[-1] + 1
     return [_Group(parts[:first]), _Group(parts[first:last], top=True), _Group(parts[last:])]
-
-
-def _inside(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Go through blocks and those that are folded in them."""
-    for block in blocks:
-        yield block
-        if isinstance(block, Folded):
-            yield from _inside(block.blocks)
 
 
 def _names(directories: Sequence[Path]) -> list[str]:
