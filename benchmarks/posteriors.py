@@ -19,12 +19,12 @@ from forward.model import FloatArray
 from forward.pointwise import FunctionModel
 from inverse.criticism.answer import answer
 from inverse.criticism.assessment import assess
-from inverse.criticism.predictive import examine_few
 from inverse.criticism.verdict import verdict_on_few
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
+from tests.problems import examine_few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs

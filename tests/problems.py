@@ -7,6 +7,7 @@ import numpy as np
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.answer import quantiles
+from inverse.criticism.predictive import examine, spectrum_of
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -90,6 +91,13 @@ def curved(limit=np.inf):
     sigma = np.full(25, 0.05)
     data = np.exp(B @ truth) + sigma * rng.standard_normal(25)
     return FieldPosterior(model, data, sigma, DensePrior(root))
+
+
+def examine_few(posterior, gaussian, neighbours=None):
+    """Test the residuals of few parameters at the mode: a solve with derivatives."""
+    at = posterior.at(gaussian.mode[None], derivatives=True)
+    residual = posterior.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
+    return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)
 
 
 def few(seed=0, wave=0.0, noise=None):

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from forward.model import FloatArray, SolveError
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ACCEPTED = 0.3  # acceptance rate for which β is tuned during the burn-in
 FIRST_STEP = 0.5  # β at its start
@@ -153,15 +150,6 @@ class Chains:
     def flat(self) -> FloatArray:
         """All draws (n, k), chain after chain."""
         return self.draws.reshape(-1, self.draws.shape[2])
-
-    def arviz_groups(self) -> dict[str, xr.Dataset]:
-        """Return ArviZ's groups: `arviz.InferenceData(**chains.arviz_groups())`."""
-        import xarray as xr
-
-        posterior = {name: (("chain", "draw"), self.draws[:, :, i]) for i, name in enumerate(self.names)}
-        stats = {"lp": (("chain", "draw"), self.log_density), "acceptance_rate": ("chain", self.accepted)}
-        at = {"chain": np.arange(self.draws.shape[0]), "draw": np.arange(self.draws.shape[1])}
-        return {"posterior": xr.Dataset(posterior, at), "sample_stats": xr.Dataset(stats, at)}
 
 
 def _arviz() -> Any:

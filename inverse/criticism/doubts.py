@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -88,17 +87,13 @@ def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> l
     share = float((left > UNSEEN).mean())
     if share < SOME:
         return []
-    best, least = (f"{left[k]:.2g} of it at {_at(places[k])}" for k in _ends(left))
+    best, least = (f"{left[k]:.2g} of it at {_at(places[k])}" for k in (int(left.argmin()), int(left.argmax())))
     return [Finding("little-seen", "note", {"share": 100 * share, "unseen": UNSEEN, "best": best, "least": least})]
 
 
 def _at(where: FloatArray) -> str:
     numbers, _, unit = place(where.tolist()).rpartition("\u00a0")
     return f"({numbers}) {unit}"
-
-
-def _ends(values: FloatArray) -> tuple[int, int]:
-    return int(values.argmin()), int(values.argmax())
 
 
 def at_an_end(
@@ -201,21 +196,19 @@ def strangers(
     return [Finding("strangers", "note" if heavy else "warning", values)]
 
 
-def expansion_off(error: Any, solves: Any) -> list[Finding]:
+def expansion_off(error: float, solves: int) -> list[Finding]:
     """Doubt an expansion that misses left-out samples by a large part of the errors of the data.
 
     Parameters
     ----------
     error
-        Root mean square error of the datum that it misses most, over the standard deviation of its error; None
-        without an expansion.
+        Root mean square error of the datum that it misses most, over the standard deviation of its error.
     solves
         Number of solves that it was fitted to.
     """
-    if error is None or not float(error) > EXPANDED:
+    if not error > EXPANDED:
         return []
-    off = float(error)
-    return [Finding("shared-expansion-off", "error" if off > 1 else "warning", {"solves": int(solves), "off": off})]
+    return [Finding("shared-expansion-off", "error" if error > 1 else "warning", {"solves": solves, "off": error})]
 
 
 def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[Finding]:

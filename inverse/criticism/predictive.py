@@ -16,7 +16,6 @@ import numpy as np
 from forward.model import FloatArray
 from inverse.data.neighbours import DRAWS, Neighbours, agreement
 from inverse.fields.low_rank import Spectrum
-from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 
 
@@ -43,11 +42,6 @@ class ResidualTest:
     probability: float
     agreement: float
     agreement_probability: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether neither probability is below 1 %."""
-        return self.probability >= 0.01 and not self.agreement_probability < 0.01
 
 
 def examine(
@@ -93,10 +87,3 @@ def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T
     return Spectrum(values, vectors, vectors @ A.T, np.zeros(d), 0.0, d)
-
-
-def examine_few(posterior: Posterior, gaussian: Laplace, neighbours: Neighbours | None = None) -> ResidualTest:
-    """Test the residuals of few parameters at the mode: a solve with derivatives."""
-    at = posterior.at(gaussian.mode[None], derivatives=True)
-    residual = posterior.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
-    return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)

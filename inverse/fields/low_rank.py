@@ -57,6 +57,11 @@ class Spectrum:
     neglected: float
     products: int
 
+    @property
+    def resolution(self) -> FloatArray:
+        """Diagonal (n,) of S: from 0 (the datum adds nothing to the others) to 1 (it alone tells its prediction)."""
+        return np.asarray((self.images**2 / (1 + self.values[:, None])).sum(axis=0))
+
     def solve(self, whitened: FloatArray) -> FloatArray:
         """Multiply (I + UΛUᵀ)⁻¹ with (N,), or (k, N)."""
         return whitened - (whitened @ self.vectors.T * (self.values / (1 + self.values))) @ self.vectors
@@ -250,10 +255,3 @@ class LowRankPosterior:
         """Number of directions that the data determine: the trace Σ λ/(1+λ) of S."""
         values = self.spectrum.values
         return float((values / (1 + values)).sum())
-
-    # --- the data ----------------------------------------------------------------------------------------------------
-
-    @cached_property
-    def resolution(self) -> FloatArray:
-        """Diagonal (n,) of S: from 0 (the datum adds nothing to the others) to 1 (it alone tells its prediction)."""
-        return np.asarray((self.spectrum.images**2 / (1 + self.spectrum.values[:, None])).sum(axis=0))

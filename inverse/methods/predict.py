@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
-from inverse.methods.record import BAND, ENDS, Record
+from inverse.methods.record import ENDS, Record
+from uq.estimators.estimate import BAND
 from uq.estimators.estimate import part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs

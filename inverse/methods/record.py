@@ -163,7 +163,7 @@ def of_data(
 ) -> Record:
     """Data, residuals over the errors `scale`, and resolution, also by load case."""
     values, cases = spectrum.values, int(data.cases.max()) + 1
-    resolution = (spectrum.images**2 / (1 + values[:, None])).sum(axis=0)
+    resolution = spectrum.resolution
     per_case = [data.cases == k for k in range(cases)]
     alone = [ritz(spectrum, rows)[0] for rows in per_case]
     return {

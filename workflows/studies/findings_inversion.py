@@ -9,7 +9,6 @@ import numpy as np
 from forward.fem.finer import counted as counted_on
 from forward.findings import Finding, Severity
 from forward.readable import told
-from forward.registry import named
 from inverse.data.shared_motion import said
 from uq.findings import add
 from workflows.studies.predictions import of_file
@@ -29,7 +28,9 @@ def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
     if study.predict is not None:
-        named("workflows.studies.predicted:keep_unknown_meshes")(study, dataset)
+        from workflows.studies import predicted
+
+        predicted.keep_unknown_meshes(study, dataset)
     for k, name in enumerate(dataset.data_set.values):
         if not bool(dataset["ok"][k]):
             said.append(Finding("not-inverted", "warning", {"name": name, "why": words[k]}))
@@ -39,7 +40,7 @@ def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
         said.append(Finding("verdict", SEVERITY.get(int(trust[k]), "note"), {"verdict": words[k]}, subject=str(name)))
         said += [one.of(str(name)) for one in doubts]
         if study.predict is not None:
-            said += named("workflows.studies.predicted:findings")(dataset.isel(data_set=k), name)
+            said += predicted.findings(dataset.isel(data_set=k), name)
     found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
     add(found, *said)
     return found
@@ -56,16 +57,6 @@ def _verdict(words: str, trust: int, doubts: list[Finding]) -> tuple[str, int]:
     if warnings:
         return f"doubtful: {'; '.join(warnings)}; but for that: {words}", DOUBTFUL
     return words, trust
-
-
-def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Finding]:
-    """Say how alike the posteriors by a reduced model and by the body are, where there is one."""
-    from inverse.criticism.doubts import reduced_off
-
-    if "reduced_share" not in one:
-        return []
-    shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
-    return reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
 
 
 def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
@@ -112,10 +103,11 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
     if "motion_eigenvalue" in one:
         motions = one["motion_eigenvalue"].to_numpy()
         found.append(said(motions[np.isfinite(motions)]))
-    found += (
-        criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
-    )
-    found += _of_reduced(one, names)
+    if "expansion_error" in one:
+        found += criticism.expansion_off(float(one["expansion_error"]), int(one["expansion_solves"]))
+    if "reduced_share" in one:
+        shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
+        found += criticism.reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
     return found + _of_mesh(one, study, number)
 
 

@@ -9,7 +9,7 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
 from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
-from inverse.criticism.predictive import examine, examine_few
+from inverse.criticism.predictive import examine
 from inverse.criticism.verdict import verdict_on_few, verdict_on_field
 from inverse.criticism.weights import enough
 from inverse.fields.field_posterior import FieldPosterior
@@ -19,7 +19,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.surrogate import fit
-from tests.problems import DensePrior, Linear, N, curved, few, ridge, solved, summary
+from tests.problems import DensePrior, Linear, N, curved, examine_few, few, ridge, solved, summary
 from uq.evaluation.evaluate import SerialEvaluate
 
 
@@ -81,17 +81,17 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
     np.testing.assert_allclose(got.std, expected.std, rtol=0.15)
 
 
-def test_the_layout_is_that_of_arviz():
+def test_diagnostics_are_those_of_arviz():
     arviz = pytest.importorskip("arviz")
     posterior = few()
     found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=100, burn=50))
-    groups = arviz.InferenceData(**found.arviz_groups())
-    table = arviz.summary(groups, round_to="none")
+    draws = {name: found.draws[:, :, k] for k, name in enumerate(found.names)}
+    table = arviz.summary(arviz.from_dict(posterior=draws), round_to="none")
     assert list(table.index) == ["a", "b", "c"]
     np.testing.assert_allclose(table["r_hat"], found.rhat)
     np.testing.assert_allclose(table["ess_bulk"], found.ess_bulk)
     np.testing.assert_allclose(table["ess_tail"], found.ess_tail)
-    assert groups.sample_stats["lp"].shape == (4, 100)
+    assert found.log_density.shape == (4, 100)
 
 
 def test_where_there_is_no_answer():

@@ -47,10 +47,10 @@ def test_predictions_and_resolution_are_those_of_the_exact_posterior():
     problem = Linear(holes=7)
     _, found = solved(problem, cutoff=1e-12)
     spread = np.sqrt(np.diag(problem.G @ problem.covariance @ problem.G.T))
-    np.testing.assert_allclose(np.sqrt(found.resolution[7:]) / found.weights[7:], spread[7:], rtol=1e-7)
+    np.testing.assert_allclose(np.sqrt(found.spectrum.resolution[7:]) / found.weights[7:], spread[7:], rtol=1e-7)
     K = problem.G[7:]
     influence = K @ problem.covariance @ K.T / problem.sigma[7:] ** 2  # of each datum on its prediction
-    np.testing.assert_allclose(found.resolution[7:], np.diag(influence), rtol=1e-7)
+    np.testing.assert_allclose(found.spectrum.resolution[7:], np.diag(influence), rtol=1e-7)
     assert found.determined == pytest.approx(np.trace(influence), rel=1e-8)
     g = np.random.default_rng(1).standard_normal(N)
     centre, width = found.marginal(g)
@@ -116,7 +116,7 @@ def test_calibration():
         found = LowRankPosterior.at(find_mode(posterior).point, cutoff=1e-3)
         inside.append((np.abs(truth - found.mean) <= stats.norm.ppf(0.9) * found.std).mean())
         probabilities.append(stats.chi2(DATA).sf(square_of(found)))
-        assert np.abs(found.residual / np.sqrt(1 - found.resolution)).max() < 6
+        assert np.abs(found.residual / np.sqrt(1 - found.spectrum.resolution)).max() < 6
     assert np.mean(inside) == pytest.approx(0.8, abs=3 * np.std(inside) / np.sqrt(60))
     assert stats.kstest(probabilities, "uniform").pvalue > 0.01
 

@@ -12,7 +12,6 @@ from forward.pointwise import FunctionModel
 from inverse.criticism.answer import answer, by_gaussian, counts, gaussian_points
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains
-from inverse.criticism.predictive import examine_few
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality, usual
 from inverse.low_dimensional.evidence import evidence
@@ -20,6 +19,7 @@ from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.proposals import Elliptical, Mixture, first
 from inverse.low_dimensional.surrogate import affordable
+from tests.problems import examine_few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
