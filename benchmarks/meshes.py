@@ -27,7 +27,7 @@ from forward.fem.finer import extrapolated
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
-from inverse.criticism.doubts_of_meshes import mesh_corrected, mesh_too_coarse
+from inverse.criticism.doubts import mesh_corrected, mesh_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL

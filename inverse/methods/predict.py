@@ -21,8 +21,7 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
 from inverse.methods.record import ENDS, Record
-from uq.estimators.estimate import BAND
-from uq.estimators.estimate import part
+from uq.estimators.estimate import BAND, part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs

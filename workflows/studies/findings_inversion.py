@@ -113,19 +113,11 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
 
 def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
     """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
-    from inverse.criticism import doubts_of_meshes as of_meshes
+    from inverse.criticism.doubts import not_estimable, of_mesh
 
     if "mesh_checked" not in one:
         return []
-    found, names = of_meshes.not_estimable(study.not_estimable(number)), [str(name) for name in one.parameter.values]
-    seen = np.isfinite(one["measured"].to_numpy())
-    shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
-    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
-    why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
-    if bool(one["mesh_corrected"]):
-        left = dict(zip(names, one["mesh_left"].to_numpy().tolist(), strict=True))
-        settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
-        return found + of_meshes.mesh_corrected(
-            error, shifts, left, nodes, settled=settled, counted=counted, from_file=of_file(study.model)
-        )
-    return found + of_meshes.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)
+    error = one["mesh_error"].to_numpy()[np.isfinite(one["measured"].to_numpy())]
+    settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
+    found = of_mesh(one, error, settled=settled, counted=counted, from_file=of_file(study.model))
+    return not_estimable(study.not_estimable(number)) + found

@@ -20,7 +20,7 @@ from forward.spec import ModelSpec
 from forward.specimen import Specimen
 from forward.words import named
 from inverse.criticism.comparison import Candidate
-from inverse.criticism.doubts_of_meshes import not_estimable
+from inverse.criticism.doubts import not_estimable
 from inverse.data.measurements import AXES, Measurements
 from inverse.data.table import DataError
 from inverse.methods.invert import derivable

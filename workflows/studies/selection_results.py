@@ -234,26 +234,17 @@ def doubts_of_selection(
 
 def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
-    from inverse.criticism import doubts_of_meshes as of_meshes
+    from inverse.criticism.doubts import of_mesh
 
     of = dataset.sel(model=model, group=group)
     here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
-    error = of["mesh_error"].to_numpy()[here]
-    names = [str(name) for name in dataset.parameter.values]
-    shifts, left = (
-        {name: value for name, value in zip(names, of[key].to_numpy().tolist(), strict=True) if np.isfinite(value)}
-        for key in ("mesh_shift", "mesh_left")
-    )
-    if bool(of["mesh_corrected"]):
-        of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
-        return of_meshes.mesh_corrected(error, shifts, left, np.zeros(0), settled=True, from_file=of_file)
-    why = str(of["mesh_why"].item())
-    return of_meshes.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
+    of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
+    return of_mesh(of, of["mesh_error"].to_numpy()[here], settled=True, from_file=of_file)
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
-    from inverse.criticism import doubts_of_meshes as of_meshes
+    from inverse.criticism import doubts as criticism
 
     if "mesh_checked" not in dataset:
         return []
@@ -282,9 +273,9 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
     coarse = _too_coarse_for_files(dataset).any("group")
-    said += of_meshes.meshes_not_alike(corrected, unknown)
-    said += of_meshes.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
-    return said + of_meshes.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
+    said += criticism.meshes_not_alike(corrected, unknown)
+    said += criticism.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
+    return said + criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
 
 
 def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Dataset:
@@ -294,7 +285,7 @@ def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Da
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
-    from inverse.criticism.doubts_of_meshes import certain, decides
+    from inverse.criticism.doubts import certain, decides
 
     if "mesh_checked" not in dataset:
         return dataset
@@ -307,7 +298,7 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
 
 def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
-    from inverse.criticism.doubts_of_meshes import beyond_files
+    from inverse.criticism.doubts import beyond_files
 
     corrected = dataset["mesh_corrected"]
     if "mesh_of_file" not in dataset:

@@ -7,12 +7,13 @@ from inverse.criticism.doubts import (
     at_an_end,
     far_from_prior,
     little_seen,
+    mesh_corrected,
+    mesh_too_coarse,
     noise_far,
     scores,
     strangers,
     too_large_errors,
 )
-from inverse.criticism.doubts_of_meshes import mesh_corrected, mesh_too_coarse
 from uq.inputs.distributions import Beta, LogNormal, LogUniform, Normal, Uniform
 
 pytestmark = pytest.mark.unit

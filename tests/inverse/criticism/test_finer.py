@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from inverse.criticism.doubts_of_meshes import certain, meshes_not_alike, meshes_too_coarse
+from inverse.criticism.doubts import certain, meshes_not_alike, meshes_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
-from inverse.criticism.doubts_of_meshes import not_estimable
+from inverse.criticism.doubts import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from tests.launch import TISSUQ, run, run_script

@@ -219,7 +219,7 @@ def differences(results: Results, output: str) -> Table:
 @section("probability", "mesh_checked")
 def finer_meshes(results: Results) -> Iterator[Block]:
     """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
-    from inverse.criticism.doubts_of_meshes import change_in_words
+    from inverse.criticism.doubts import change_in_words
 
     dataset = results.dataset
     yield Heading("Effect of a finer mesh", level=3)
