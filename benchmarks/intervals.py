@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from inverse.criticism.answer import quantiles
+from inverse.criticism.assessment import quantiles
 from inverse.methods.invert_few import invert_few
 from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate

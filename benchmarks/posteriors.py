@@ -17,8 +17,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.pointwise import FunctionModel
-from inverse.criticism.answer import answer
-from inverse.criticism.assessment import assess
+from inverse.criticism.assessment import Assessment, answer, assess
 from inverse.criticism.verdict import verdict_on_few
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
@@ -86,7 +85,7 @@ def main() -> None:
                 posterior, A = problem(size, curvature, seed)
                 gaussian = laplace(posterior)
                 found = evidence(posterior, gaussian, Invert().solves(size, field=False))
-                known = answer(posterior, gaussian, found)
+                known = answer(posterior, Assessment(gaussian, found))
                 mean, std, log_evidence = truth(posterior, A, curvature, gaussian)
                 refused += verdict_on_few(gaussian, found, examine_few(posterior, gaussian)).trust == "neither"
                 means.append(float(np.abs((known.mean - mean) / std).max()))
@@ -111,7 +110,7 @@ def curved() -> None:
         begin = time.process_time()
         gaussian = laplace(posterior)
         one = assess(posterior, gaussian, 8 * len(std), chains="hmc", model=model, seed=seed)
-        known = answer(posterior, gaussian, one.evidence, one.chains)
+        known = answer(posterior, one)
         seconds, chains = time.process_time() - begin, one.chains
         assert chains is not None
         gaps, ratios = (known.mean - mean) / std, known.std / std

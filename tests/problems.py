@@ -6,7 +6,7 @@ import numpy as np
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from inverse.criticism.answer import quantiles
+from inverse.criticism.assessment import quantiles
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior

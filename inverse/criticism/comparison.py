@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.answer import answer, quantiles
-from inverse.criticism.assessment import Assessment, Points
+from inverse.criticism.assessment import Assessment, Points, answer, quantiles
 from inverse.criticism.stacking import stacking
 from inverse.criticism.verdict import Verdict
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
@@ -307,7 +306,7 @@ def _constants(
         for g, group in enumerate(data_groups):
             posterior, assessment = posteriors[name, group], stated[name, group]
             columns = [parameters.index(p) for p in posterior.names]
-            known = answer(posterior, assessment.gaussian, assessment.evidence, assessment.chains)
+            known = answer(posterior, assessment)
             mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
             mean[k, g, columns], std[k, g, columns] = known.mean, known.std
             bands[:, k, g, columns] = known.quantiles(QUANTILES).T

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from forward.model import FloatArray
-from inverse.criticism.answer import counts
+from inverse.criticism.assessment import counts
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights
 from inverse.criticism.predictive import ResidualTest

@@ -13,8 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution
-from inverse.criticism.answer import Answer, answer, by_gaussian
-from inverse.criticism.assessment import Assessment, Points, even, of_chains, of_gaussian, weighted
+from inverse.criticism.assessment import (
+    Answer,
+    Assessment,
+    Points,
+    answer,
+    by_gaussian,
+    even,
+    of_chains,
+    of_gaussian,
+    weighted,
+)
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import resampled
@@ -148,7 +157,7 @@ def invert_few(
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
     verdict = verdict_on_few(gaussian, found, test, chains)
-    known = answer(posterior, gaussian, found, chains)
+    known = answer(posterior, one)
     log_evidence, error = one.log_evidence
     drawn = _drawn(posterior, one, at, method)
     moments = _moments(posterior, gaussian, known, drawn, look)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.answer import quantiles
+from inverse.criticism.assessment import quantiles
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer

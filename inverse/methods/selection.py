@@ -26,9 +26,8 @@ from inverse.criticism.verdict import verdict_on_points
 from inverse.criticism.weights import fewest
 from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared, determined
-from inverse.low_dimensional.evidence import LEAST
+from inverse.low_dimensional.evidence import LEAST, nested
 from inverse.low_dimensional.laplace import Laplace
-from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
 from inverse.methods.mesh_correction import MeshTreatment, Treatment

@@ -13,9 +13,8 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import own_seconds
 from inverse.criticism.weights import pareto_shape
-from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.evidence import evidence, nested
 from inverse.low_dimensional.laplace import laplace
-from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.surrogate import _regression, _tempered, fit, operations
 from inverse.methods.selection import _rescaled

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from forward.pointwise import FunctionModel
-from inverse.criticism.answer import answer, by_gaussian, counts, gaussian_points
+from inverse.criticism.assessment import Assessment, answer, by_gaussian, counts, gaussian_points
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains
 from inverse.criticism.verdict import verdict_on_few
@@ -74,7 +74,7 @@ def test_where_it_is_gaussian_everything_is_of_the_gaussian(size):
     assert found.route == "closed form"
     assert found.log_evidence == pytest.approx(log_evidence, abs=1e-7)
     assert verdict(posterior, gaussian, found).trust == "laplace"
-    known = answer(posterior, gaussian, found)
+    known = answer(posterior, Assessment(gaussian, found))
     assert known.source == "laplace"
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(known.mean, exact, atol=1e-9)
@@ -93,7 +93,7 @@ def test_bent_a_little(size, seed):
     found = evidence(posterior, gaussian, 320)
     mean, std, log_evidence = reference(posterior, A, 0.25, gaussian)
     assert verdict(posterior, gaussian, found).trust != "neither"
-    known = answer(posterior, gaussian, found)
+    known = answer(posterior, Assessment(gaussian, found))
     assert known.source == "points"
     assert np.abs((known.mean - mean) / std).max() < 0.15
     assert np.abs(known.std / std - 1).max() < 0.15
@@ -132,7 +132,7 @@ def test_few_points_replace_nothing():
     judged = verdict(posterior, gaussian, alike)
     assert judged.trust == "neither"
     assert "more of them will not do: run chains" in judged.why
-    known = answer(posterior, gaussian, alike)
+    known = answer(posterior, Assessment(gaussian, alike))
     assert known.source == "laplace"
     np.testing.assert_allclose(known.std, np.sqrt(np.diag(gaussian.covariance)), rtol=1e-9)
     fewer = replace(found, route="importance", ess=22.0, pareto_k=0.1)
@@ -234,7 +234,7 @@ def test_chains_that_follow_gradients():
     alike = replace(evidence(posterior, gaussian, 64), pareto_k=2.0, ess=5.0)
     judged = verdict_on_few(gaussian, alike, examine_few(posterior, gaussian), found)
     assert judged.trust == "corrected"  # fewer points do not overrule chains
-    assert answer(posterior, gaussian, alike, found).source == "chains"
+    assert answer(posterior, Assessment(gaussian, alike, found)).source == "chains"
 
 
 def test_chains_come_back_to_their_starts_only(monkeypatch):
