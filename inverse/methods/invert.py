@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -38,22 +37,6 @@ class ByReduced(Settings):
     file: str | dict[str, str]
     solves: Annotated[int, Field(ge=8)] = 24
     digest: str | dict[str, str] | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _hashed(cls, given: Any) -> Any:
-        """Add the hash of each file as it is; whoever uses a file says what is wrong with it."""
-        if not isinstance(given, Mapping) or given.get("digest") is not None:
-            return given
-        from forward.reduced.spec import digest_of
-
-        file = given.get("file")
-        try:
-            if isinstance(file, Mapping):
-                return {**given, "digest": {name: digest_of(one) for name, one in file.items()}}
-            return {**given, "digest": digest_of(file)} if isinstance(file, str) else given
-        except ModelError:
-            return given
 
     @property
     def files(self) -> str:

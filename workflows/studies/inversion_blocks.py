@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
+from forward.model import ModelError
 from forward.settings import Settings
 from forward.spec import MEASURED
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
@@ -210,6 +211,24 @@ class InversionBlocks(Settings):
         more = 0 if self.predict is None else 1 + self.predicted_by
         count = sum(measurement is not None for measurement in self.measurements)
         return (each + more) * count + more
+
+    @field_validator("method")
+    @classmethod
+    def _hashed(cls, method: Invert) -> Invert:
+        """Add the hash of each reduced model as it is; whoever uses a file says what is wrong with it."""
+        given = method.reduced
+        if given is None or given.digest is not None:
+            return method
+        from forward.reduced.spec import digest_of
+
+        try:
+            if isinstance(given.file, str):
+                digest: str | dict[str, str] = digest_of(given.file)
+            else:
+                digest = {name: digest_of(file) for name, file in given.file.items()}
+        except ModelError:
+            return method
+        return method.model_copy(update={"reduced": given.model_copy(update={"digest": digest})})
 
     @model_validator(mode="before")
     @classmethod
