@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
@@ -115,7 +115,7 @@ class MeasuredOutputs(Settings):
     quantity: ClassVar[str] = "output"
 
     files: FileNames = ()
-    tables: dict[str, str] = Field(default={})
+    tables: Annotated[dict[str, str], Field(min_length=1)] | None = None
     outputs: Stated = Field(default={})
     sigma: dict[str, Positive] = Field(default={})
     noise: OutputNoise = OutputNoise()
@@ -125,7 +125,7 @@ class MeasuredOutputs(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> MeasuredOutputs:
-        if bool(self.files) + bool(self.tables) + bool(self.outputs) != 1:
+        if bool(self.files) + (self.tables is not None) + bool(self.outputs) != 1:
             message = "expected either files or outputs, or tables of joined models"
             raise ValueError(message)
         return self
@@ -140,8 +140,8 @@ class MeasuredOutputs(Settings):
         names, steps = tuple(output.name for output in model.returned), steps_of(model)
         if self.files:
             sets, found = read_files(self.files, folder, lambda path: known(read_outputs(path, names, steps)))
-        elif self.tables:
-            sets, found = self._of_tables(folder, model, known)
+        elif self.tables is not None:
+            sets, found = _of_tables(self.tables, folder, model, known)
         else:
             try:
                 sets, found = (DataSet(name=STATED, file=""),), (known(stated(self.outputs, names)),)
@@ -149,37 +149,6 @@ class MeasuredOutputs(Settings):
                 raise StudyError(*(f"data: {line}" for line in error.args)) from None
         seen = np.unique(np.concatenate([one.axes for one in found if one is not None]))
         return sets, tuple(None if one is None else one.by_part(seen) for one in found)
-
-    def _of_tables(self, folder: Path, model: ModelSpec, known: Callable[[Measurements], Measurements]) -> Found:
-        """Read the tables of joined models, one of each at most, as one data set."""
-        names, parts, paths, wrong = tuple(output.name for output in model.returned), [], [], list[str]()
-        for name, file in self.tables.items():
-            if name not in model.parts:
-                wrong.append(f"data.tables.{name}: no model of this name; {nearest(name, tuple(model.parts))}")
-                continue
-            own, path = model.parts[name], next((one / file for one in (folder, Path()) if (one / file).exists()), None)
-            if path is None:
-                wrong.append(f"data.tables.{name}: {file}: no such file")
-                continue
-            outputs = tuple(output.name for output in own.returned)
-            try:
-                found = read_outputs(path, outputs, steps_of(own))
-            except DataError as error:
-                wrong += [f"data: {line}" for line in error.args]
-                continue
-            whole = np.array([names.index(f"{name}.{output}") for output in outputs], dtype=np.int64)[found.axes]
-            truth = {model.path_of(name, path): value for path, value in found.truth.items()}
-            rows = {"axes": whole, "cases": whole, "names": np.array(names)[whole], "parts": names}
-            parts.append(replace(found, **rows, truth=truth))
-            paths.append(path)
-        if wrong:
-            raise StudyError(*wrong)
-        try:
-            measured = known(reduce(Measurements.with_rows, parts))
-        except DataError as error:
-            raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        digest = sha256("".join(map(digest_of, paths)).encode()).hexdigest()[:16]
-        return (DataSet(name=TABLES, file=", ".join(self.tables.values()), digest=digest),), (measured,)
 
     def with_errors(self, found: Measurements) -> Measurements:
         """Return data with standard deviations and what is true; a DataError if one is unknown."""
@@ -201,6 +170,40 @@ class MeasuredOutputs(Settings):
             for name in given:
                 if name not in names:
                     yield ("data", block, name), f"not an output of the model; {nearest(name, names)}", name
+
+
+def _of_tables(
+    tables: Mapping[str, str], folder: Path, model: ModelSpec, known: Callable[[Measurements], Measurements]
+) -> Found:
+    """Read the tables of joined models, one of each at most, as one data set."""
+    names, parts, paths, wrong = tuple(output.name for output in model.returned), [], [], list[str]()
+    for name, file in tables.items():
+        if name not in model.parts:
+            wrong.append(f"data.tables.{name}: no model of this name; {nearest(name, tuple(model.parts))}")
+            continue
+        own, path = model.parts[name], next((one / file for one in (folder, Path()) if (one / file).exists()), None)
+        if path is None:
+            wrong.append(f"data.tables.{name}: {file}: no such file")
+            continue
+        outputs = tuple(output.name for output in own.returned)
+        try:
+            found = read_outputs(path, outputs, steps_of(own))
+        except DataError as error:
+            wrong += [f"data: {line}" for line in error.args]
+            continue
+        whole = np.array([names.index(f"{name}.{output}") for output in outputs], dtype=np.int64)[found.axes]
+        truth = {model.path_of(name, path): value for path, value in found.truth.items()}
+        rows = {"axes": whole, "cases": whole, "names": np.array(names)[whole], "parts": names}
+        parts.append(replace(found, **rows, truth=truth))
+        paths.append(path)
+    if wrong:
+        raise StudyError(*wrong)
+    try:
+        measured = known(reduce(Measurements.with_rows, parts))
+    except DataError as error:
+        raise StudyError(*(f"data: {line}" for line in error.args)) from None
+    digest = sha256("".join(map(digest_of, paths)).encode()).hexdigest()[:16]
+    return (DataSet(name=TABLES, file=", ".join(tables.values()), digest=digest),), (measured,)
 
 
 def check_signs(found: Measurements, model: ModelSpec) -> None:
