@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import log_factor
 from forward.bodies.surface import Surface
-from inverse.data.measurements import kinds
+from inverse.data.measurements import Measurements, kinds
 from workflows.studies.synthetic import Synthetic
 
 if TYPE_CHECKING:
@@ -56,8 +56,9 @@ def displacements(
         return found.assign(factor=(("data_set", "place", "axis"), table))
 
     def files(label: str, one: xr.Dataset, truth: dict[str, float], head: str) -> dict[str, str]:
-        where = points, model.cases, model.axes, model.places
-        return synthetic_files(specimen, method, label, one, truth, head, where)
+        values, sigma = (one[name].to_numpy() / method.metres for name in ("values", "sigma"))
+        data = Measurements.of(values, sigma, model.cases, model.axes, places=model.places, points=points)
+        return synthetic_files(specimen, method, label, one, data, truth, head)
 
     groups = np.where(points < 0, len(model.models) + kinds(model.cases, model.axes), model.cases)
     return Synthetic(model, groups, points, files, labelled)
@@ -84,14 +85,14 @@ def synthetic_files(
     method: Synthesize,
     label: str,
     one: xr.Dataset,
+    data: Measurements,
     truth: dict[str, float],
     head: str,
-    where: tuple[Any, ...],
 ) -> dict[str, str]:
-    """Return the texts of the files of a data set, by their names; points, load cases, axes and places are given."""
-    points, cases, axes, places = where
-    rigid, texts = method.motion, {}
-    frame = (places - rigid.shift) @ rigid.rotation  # where the scanner sees them
+    """Return the texts of the files of a data set, by their names; its displacements are in the unit of the files."""
+    points, cases, axes, values, sigma = data.points, data.cases, data.axes, data.values, data.sigma
+    rigid, unit, texts = method.motion, method.metres, {}
+    frame = (data.places - rigid.shift) @ rigid.rotation / unit  # where the scanner sees them
     file = io.StringIO()
     file.write(head)
     if specimen.inclusions and not specimen.fields:
@@ -101,11 +102,8 @@ def synthetic_files(
         file.write(f"# truth.stiffness = truth/{label}.csv\n")
         lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
         texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
-    unit = method.metres
-    values, sigma = one["values"].values / unit, one["sigma"].values / unit
     if method.format != "csv":
-        arrays = _arrays(specimen, method, values, sigma, (points, cases, axes))
-        return texts | _described(specimen, method, label, (places, frame / unit), arrays, truth)
+        return texts | _described(specimen, method, label, data, frame, truth)
     said = "" if method.units == "m" else f" [{method.units}]"
     heads = [f"{column}{said}" for column in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
     apart = points < 0  # outputs of load cases, in units of their own
@@ -117,7 +115,7 @@ def synthetic_files(
             if len(rows) == 0:
                 continue
             motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
-            at = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
+            at = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]], 12) + 0.0)
             cells = ",".join(motion.get(axis, "") for axis in range(3))
             file.write(f"{at},{cells},{sigma[rows[0]]:.4e},{case_name}{',' * len(more)}\n")
         names = tuple(output.name for output in specimen.cases[case].outputs)
@@ -132,8 +130,8 @@ def _described(
     specimen: Specimen,
     method: Synthesize,
     label: str,
-    where: tuple[FloatArray, FloatArray],
-    arrays: dict[str, NDArray[Any]],
+    data: Measurements,
+    frame: FloatArray,
     truth: Mapping[str, float],
 ) -> dict[str, str]:
     """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are.
@@ -142,15 +140,13 @@ def _described(
     ----------
     label
         With which names begin.
-    where
-        Places (m, 3) of all outputs on the body (m), and in the unit and the frame of the files.
-    arrays
-        As of `_arrays`, in the unit of the files.
+    data, frame
+        Displacements, and where (m, 3) they are in the frame of the files, both in their unit.
     truth
         What is known, by path.
     """
-    number = arrays.pop("number")
-    on_body, places = (one[number] for one in where)
+    number, arrays = _arrays(specimen, method, data)
+    on_body, places = data.places[number], frame[number]
     if method.format == "stl":
         motions = {case.name: arrays[f"displacement_{case.name}"] for case in specimen.cases}
         more = {"units": method.units, "sigma": method.noise.absolute, "truth": truth}
@@ -161,24 +157,23 @@ def _described(
 
 
 def _arrays(
-    specimen: Specimen, method: Synthesize, values: FloatArray, sigma: FloatArray, where: tuple[NDArray[np.int64], ...]
-) -> dict[str, NDArray[Any]]:
-    """Return displacements of each load case at the points of a cloud, their errors, and `number`, a row of each."""
-    points, cases, axes = where
-    measured = np.unique(points[np.isfinite(values)])
-    number = np.array([np.flatnonzero(points == point)[0] for point in measured])
-    found: dict[str, NDArray[Any]] = {"number": number}
+    specimen: Specimen, method: Synthesize, data: Measurements
+) -> tuple[NDArray[np.int64], dict[str, FloatArray]]:
+    """Return a row of each point of a cloud, and displacements of each load case there with their errors."""
+    measured = np.unique(data.seen().points)
+    number = np.array([np.flatnonzero(data.points == point)[0] for point in measured])
+    found: dict[str, FloatArray] = {}
     for case, name in enumerate(one.name for one in specimen.cases):
-        rows = np.flatnonzero((cases == case) & np.isin(points, measured))
+        here = data.subset((data.cases == case) & np.isin(data.points, measured))
         motion, errors = np.full((len(measured), 3), np.nan), np.full(len(measured), np.nan)
-        at = np.searchsorted(measured, points[rows])
-        motion[at, axes[rows]] = values[rows]
-        errors[at] = sigma[rows]
+        at = np.searchsorted(measured, here.points)
+        motion[at, here.axes] = here.values
+        errors[at] = here.sigma
         if method.format == "ply":
             found |= {f"u{axis}_{name}": motion[:, k] for k, axis in enumerate("xyz")} | {f"sigma_{name}": errors}
         else:
             found |= {f"displacement_{name}": motion, f"sigma_{name}": errors}
-    return found
+    return number, found
 
 
 def _cloud(places: FloatArray, arrays: Mapping[str, NDArray[Any]], form: str) -> str:
