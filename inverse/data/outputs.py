@@ -91,11 +91,7 @@ def stated(given: Mapping[str, float | Sequence[float]], outputs: Sequence[str])
         raise DataError(
             *(f"outputs.{one}: not an output of the model; {nearest(one, tuple(outputs))}" for one in wrong)
         )
-    pairs = [
-        (name, float(value))
-        for name, several in given.items()
-        for value in (several if isinstance(several, Sequence) else (several,))
-    ]
+    pairs = [(name, float(value)) for name, several in given.items() for value in np.atleast_1d(several)]
     labels = [f"data.outputs.{name}" for name, _ in pairs]
     values = np.array([value for _, value in pairs])
     return _outputs(values, np.full(len(pairs), math.nan), [outputs.index(name) for name, _ in pairs], labels, outputs)

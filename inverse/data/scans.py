@@ -162,7 +162,7 @@ class Scan(Reading):
         return self
 
 
-def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -> Measurements:
+def read(folder: Path, scan: Scan, known: Mapping[str, Units]) -> Measurements:
     """Read the files of a scan.
 
     Parameters
@@ -172,7 +172,7 @@ def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -
     scan
         The scan.
     known
-        Names of the load cases, and what is measured in them beside displacements (nothing if only names are given).
+        Names of the load cases, and what is measured in them beside displacements.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -
         if path.suffix not in TABLES + MESHES:
             raise DataError(f"{path.name}: unknown kind of file, expected one of: {', '.join(TABLES + MESHES)}")
         if path.suffix in TABLES:
-            found = of_table(path, known if isinstance(known, Mapping) else {case: {} for case in cases}, unit)
+            found = of_table(path, known, unit)
         else:
             found = _mesh(path, scan.field, cases, 1.0 if unit is None else unit)
     mistakes = found.mistakes(Path(scan.file or scan.reference or "").name)

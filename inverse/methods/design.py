@@ -320,19 +320,12 @@ class Design(Settings):
             log_bayes_factor=(("model", "other"), after.pairs()),
         ).assign_coords(model=list(inputs), other=list(inputs))
         if lost:
-            add(
-                result, Finding("design-no-answer-of-models", "warning", {"draws": self.draws, "lost": ", ".join(lost)})
-            )
+            told = {"draws": self.draws, "lost": ", ".join(lost)}
+            add(result, Finding("design-no-answer-of-models", "warning", told))
         few = [name for name, one in inputs.items() if len(outputs[name]) < 4 * (len(one.names) + 1)]
         if few:
-            add(
-                result,
-                Finding(
-                    "design-few-draws",
-                    "warning",
-                    {"models": ", ".join(few), "least": 4 * (max(len(inputs[name].names) for name in few) + 1)},
-                ),
-            )
+            least = 4 * (max(len(inputs[name].names) for name in few) + 1)
+            add(result, Finding("design-few-draws", "warning", {"models": ", ".join(few), "least": least}))
         return with_values(result, values, sigma, candidates)
 
     def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
@@ -374,9 +367,8 @@ class Design(Settings):
         gain, n = found["gain"].to_numpy(), len(choice.order)
         little = np.flatnonzero(gain < LITTLE * gain.sum() / n)
         if len(little) and n > 1:
-            doubts.append(
-                Finding("design-repeats", "note", {"first": little[0] + 1, "n": n, "least": LITTLE * gain.sum() / n})
-            )
+            values = {"first": little[0] + 1, "n": n, "least": LITTLE * gain.sum() / n}
+            doubts.append(Finding("design-repeats", "note", values))
         if self.criterion == "information" and len(told.rows) > 1:
             shared = found["information_of_draw"].to_numpy()[:, -1]
             costs = found["candidate_cost"].to_numpy()
@@ -385,9 +377,6 @@ class Design(Settings):
             shares = shared / np.maximum(own, shared)
             worst = int(shares.argmin())
             if shares[worst] < ALIKE:
-                doubts.append(
-                    Finding(
-                        "design-depends", "warning", {"draws": len(own), "shared": shared[worst], "own": own[worst]}
-                    )
-                )
+                values = {"draws": len(own), "shared": shared[worst], "own": own[worst]}
+                doubts.append(Finding("design-depends", "warning", values))
         return doubts

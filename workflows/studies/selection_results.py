@@ -124,19 +124,9 @@ def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
     (most, _), (fewer, theirs) = sides
     groups = [str(group) for group in dataset["group"].values[theirs]]
     listed = ", ".join([*groups[:LISTED], *([f"and {len(groups) - LISTED} more"] if len(groups) > LISTED else [])])
-    yield Finding(
-        "specimens-disagree",
-        "warning",
-        {
-            "specimens": first.size,
-            "many": int((~theirs).sum()),
-            "most": most,
-            "few": int(theirs.sum()),
-            "fewer": fewer,
-            "listed": listed,
-            "factor": number(found.log_bayes_factor, 3),
-        },
-    )
+    values = {"specimens": first.size, "many": int((~theirs).sum()), "most": most, "few": int(theirs.sum())}
+    values |= {"fewer": fewer, "listed": listed, "factor": number(found.log_bayes_factor, 3)}
+    yield Finding("specimens-disagree", "warning", values)
 
 
 def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> Iterator[Finding]:

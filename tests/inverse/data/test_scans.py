@@ -122,7 +122,7 @@ def test_every_format_says_the_same(tmp_path, name):
     write(tmp_path / name)
     scan = Scan(file=name, units=None if name.endswith("csv") else "mm", sigma=1e-4)
     before = locale.setlocale(locale.LC_ALL)
-    found = read(tmp_path, scan, ("press",)).with_sigma(scan.sigma)
+    found = read(tmp_path, scan, {"press": {}}).with_sigma(scan.sigma)
     assert locale.setlocale(locale.LC_ALL) == before
     np.testing.assert_allclose(found.places_of_points, POINTS / 1e3, rtol=1e-6)
     np.testing.assert_allclose(found.values, np.ravel(HOLES) / 1e3, rtol=1e-6)
@@ -151,7 +151,7 @@ with io.XDMFFile(box.comm, FILE, "w") as file:
 """
     path = tmp_path / "run.xdmf"
     run_script(1, script.replace("FILE", repr(str(path))))
-    found = read(tmp_path, Scan(file="run.xdmf", sigma=1e-5), ("press",))
+    found = read(tmp_path, Scan(file="run.xdmf", sigma=1e-5), {"press": {}})
     places = found.places_of_points
     assert len(places) == 12
     np.testing.assert_allclose(found.values, np.ravel(places * [0.2, 0.4, 0.6]), atol=1e-15)
@@ -173,7 +173,7 @@ def test_pairs_of_surfaces(tmp_path, form):
     )
     scan = scan_of(tmp_path / "scan.toml", Reading(unit=7.0, tolerance=0.2))
     assert (scan.metres, scan.tolerance, scan.surface) == (1e-3, 0.2, True)
-    found = read(tmp_path, scan, ("press", "pull"))
+    found = read(tmp_path, scan, {"press": {}, "pull": {}})
     places, motions = found.places_of_points, found.values.reshape(-1, 3)
     assert len(places) == 12
     order = [int(np.linalg.norm(POINTS / 1e3 - place, axis=1).argmin()) for place in places[:6]]
@@ -233,7 +233,7 @@ def write_stl(path, points, *, binary):
 def test_units_of_heads(tmp_path, head, settings, told):
     (tmp_path / "scan.csv").write_text(f"{head}\n0,0,0,1\n")
     with pytest.raises(DataError) as caught:
-        read(tmp_path, Scan(file="scan.csv", **settings), ("press",))
+        read(tmp_path, Scan(file="scan.csv", **settings), {"press": {}})
     assert len(caught.value.args) == 1
     assert told in str(caught.value)
 
@@ -242,7 +242,7 @@ def test_units_of_heads(tmp_path, head, settings, told):
 def test_units_agree(tmp_path):
     (tmp_path / "scan.csv").write_text("x [mm],y [mm],z [mm],ux [mm]\n1,2,3,4\n")
     for settings in ({}, {"units": "mm"}, {"unit": 1e-3}):
-        found = read(tmp_path, Scan(file="scan.csv", **settings), ("press",))
+        found = read(tmp_path, Scan(file="scan.csv", **settings), {"press": {}})
         assert found.places_of_points.tolist() == [[1e-3, 2e-3, 3e-3]]
     for settings, told in (({"units": "furlong"}, "unit 'furlong'"), ({"units": "mm", "unit": 1.0}, "either unit or")):
         with pytest.raises(ValidationError, match=told):
@@ -260,7 +260,7 @@ def test_files_that_cannot_be_read(tmp_path, name, damage, capfd):
         some = {"empty": b"", "garbage": random.Random(1).randbytes(500), "words": b"not what it says\n"}
         path.write_bytes(some.get(damage, whole[: len(whole) // 2]))
     with pytest.raises(DataError) as caught:
-        read(tmp_path, Scan(file=name), ("press",))
+        read(tmp_path, Scan(file=name), {"press": {}})
     assert len(caught.value.args) == 1, caught.value.args
     assert caught.value.args[0].startswith(f"{name}: ")
     assert "\n" not in caught.value.args[0]
@@ -280,7 +280,7 @@ def test_files_damaged_by_chance(tmp_path, capfd):
             scan = Scan(file=name) if name != "rest.stl" else Scan(reference=name, deformed={"press": name})
             said: tuple[str, ...] = ()
             try:
-                read(tmp_path, scan, ("press",))
+                read(tmp_path, scan, {"press": {}})
             except DataError as error:
                 said = error.args
             assert all(line.isprintable() for line in said), said
@@ -291,7 +291,7 @@ def test_files_damaged_by_chance(tmp_path, capfd):
 def test_pairs_that_do_not_belong_together(tmp_path):
     def told(deformed, reference="rest.ply", case="press"):
         with pytest.raises(DataError) as caught:
-            read(tmp_path, Scan(reference=reference, deformed={case: deformed}), ("press",))
+            read(tmp_path, Scan(reference=reference, deformed={case: deformed}), {"press": {}})
         return str(caught.value)
 
     mesh = meshio.Mesh(POINTS, [("triangle", TRIANGLES)])
@@ -307,7 +307,7 @@ def test_pairs_that_do_not_belong_together(tmp_path):
     assert "coincide, but move by different displacements" in told("turned.stl", "rest.stl")
     assert "deformed: unknown load case 'pres'; did you mean 'press'?" in told("rest.ply", case="pres")
     with pytest.raises(DataError, match=r"rest.ply: no displacements; expected data at its points, or a file in TOML"):
-        read(tmp_path, Scan(file="rest.ply"), ("press",))
+        read(tmp_path, Scan(file="rest.ply"), {"press": {}})
 
 
 @pytest.mark.parametrize(
@@ -330,7 +330,7 @@ def test_mistakes_in_descriptions(tmp_path, text, told):
     path = tmp_path / "scan.toml"
     path.write_text(text)
     with pytest.raises(DataError) as caught:
-        read(tmp_path, scan_of(path, Reading()), ("press",))
+        read(tmp_path, scan_of(path, Reading()), {"press": {}})
     assert any(told in line for line in caught.value.args), caught.value.args
 
 
