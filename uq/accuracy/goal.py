@@ -19,15 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray
-from uq.estimators.moments import Z
-
-if TYPE_CHECKING:
-    from uq.estimators.moments import Estimates
+from uq.estimators.moments import ESTIMATES, Z
 
 SMALL = 1e-3  # of the largest estimate of a kind: smaller ones are held to a tolerance of this
 LEFT = 1 / 3  # of the error of a mesh that takes more than all: sampling need not be better
@@ -72,9 +68,9 @@ class Goal:
         of_std = np.maximum(std, SMALL * of_mean)
         return np.array([of_mean, of_std])
 
-    def parts(self, found: Estimates | Mapping[str, FloatArray], half_width: float = Z) -> dict[str, FloatArray]:
+    def parts(self, found: Mapping[str, FloatArray], half_width: float = Z) -> dict[str, FloatArray]:
         """Return the errors (2, m) by source, and in all, over the tolerance: 1 is as much as is allowed."""
-        mean, mean_error, std, std_error = _moments(found)
+        mean, mean_error, std, std_error = (np.asarray(found[name], dtype=float) for name in ESTIMATES)
         allowed = self.tolerance * self.sizes(mean, std)
         errors = {
             "sampling": half_width * np.array([mean_error, std_error]),
@@ -86,18 +82,9 @@ class Goal:
         shares["total"] = np.hypot(shares["sampling"], shares["mesh"]) + shares["solver"]
         return shares
 
-    def reached(self, found: Estimates | Mapping[str, FloatArray], half_width: float = Z) -> float:
+    def reached(self, found: Mapping[str, FloatArray], half_width: float = Z) -> float:
         """Return the largest error of sampling over what is left for it: up to 1 there are enough samples."""
         parts = self.parts(found, half_width)
         left = 1 - parts["solver"]
         room = np.sqrt(np.maximum(np.maximum(left, 0.1) ** 2 - parts["mesh"] ** 2, (LEFT * parts["mesh"]) ** 2))
         return float(np.nan_to_num(parts["sampling"] / room, nan=np.inf).max())
-
-
-def _moments(found: Estimates | Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    names = ("mean", "mean_error", "std", "std_error")
-    if isinstance(found, Mapping):
-        mean, mean_error, std, std_error = (np.asarray(found[name], dtype=float) for name in names)
-    else:
-        mean, mean_error, std, std_error = (np.asarray(getattr(found, name), dtype=float) for name in names)
-    return mean, mean_error, std, std_error

@@ -81,6 +81,11 @@ class Estimates:
         return {name: (("output",), getattr(self, name)) for name in names or ESTIMATES}
 
     @property
+    def named(self) -> dict[str, FloatArray]:
+        """The four estimates by their names."""
+        return {"mean": self.mean, "mean_error": self.mean_error, "std": self.std, "std_error": self.std_error}
+
+    @property
     def relative_error(self) -> FloatArray:
         """Standard error of the mean relative to the mean, or to the standard deviation if that is larger."""
         scale = np.maximum(np.abs(self.mean), self.std)

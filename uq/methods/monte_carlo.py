@@ -13,7 +13,6 @@ from pydantic import Field
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
 from uq.estimators.doubts import of_control, of_field_tails, of_tails
 from uq.estimators.moments import (
-    ESTIMATES,
     POWERS,
     Coefficient,
     Estimates,
@@ -140,7 +139,7 @@ class MonteCarlo(Amount):
             count = target
             evaluations = merge(rounds)
             scalars = _scalar_moments(evaluations, inputs, centre, control)
-            reached = float(scalars.relative_error.max()) if goal is None else goal.reached(scalars)
+            reached = float(scalars.relative_error.max()) if goal is None else goal.reached(scalars.named)
             growth = MOST_GROWTH
             if tolerance is not None:
                 growth = min(MOST_GROWTH, max(1.5 if goal is None else 1.1, 1.1 * (reached / tolerance) ** 2))
@@ -303,8 +302,8 @@ def _dataset(
 def by_node(field: Estimates, displacements: int) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
     """Return estimates of a state, whose first entries are displacements, as arrays by node and component."""
     return {
-        f"field_{name}": (("node", "component"), getattr(field, name)[:displacements].reshape(-1, 3))
-        for name in ESTIMATES
+        f"field_{name}": (("node", "component"), values[:displacements].reshape(-1, 3))
+        for name, values in field.named.items()
     }
 
 

@@ -196,7 +196,7 @@ class QuasiMonteCarlo(MonteCarlo):
 
         def missed() -> float:
             if goal is not None:
-                return goal.reached(scalars, student(samples.scrambles - 1))
+                return goal.reached(scalars.named, student(samples.scrambles - 1))
             return np.inf if not self.met(float(scalars.relative_error.max())) else 0.0
 
         while (left := missed()) > 1:
