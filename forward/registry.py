@@ -175,7 +175,7 @@ def _kinds(document: Any) -> Iterator[str]:
         yield from _kinds(block)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OfKind:
     """Annotation of a field that holds a block of one of these kinds: ``Annotated[Settings, OfKind(LOADS)]``.
 

@@ -43,7 +43,7 @@ def schema():
 def test_the_page_has_one_file_for_each_kind(folder):
     assert {path.name for path in folder.iterdir()} >= {
         "my_tissue.py", "my_loads.py", "my_outputs.py", "my_methods.py", "my_sections.py", "my_models.py",
-        "my_studies.py", "wound.toml", "beam.toml", "scan.toml",
+        "my_readers.py", "my_studies.py", "wound.toml", "beam.toml", "scan.toml",
     }  # fmt: skip
 
 
@@ -134,6 +134,50 @@ def test_a_model_with_numbers_of_its_own(folder, schema):
     expected = 0.5 * cube / 3 / 2.0 * (1 + 0.1**2)  # the mean of 1/x of a log-normal x of coefficient of variation v
     assert data["mean"].item() == pytest.approx(expected, abs=4 * data["mean_error"].item())
     assert np.isfinite(data["std"]).all()
+
+
+STRIP = """
+[model]
+kind = "material-tests"
+material = { kind = "neo-hookean", C1 = 1e4 }
+tests = [{ mode = "uniaxial", at = [1.1, 1.2, 1.3] }]
+
+[parameters]
+"material.C1" = { kind = "log-normal", mean = 1e4, std = 5e3 }
+
+[data]
+files = "strip.dat"
+reader = { kind = "my_readers.Machine", length = 0.02, area = 1e-5 }
+noise = { relative = 0.03 }
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+"""
+
+
+def test_a_reader_of_data(folder, schema):
+    """Against a table of the same numbers; what a file lacks is said in one line."""
+    study, machine = folder / "strip.toml", folder / "strip.dat"
+    study.write_text(STRIP)
+    schema.validate(tomllib.loads(STRIP))
+    machine.write_text("elongation;force\n2,0;0,055\n4,0;0,101\n6,0;0,142\n")
+    done = run(None, TISSUQ, "run", study, "--out", folder / "strip", "--no-report")
+    assert done.returncode == 0, done.stderr
+    rows = zip((1.1, 1.2, 1.3), (5500, 10100, 14200), strict=True)
+    (folder / "same.csv").write_text("stretch,uniaxial\n" + "".join(f"{x},{y}\n" for x, y in rows))
+    same = re.sub(r"reader = .*\n", "", STRIP).replace("strip.dat", "same.csv")
+    (folder / "same.toml").write_text(same)
+    assert run(None, TISSUQ, "run", folder / "same.toml", "--out", folder / "same", "--no-report").returncode == 0
+    found, other = (xr.load_dataset(folder / name / "results.nc") for name in ("strip", "same"))
+    np.testing.assert_allclose(found["mode"], other["mode"], rtol=1e-12)
+    np.testing.assert_allclose(found["measured"], other["measured"], rtol=1e-15)
+    assert "my_readers" in json.loads((folder / "strip" / "sources.json").read_text())["files"]
+    machine.write_text("elongation;force\n2,0\n")
+    refused = run(None, TISSUQ, "check", study)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("data: strip.dat: cannot be read by Machine: ValueError: not enough values")
 
 
 def test_a_kind_of_study(folder, schema):

@@ -22,15 +22,18 @@ import numpy as np
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.measurements import AXES, SAME, Measurements
+from inverse.data.reader import Reader, table_of
 from inverse.data.readings import Units, split
-from inverse.data.table import DataError, Table, needed, numeric, others, read_table
+from inverse.data.table import DataError, Table, needed, numeric, others
 from inverse.data.units import factor
 
 MOTION, ERRORS = ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (*AXES, *MOTION, "sigma", *ERRORS, "case")
 
 
-def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) -> Measurements:
+def of_table(
+    path: Path, known: Mapping[str, Units], unit: float | None = None, reader: Reader | None = None
+) -> Measurements:
     """Read a table of displacements, and of other outputs.
 
     Parameters
@@ -41,6 +44,8 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         Names of the load cases, and what is measured in them beside displacements.
     unit
         m per unit of the file, if it does not state that.
+    reader
+        What reads files of another kind.
 
     Raises
     ------
@@ -48,7 +53,7 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
         With every kind of mistake in the file.
     """
     name, cases = path.name, tuple(known)
-    table, readings = split(read_table(path).with_units(name), name, known)
+    table, readings = split(table_of(path, reader).with_units(name), name, known)
     readings = replace(readings, source=table.source, truth={one: value.strip('"') for one, value in table.truth})
     if not table.rows:
         return readings

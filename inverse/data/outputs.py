@@ -19,12 +19,15 @@ from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.curves import Steps, as_rows
 from inverse.data.measurements import Measurements
-from inverse.data.table import DataError, needed, numeric, read_table
+from inverse.data.reader import Reader, table_of
+from inverse.data.table import DataError, needed, numeric
 
 COLUMNS = ("output", "value", "sigma")
 
 
-def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None) -> Measurements:
+def read_outputs(
+    path: Path, outputs: Sequence[str], steps: Steps | None = None, reader: Reader | None = None
+) -> Measurements:
     """Read a table of measured outputs.
 
     Parameters
@@ -35,13 +38,15 @@ def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None)
         Names of the outputs of the model.
     steps
         Of a path, where the table may be a curve.
+    reader
+        What reads files of another kind.
 
     Raises
     ------
     DataError
         With every kind of mistake in the file.
     """
-    table = read_table(path)
+    table = table_of(path, reader)
     name = path.name
     if steps is not None and "output" not in table.columns:
         table = as_rows(table.with_units(name), name, steps)

@@ -35,6 +35,7 @@ from forward.settings import Settings, nearest
 from inverse.data.displacement_tables import ERRORS, MOTION, of_table
 from inverse.data.files import MESHES, TABLES
 from inverse.data.measurements import SAME, Measurements
+from inverse.data.reader import AnyReader
 from inverse.data.readings import Units
 from inverse.data.registration import Registration
 from inverse.data.scan_files import Points, points_of
@@ -85,6 +86,8 @@ class Reading(Settings):
     between
         How uncertain it is that neither specimen nor scanner moved as a whole between the undeformed scan and that of
         each load case.
+    reader
+        What reads files of a kind of your own, as tables; by default they are of the kinds above.
     """
 
     sigma: Annotated[float, Field(gt=0)] | None = None
@@ -97,6 +100,7 @@ class Reading(Settings):
     beyond: Literal["refuse", "leave-out"] = "refuse"
     registration: Registration | None = None
     between: Between | None = None
+    reader: AnyReader = None
 
     def moved_between(self, unit: float) -> tuple[float, float]:
         """Return standard deviations (rad, m) of the motions between scans, given m per unit of the file."""
@@ -184,10 +188,10 @@ def read(folder: Path, scan: Scan, known: Mapping[str, Units]) -> Measurements:
         found = _pairs(folder, scan, cases, 1.0 if unit is None else unit)
     else:
         path = folder / scan.file
-        if path.suffix not in TABLES + MESHES:
+        if scan.reader is None and path.suffix not in TABLES + MESHES:
             raise DataError(f"{path.name}: unknown kind of file, expected one of: {', '.join(TABLES + MESHES)}")
-        if path.suffix in TABLES:
-            found = of_table(path, known, unit)
+        if scan.reader is not None or path.suffix in TABLES:
+            found = of_table(path, known, unit, scan.reader)
         else:
             found = _mesh(path, scan.field, cases, 1.0 if unit is None else unit)
     mistakes = found.mistakes(Path(scan.file or scan.reference or "").name)

@@ -10,7 +10,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
-from inverse.data.table import DataError, Table, needed, read_table
+from inverse.data.reader import AnyReader, table_of
+from inverse.data.table import DataError, Table, needed
 from workflows.config.mistakes import StudyError, lines
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
@@ -89,6 +90,8 @@ class DataFile(Settings):
         Rows to keep: by column, the word that must be there.
     between
         Smallest and largest stretch or amount of shear to keep.
+    reader
+        What reads a file of a kind of your own, as a table.
     """
 
     file: str
@@ -104,6 +107,7 @@ class DataFile(Settings):
     stress: Literal["nominal", "cauchy"] = "nominal"
     where: dict[str, str] = Field(default={})
     between: tuple[float, float] | None = None
+    reader: AnyReader = None
 
     def read(self, folder: Path) -> dict[str, Any]:
         """Return the block `data` with the tests themselves.
@@ -137,7 +141,7 @@ class DataFile(Settings):
     def _table(self, path: Path) -> Table:
         """Read the table, which must have all columns that are named."""
         try:
-            table = read_table(path)
+            table = table_of(path, self.reader)
         except DataError as error:
             raise StudyError(*(f"data.file: {line}" for line in error.args)) from None
         columns = [self.mode, self.at, self.across, self.component, self.group, *self.where]

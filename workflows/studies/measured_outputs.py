@@ -20,6 +20,7 @@ from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.measurements import Measurements
 from inverse.data.outputs import read_outputs, stated
+from inverse.data.reader import AnyReader
 from inverse.data.table import DataError, others
 from workflows.config.mistakes import StudyError
 from workflows.studies.measured import DataSet, FileNames, Found, Positive, digest_of, read_files
@@ -55,6 +56,8 @@ class OutputFile(Settings):
         Instead of a file: measurements by output, a number or a list of repeated measurements.
     sigma
         Standard deviations of the errors by output, if the table does not state them.
+    reader
+        What reads a file of a kind of your own, as such a table.
     digest, source
         Of the file as it was when the study ran: of its bytes, and what its remarks say; written by the run.
     """
@@ -64,6 +67,7 @@ class OutputFile(Settings):
     file: str | None = None
     outputs: Stated = Field(default={})
     sigma: dict[str, Positive] = Field(default={})
+    reader: AnyReader = None
     digest: str = ""
     source: tuple[str, ...] = ()
 
@@ -80,7 +84,7 @@ class OutputFile(Settings):
         found = (
             stated(self.outputs, names)
             if self.file is None
-            else read_outputs(folder / self.file, names, steps_of(model))
+            else read_outputs(folder / self.file, names, steps_of(model), self.reader)
         )
         check_signs(found, model)
         return found.with_sigma(np.array([self.sigma.get(name, np.nan) for name in found.names]))
@@ -108,6 +112,8 @@ class MeasuredOutputs(Settings):
         Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be outliers.
     truth
         By path: the numbers from which the data were made, if known.
+    reader
+        What reads files of a kind of your own, as such tables.
     sets
         The files as they were when the study ran; written by the run.
     """
@@ -121,6 +127,7 @@ class MeasuredOutputs(Settings):
     noise: OutputNoise = OutputNoise()
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
+    reader: AnyReader = None
     sets: tuple[DataSet, ...] = ()
 
     @model_validator(mode="after")
@@ -139,7 +146,9 @@ class MeasuredOutputs(Settings):
 
         names, steps = tuple(output.name for output in model.returned), steps_of(model)
         if self.files:
-            sets, found = read_files(self.files, folder, lambda path: known(read_outputs(path, names, steps)))
+            sets, found = read_files(
+                self.files, folder, lambda path: known(read_outputs(path, names, steps, self.reader))
+            )
         elif self.tables is not None:
             sets, found = _of_tables(self.tables, folder, model, known)
         else:
