@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from forward.findings import Finding
-from forward.registry import named
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.predictions import duration, times_of
@@ -17,7 +16,6 @@ from workflows.studies.sampling import Study
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.specimen import Specimen
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
@@ -93,7 +91,9 @@ def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
     model, method = blocks.get("model"), blocks.get("method")
     if not isinstance(model, Mapping) or model.get("kind") != "specimen" or not isinstance(method, Mapping):
         return blocks
-    specimen: Specimen = named("forward.specimen:Specimen").model_validate(model)
+    from forward.specimen import Specimen
+
+    specimen = Specimen.model_validate(model)
     case = next((one for one in specimen.cases if one.name == method.get("case")), None)
     if case is None:
         known = ", ".join(one.name for one in specimen.cases)
