@@ -183,7 +183,6 @@ class Select(Settings):
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
             starts[name, group] = by_tangents(one.inputs, one.evaluate)
             data = data_groups[group].seen()
-            data = replace(data, places=np.nan_to_num(data.places))
             with _of((name, group)):
                 found[name, group] = infer(
                     one,

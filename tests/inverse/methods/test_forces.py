@@ -8,7 +8,10 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.conformance import check_derivatives
+from forward.model import SolveError
 from forward.specimen import Specimen
+from inverse.criticism.finer import NOT_LOOKED
+from inverse.data.approximation_error import uncertain
 from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
 from tests.launch import run_script
@@ -293,6 +296,24 @@ def test_candidates_are_compared_by_forces_too(folder):
     here(folder / "select.toml", folder / "out-select")
     found = xr.load_dataset(folder / "out-select" / "results.nc", engine="h5netcdf")
     assert float(found["probability"].sel(model="right").max()) > 0.99  # the other is three times softer
+
+
+def test_forces_lie_nowhere_in_comparisons_as_in_inversions(folder, monkeypatch):
+    """What finer meshes still miss of displacements varies over the body, with which forces have nothing to do."""
+    looked = []
+
+    def stop(*given, look, **more):
+        looked.append(look.data)
+        raise SolveError("enough")
+
+    monkeypatch.setattr("inverse.methods.selection.infer", stop)
+    study = load(folder / "select.toml")
+    with pytest.raises(SolveError, match="enough"):
+        study.method.run(study.models, study.data_groups, lambda *pair: None, finer=lambda *pair: NOT_LOOKED)
+    (data,), inverted = looked, load(folder / "few.toml").measured(0)
+    np.testing.assert_array_equal(np.isnan(data.places).all(axis=1), data.axes >= 3)
+    rows = (uncertain(np.ones(len(one)), np.ones(len(one)), one) for one in (data, inverted))
+    np.testing.assert_allclose(*rows)
 
 
 def test_forces_stand_beside_points_of_uncertain_registration(folder):
