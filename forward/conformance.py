@@ -137,8 +137,7 @@ def check_derivatives(
     if not model.differentiable:
         raise DerivativeError("the model has no derivatives to check")
     if len(steps) < WINDOW:
-        message = f"{len(steps)} steps given, expected at least {WINDOW}"
-        raise ValueError(message)
+        raise ValueError(f"{len(steps)} steps given, expected at least {WINDOW}")
     rng = np.random.default_rng(seed)
     point, unit = np.array(parameters, dtype=float), np.array(scale, dtype=float)
     if directions is None:
@@ -259,8 +258,7 @@ def _changed(solution: Solution, outputs: FloatArray, state: FloatArray) -> Iter
 def _rows(rows: list[FloatArray], what: str, length: int) -> FloatArray:
     for row in rows:
         if np.shape(row) != (length,):
-            message = f"{what} returned shape {np.shape(row)}, expected ({length},)"
-            raise AssertionError(message)
+            raise AssertionError(f"{what} returned shape {np.shape(row)}, expected ({length},)")
     return np.array(rows, dtype=float).reshape(len(rows), length)
 
 

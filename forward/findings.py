@@ -47,8 +47,7 @@ def register(table: Mapping[str, str | Words]) -> None:
     for code, said in table.items():
         words = Words(said) if isinstance(said, str) else said
         if CATALOGUE.setdefault(code, words) != words:
-            message = f"a finding with code '{code}' has other words already"
-            raise ValueError(message)
+            raise ValueError(f"a finding with code '{code}' has other words already")
 
 
 class Entry(NamedTuple):

@@ -96,8 +96,7 @@ class Hyperelastic(LoadedBody):
             If its mesh is to be refined first.
         """
         if self.unrefined:
-            message = f"model.adapt: {UNREFINED}"
-            raise ModelError(message)
+            raise ModelError(f"model.adapt: {UNREFINED}")
         alone = "path:built" if self.stepped else "model:HyperelasticModel"
         model = "path:HistoryModel" if self.path_dependent else alone
         return named(f"forward.fem.{model}")(self, comm, parameters)
@@ -249,8 +248,7 @@ class Path(Hyperelastic):
     def _mistakes(self) -> Iterator[Mistake]:
         yield from super()._mistakes()
         if not self.steps:
-            message = "no number has steps, expected a list for a number of a load or of a displacement"
-            yield ("steps",), message, {}
+            yield ("steps",), "no number has steps, expected a list for a number of a load or of a displacement", {}
             return
         known = {path: one for path, one in super().scalars.items() if path.partition(".")[0] in BLOCKS}
         for path, values in self.steps.items():

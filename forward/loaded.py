@@ -59,8 +59,7 @@ class LoadedBody(Refinable):
         block: Block = "loads" if of.field_name == "loads" else "displacements"
         for item in given if isinstance(given, tuple) else ():
             for name, values in lists(block, item).items():
-                message = f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'"
-                raise ValueError(message)
+                raise ValueError(f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'")
         return given
 
     @property
@@ -343,8 +342,7 @@ class LoadedBody(Refinable):
         yield from self.mistakes_of_adapt()
         if self.adapt is not None and self.remembers:
             expected = "friction = 0" if self.remembers == "friction" else "neither"
-            message = f"errors of the mesh are not estimated with {self.remembers}, expected {expected}"
-            yield ("adapt",), message, True
+            yield ("adapt",), f"errors of the mesh are not estimated with {self.remembers}, expected {expected}", True
         yield from support.mistakes(complete=not unknown)
 
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:

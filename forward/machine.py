@@ -99,8 +99,7 @@ def require(size: float, what: str) -> None:
     """
     have = headroom()
     if have.size < size:
-        message = f"memory ran out: {what} needs {size / MIB:,.0f} MiB, {have}"
-        raise StopError(message)
+        raise StopError(f"memory ran out: {what} needs {size / MIB:,.0f} MiB, {have}")
 
 
 def reserve_for_linear_algebra() -> None:
@@ -127,8 +126,7 @@ def require_files(size: float, what: str) -> None:
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     if soft != resource.RLIM_INFINITY and soft < size:
-        message = f"{what} needs files of {size / MIB:.0f} MiB, {soft / MIB:.3g} MiB are allowed (ulimit -f)"
-        raise StopError(message)
+        raise StopError(f"{what} needs files of {size / MIB:.0f} MiB, {soft / MIB:.3g} MiB are allowed (ulimit -f)")
 
 
 def _limits() -> Iterator[Headroom]:

@@ -136,8 +136,7 @@ def real(returned: object, what: str) -> FloatArray:
         given = {"c": "complex numbers", "U": "text", "S": "bytes"}.get(found.dtype.kind, str(found.dtype))
     except (TypeError, ValueError, OverflowError):
         given = f"{type(returned).__name__} that holds more than numbers, or rows of different lengths"
-    message = f"the model's {what} returned {given}, expected real numbers"
-    raise ModelError(message)
+    raise ModelError(f"the model's {what} returned {given}, expected real numbers")
 
 
 @dataclass(frozen=True)
@@ -176,8 +175,7 @@ class FunctionModel(OneByOne):
         point.flags.writeable = False
         outputs = np.array(real(self.function(point), "function"), ndmin=1)
         if outputs.shape != (len(self.outputs),):
-            message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
-            raise ModelError(message)
+            raise ModelError(f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)")
         if not np.isfinite(outputs).all():
             raise SolveError("the model's function returned a value that is not finite")
         outputs.flags.writeable = False
@@ -207,6 +205,5 @@ class FunctionSolution(ExplicitSolution):
         jacobian = real(self.model.jacobian(self.parameters), "jacobian")
         expected = self.outputs.size, self.parameters.size
         if jacobian.size != np.prod(expected) or (jacobian.shape != expected and 1 not in expected):
-            message = f"the model's jacobian returned shape {jacobian.shape}, expected {expected}"
-            raise ModelError(message)
+            raise ModelError(f"the model's jacobian returned shape {jacobian.shape}, expected {expected}")
         return jacobian.reshape(expected)

@@ -103,8 +103,7 @@ class Kinds:
             found = getattr(loaded, name)
         except AttributeError:
             known = tuple(word for word in dir(loaded) if not word.startswith("_"))
-            message = f"the module '{module}' has no {self.family} '{name}'; {nearest(name, known)}"
-            raise KindError(message) from None
+            raise KindError(f"the module '{module}' has no {self.family} '{name}'; {nearest(name, known)}") from None
         if self.objection is not None:
             objection = self.objection(found)
             if objection is not None:

@@ -36,8 +36,7 @@ class _Fibrous(Settings):
     @classmethod
     def _have_lengths(cls, fibres: tuple[Vector, ...]) -> tuple[Vector, ...]:
         if not all(any(fibre) for fibre in fibres):
-            message = "a direction has length zero, expected vectors such as [1, 0, 0]"
-            raise ValueError(message)
+            raise ValueError("a direction has length zero, expected vectors such as [1, 0, 0]")
         return fibres
 
 
@@ -232,8 +231,7 @@ class Solid(ModelSpec):
                 yield ("regions", region), f"unknown region; {hint}", numbers
             for name, value in numbers.items():
                 if name not in known:
-                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
-                    yield ("regions", region, name), message, value
+                    yield ("regions", region, name), f"not a constant of '{self.energy}'; {nearest(name, known)}", value
                     continue
                 objection = self.own_scalars[f"regions.{region}.{name}"].objection(value)
                 if objection is not None:

@@ -213,18 +213,15 @@ class ModelSpec(Settings):
 
     def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
         """Refine its mesh at a point (d,) of parameters by their paths (`forward.fem.adapt.Adapted`); collective."""
-        message = f"a model of kind '{self.kind}' has no mesh that is refined"
-        raise ModelError(message)
+        raise ModelError(f"a model of kind '{self.kind}' has no mesh that is refined")
 
     def on_mesh(self, file: str, contents: Contents | None = None) -> Self:
         """Return the same model on the mesh of a file, of which it may be known what it holds."""
-        message = f"a model of kind '{self.kind}' has no meshes"
-        raise ModelError(message)
+        raise ModelError(f"a model of kind '{self.kind}' has no meshes")
 
     def refined(self, level: int) -> Self:
         """Return the same model on a mesh whose cells are divided by 2^level along each edge."""
-        message = f"a model of kind '{self.kind}' has no meshes"
-        raise ModelError(message)
+        raise ModelError(f"a model of kind '{self.kind}' has no meshes")
 
     def finer(self, times: float) -> Self:
         """Return the same model with so many times the cells along each edge of its body, or a few more.
@@ -234,8 +231,7 @@ class ModelSpec(Settings):
         ModelError
             If there is no such mesh, with the reason.
         """
-        message = f"a model of kind '{self.kind}' has no meshes"
-        raise ModelError(message)
+        raise ModelError(f"a model of kind '{self.kind}' has no meshes")
 
     def coarser(self, times: float, degree: Literal[1, 2] | None = None) -> Self:
         """Return the same model with cells that are so many times as long, perhaps with elements of another degree.
@@ -245,8 +241,7 @@ class ModelSpec(Settings):
         ModelError
             If there is no such mesh, with the reason.
         """
-        message = f"a model of kind '{self.kind}' has no meshes"
-        raise ModelError(message)
+        raise ModelError(f"a model of kind '{self.kind}' has no meshes")
 
     @property
     def solver_tolerance(self) -> float | None:

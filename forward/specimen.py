@@ -111,8 +111,7 @@ class Observed(Settings):
     @model_validator(mode="after")
     def _check(self) -> Observed:
         if (self.on is None) == (not self.at):
-            message = "expected either a boundary ('on') or points ('at')"
-            raise ValueError(message)
+            raise ValueError("expected either a boundary ('on') or points ('at')")
         return self
 
 
@@ -315,8 +314,7 @@ class Specimen(Solid):
     def _mistakes_of(self, i: int, item: Observed) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)
         if item.on is not None and item.on not in self.body.boundaries:
-            message = f"unknown boundary; {nearest(item.on, self.body.boundaries)}"
-            yield ("observed", i, "on"), message, item.on
+            yield ("observed", i, "on"), f"unknown boundary; {nearest(item.on, self.body.boundaries)}", item.on
         for name in item.cases:
             if name not in names:
                 yield ("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name

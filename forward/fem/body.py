@@ -58,8 +58,7 @@ class DiscreteBody(Generic[S]):
         for path in parameters:
             if path not in scalars and path not in coefficients:
                 known = [*scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
-                message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
-                raise ValueError(message)
+                raise ValueError(f"'{path}' is not a number of the model, expected one of: {', '.join(known)}")
         self.spec = spec
         self.parameters = parameters
         self.outputs = tuple(output.name for output in spec.outputs)

@@ -254,8 +254,7 @@ class Enriched(EnrichedEquations):
         """
         known = [i for i, f in enumerate(self._functionals) if f is not None]
         if np.delete(weights, known, axis=1).any():
-            message = "the mesh error of a weighted output is not estimated"
-            raise ValueError(message)
+            raise ValueError("the mesh error of a weighted output is not estimated")
         self.visit(solution)
         gradients = np.array([f.gradient() for f in self._functionals if f is not None])
         loads = weights[:, known] @ gradients

@@ -244,8 +244,7 @@ class Discretisation(Sensitivities):
             return
         end, seconds = self._deadline
         if ranks.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
-            message = f"the solve took longer than solve_seconds = {seconds:g}"
-            raise SolveError(message, work=self.work)
+            raise SolveError(f"the solve took longer than solve_seconds = {seconds:g}", work=self.work)
 
     def curvature(self, move: FloatArray, change: FloatArray) -> float:
         """Second difference of the energy along a move (U_local,), from the change of the imbalance.

@@ -155,8 +155,7 @@ def interpolation(equations: Discretisation, places: FloatArray, directions: Flo
     far = np.flatnonzero(distances > max(tolerance(body), body.longest_edge))
     if len(far):
         where = ", ".join(f"{x:g}" for x in points[far[0]])
-        message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
-        raise ValueError(message)
+        raise ValueError(f"({where}) lies {distances[far[0]]:.3g} m outside the mesh")
     nodes = layout.nodes()
     mine = {i: (nodes[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
     held = {i: here for part in equations.comm.allgather(mine) for i, here in part.items()}

@@ -183,8 +183,7 @@ def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
     known = {*spec.scalars, *spec.coefficients}
     for path in parameters:
         if path not in known:
-            message = f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}"
-            raise ValueError(message)
+            raise ValueError(f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}")
     bodies: list[HyperelasticModel] = []
     models: list[Mapped] = []
     for case in spec.cases:

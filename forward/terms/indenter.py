@@ -326,8 +326,7 @@ class Indenter(Term):
         elif alone and self.depth > 0:
             left = float(self.gaps(looked_at).min())
             if left > 0:
-                message = f"the tool does not reach '{self.on}': at its depth, {left:.3g} m are left"
-                yield "depth", message, self.depth
+                yield "depth", f"the tool does not reach '{self.on}': at its depth, {left:.3g} m are left", self.depth
 
     def findings(self, body: Body) -> Iterator[Finding]:
         """Find a tool that touches too little of the mesh."""

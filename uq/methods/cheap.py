@@ -77,8 +77,7 @@ class CheapModel(Settings):
             if returned != wanted:
                 yield ("model", "outputs"), f"expected those of the study's model: {', '.join(wanted)}", returned
         if self.predicted(spec.unknowns, 0 if other is None else other.unknowns) is None:
-            message = "cannot be predicted, expected the time of a solve over that of the study's model"
-            yield ("cost",), message, None
+            yield ("cost",), "cannot be predicted, expected the time of a solve over that of the study's model", None
 
 
 class Coarser(CheapModel):

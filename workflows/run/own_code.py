@@ -61,8 +61,7 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
         return
     change = before.change(_sources(study))
     if change is not None:
-        message = f"{directory}: {other_code(change)}"
-        raise StudyError(message)
+        raise StudyError(f"{directory}: {other_code(change)}")
 
 
 def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:

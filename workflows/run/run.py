@@ -254,8 +254,7 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> 
     """
     share = study.parallel.ranks_per_model
     if ranks % share:
-        message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
-        raise StudyError(message)
+        raise StudyError(f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}")
     rank_groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
     if rank_groups > blocks:
         tasks, idle = f"{blocks} task{'s' * (blocks > 1)}", rank_groups - blocks
@@ -268,32 +267,27 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> 
         if kept.exists():
             changes = differences(tomllib.loads(kept.read_text(encoding="utf-8")), document(study))
             if changes:
-                message = f"{directory}: holds another study ({'; '.join(changes[:5])}); choose another --out"
-                raise StudyError(message)
+                raise StudyError(f"{directory}: holds another study ({'; '.join(changes[:5])}); choose another --out")
         elif directory.exists() and any(directory.iterdir()):
             message = f"{directory}: is not empty and holds no study, expected a new directory or one of this study"
             raise StudyError(message)
         directory.mkdir(parents=True, exist_ok=True)
         if not os.access(directory, os.W_OK | os.X_OK):
-            message = f"{directory}: cannot be written: permission denied"
-            raise StudyError(message)
+            raise StudyError(f"{directory}: cannot be written: permission denied")
         _hold(directory, held)
         _keep_study(directory, study)
     except tomllib.TOMLDecodeError:
-        message = f"{kept}: is not a study, expected a directory of this study"
-        raise StudyError(message) from None
+        raise StudyError(f"{kept}: is not a study, expected a directory of this study") from None
     except OSError as error:
         reason = reason_to_stop(error)
         if reason is not None:
             raise StopError(reason) from None
-        message = f"{directory}: cannot be written: {error.strerror}"
-        raise StudyError(message) from None
+        raise StudyError(f"{directory}: cannot be written: {error.strerror}") from None
     try:
         own_code.refuse_other(directory, study)
         return _finished(directory)
     except OSError as error:  # a folder where a file should be
-        message = f"{error.filename or directory}: cannot be read: {error.strerror or error}"
-        raise StudyError(message) from None
+        raise StudyError(f"{error.filename or directory}: cannot be read: {error.strerror or error}") from None
 
 
 def _hold(directory: Path, held: ExitStack) -> None:

@@ -84,39 +84,32 @@ class CandidateModel(CandidateBlock):
     def _check(self) -> CandidateModel:
         kind = self.material.get("kind")
         if kind is None:
-            message = "material.kind: missing"
-            raise ValueError(message)
+            raise ValueError("material.kind: missing")
         try:
             MATERIALS[str(kind)]
         except KindError as error:
-            message = f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
-            raise ValueError(message) from None
+            raise ValueError(f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}") from None
         numbers = {name for name, value in self.material.items() if isinstance(value, float)}
         words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
         if words:
-            message = f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
-            raise ValueError(message)
+            raise ValueError(f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number")
         known = constants(self.kind)
         given = dict.fromkeys([*self.fixed, *self.parameters])
         for name in given:
             if name not in known:
-                message = f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
-                raise ValueError(message)
+                raise ValueError(f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}")
             if name in self.fixed and name in self.parameters:
-                message = f"'{name}' is given in material and in parameters, expected one of them"
-                raise ValueError(message)
+                raise ValueError(f"'{name}' is given in material and in parameters, expected one of them")
         left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
         missing = [name for name in known if name not in given and name not in left_out]
         if missing:
-            message = f"missing: {', '.join(missing)}, expected in material or parameters"
-            raise ValueError(message)
+            raise ValueError(f"missing: {', '.join(missing)}, expected in material or parameters")
         try:
             wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
         except ValueError:  # correlations, which are reported elsewhere
             return self
         if wrong is not None:
-            message = f"parameters {', '.join(wrong[2])}: {wrong[1]}"
-            raise ValueError(message)
+            raise ValueError(f"parameters {', '.join(wrong[2])}: {wrong[1]}")
         return self
 
 

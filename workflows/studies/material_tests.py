@@ -40,8 +40,7 @@ class MeasuredTest(MaterialTest):
     def _check_sizes(self) -> MeasuredTest:
         for name, values in (("measured", self.measured), ("sigma", self.sigma)):
             if values is not None and len(values) != len(self.at):
-                message = f"{name}: {len(values)} values, expected as many as in at: {len(self.at)}"
-                raise ValueError(message)
+                raise ValueError(f"{name}: {len(values)} values, expected as many as in at: {len(self.at)}")
         return self
 
     @model_validator(mode="after")
@@ -121,8 +120,7 @@ class DataFile(Settings):
         table = self._table(path)
         tests = self._tests(table, path)
         if not tests:
-            message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
-            raise StudyError(message)
+            raise StudyError(f"data: {path}: no row is left; data.where and data.between say which ones are kept")
         return {
             "source": list(table.remarks),
             "tests": [
@@ -148,8 +146,7 @@ class DataFile(Settings):
         columns += [column for pair in self.stresses.values() for column in pair]
         for column in columns:
             if column is not None and column not in table.columns:
-                message = f"data: {path} has no column '{column}'; {nearest(column, table.columns)}"
-                raise StudyError(message)
+                raise StudyError(f"data: {path} has no column '{column}'; {nearest(column, table.columns)}")
         _refuse_repeats(table, path)
         return table
 
@@ -167,8 +164,7 @@ class DataFile(Settings):
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
-                message = f"data: {place}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
-                raise StudyError(message)
+                raise StudyError(f"data: {place}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}")
             across = None
             if self.across is not None and mode == "biaxial":
                 across = _stretch(row[self.across], place, self.across, positive=True)
@@ -199,8 +195,7 @@ class DataFile(Settings):
             word = row[self.component] or "P1"
             component = next((name for name in COMPONENTS if name == word), None)
             if component is None:
-                message = f"data: {place}, {self.component}: '{word}'; {nearest(word, COMPONENTS)}"
-                raise StudyError(message)
+                raise StudyError(f"data: {place}, {self.component}: '{word}'; {nearest(word, COMPONENTS)}")
             return {component: next(iter(stresses.values()))}
         found = {c: pair for c, pair in stresses.items() if len(stresses) == 1 or row[pair[0]].strip()}
         strange = next((pair[0] for c, pair in found.items() if c != "P1" and not held), None)
@@ -216,15 +211,12 @@ class DataFile(Settings):
     def _check_stresses(self) -> DataFile:
         stresses = self.stresses
         if not stresses:
-            message = "measured: no column, expected one for each stress: { P1 = ..., P2 = ... }"
-            raise ValueError(message)
+            raise ValueError("measured: no column, expected one for each stress: { P1 = ..., P2 = ... }")
         if self.component is not None and len(stresses) > 1:
-            message = "component: stands beside several columns of stresses, expected one column of them"
-            raise ValueError(message)
+            raise ValueError("component: stands beside several columns of stresses, expected one column of them")
         lacking = [c for c, (_, sigma) in stresses.items() if sigma is None]
         if self.sigma is not None and lacking:
-            message = f"sigma: no column for {', '.join(lacking)}, expected one for each stress"
-            raise ValueError(message)
+            raise ValueError(f"sigma: no column for {', '.join(lacking)}, expected one for each stress")
         return self
 
 
@@ -273,15 +265,13 @@ def _refuse_repeats(table: Table, path: Path) -> None:
     for line, row in zip(table.lines, table.rows, strict=True):
         before = seen.setdefault(tuple(row.values()), line)
         if before != line:
-            message = f"data: {path}: lines {before} and {line} are the same, expected each measurement once"
-            raise StudyError(message)
+            raise StudyError(f"data: {path}: lines {before} and {line} are the same, expected each measurement once")
 
 
 def _stretch(text: str, place: str, column: str, *, positive: bool) -> float:
     value = _number(text, place, column)
     if positive and value <= 0:
-        message = f"data: {place}: {column} is {text!r}, expected a number more than 0: stretches, 1 + strain"
-        raise StudyError(message)
+        raise StudyError(f"data: {place}: {column} is {text!r}, expected a number more than 0: stretches, 1 + strain")
     if abs(value) > LARGEST_STRETCH:
         message = f"data: {place}: {column} is {text!r}, expected a stretch (1 is undeformed), or an amount of shear"
         raise StudyError(message)
@@ -292,5 +282,4 @@ def _number(text: str, place: str, column: str, *, positive: bool = False) -> fl
     try:
         return needed(text, column, positive=positive)
     except ValueError as error:
-        message = f"data: {place}: {error}"
-        raise StudyError(message) from None
+        raise StudyError(f"data: {place}: {error}") from None

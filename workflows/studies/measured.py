@@ -312,8 +312,7 @@ def _true_inclusions(text: str, path: Path) -> tuple[Any, ...]:
     try:
         return TypeAdapter(tuple[Inclusion, ...]).validate_python(tuple(json.loads(text)))
     except (ValueError, TypeError):
-        message = f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON"
-        raise DataError(message) from None
+        raise DataError(f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON") from None
 
 
 def _true_stiffness(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -322,5 +321,4 @@ def _true_stiffness(path: Path) -> tuple[FloatArray, FloatArray]:
         table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
         return table[:, :3], np.log(table[:, 3])
     except (OSError, ValueError, IndexError):
-        message = f"{path.name}: the true stiffness cannot be read, expected a table x, y, z, factor"
-        raise DataError(message) from None
+        raise DataError(f"{path.name}: the true stiffness cannot be read, expected a table x, y, z, factor") from None

@@ -74,8 +74,7 @@ class OutputFile(Settings):
     @model_validator(mode="after")
     def _check(self) -> OutputFile:
         if (self.file is None) == (not self.outputs):
-            message = "expected either a file or outputs"
-            raise ValueError(message)
+            raise ValueError("expected either a file or outputs")
         return self
 
     def read(self, folder: Path, model: ModelSpec) -> Measurements:
@@ -133,8 +132,7 @@ class MeasuredOutputs(Settings):
     @model_validator(mode="after")
     def _check(self) -> MeasuredOutputs:
         if bool(self.files) + (self.tables is not None) + bool(self.outputs) != 1:
-            message = "expected either files or outputs, or tables of joined models"
-            raise ValueError(message)
+            raise ValueError("expected either files or outputs, or tables of joined models")
         return self
 
     def read(self, folder: Path, model: ModelSpec) -> Found:

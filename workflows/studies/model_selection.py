@@ -73,8 +73,7 @@ class ModelSelection(OfCandidates, Comparison):
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:  # type: ignore[override]
         """Check the blocks of a comparison of models, whose data are read by the first one, or of material points."""
         if not isinstance(blocks.get("model", {}), Mapping):
-            message = f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}"
-            raise StudyError(message)
+            raise StudyError(f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}")
         if "model" not in blocks:
             return Selection.model_validate(expanded(blocks, folder))
         return cls.model_validate(blocks).with_data(folder)

@@ -147,8 +147,7 @@ class PopulationStudy(FromPython, StudyKind):
                 method.study,
             )
         if method.digest and found != method.digest:
-            message = f"has changed since the study was begun: hash {method.digest} → {found}"
-            yield place, message, method.source
+            yield place, f"has changed since the study was begun: hash {method.digest} → {found}", method.source
 
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:

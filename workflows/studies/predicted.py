@@ -77,8 +77,7 @@ def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
         return
     yield from _of_shared_paths(study.model, made, study.unknown)
     if not {*made.scalars, *made.coefficients} & set(study.unknown):
-        message = f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted"
-        yield ("predict",), message, {}
+        yield ("predict",), f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted", {}
 
 
 def _of_shared_paths(measured: ModelSpec, made: ModelSpec, unknown: tuple[str, ...]) -> Iterator[Mistake]:

@@ -132,8 +132,7 @@ class Synthesis(FromPython, StudyKind):
             message = "nothing is observed, expected boundaries or points, or outputs of load cases"
             yield ("model", "observed"), message, ()
         if method.format != "csv" and any(case.outputs for case in model.cases):
-            message = "outputs of load cases are written to tables, expected 'csv'"
-            yield ("method", "format"), message, method.format
+            yield ("method", "format"), "outputs of load cases are written to tables, expected 'csv'", method.format
         if method.format != "stl":
             return
         if not any(item.on is not None for item in model.observed):
