@@ -40,7 +40,7 @@ import numpy as np
 from mpi4py import MPI
 from forward.pointwise import FunctionModel
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.turns import counter as shared_counter
+from uq.evaluation.work_queue import counter as shared_counter
 from uq.evaluation.request import Request
 
 mode, world = sys.argv[1], MPI.COMM_WORLD

@@ -22,7 +22,7 @@ from mpi4py import MPI
 from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, Solution, SolveError, Work
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request, audited
 from uq.inputs.distributions import Distribution, Uniform
@@ -524,7 +524,8 @@ def findings(case: Case) -> tuple[int, int, list[str]]:
     points = case.inputs.points(random_points(1, 0, ONE_STATE, len(case.inputs.names)))
     evaluate = SerialEvaluate(model)
     found = evaluate(Request(points, start=linearise(case.inputs, evaluate).prediction))
-    return len(found.failures), int(found.counted("calls").sum()), [one.text for one in branch.of_jumps([found])]
+    jumps = [one.text for one in failure_domain.of_jumps([found])]
+    return len(found.failures), int(found.counted("calls").sum()), jumps
 
 
 FORMS = ("displacement", "mixed")

@@ -289,7 +289,7 @@ MODELS = Kinds(
         "path": "forward.hyperelastic:Path",
         "specimen": "forward.specimen:Specimen",
         "material-tests": "forward.material_tests:MaterialTests",
-        "joined": "forward.joined:JoinedModels",
+        "joined": "forward.joined_models:JoinedModels",
         "reduced": "forward.reduced.spec:Reduced",
         "python": "forward.external.models:PythonModel",
         "um-bridge": "forward.external.models:UmBridgeModel",

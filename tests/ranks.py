@@ -6,7 +6,7 @@ import traceback
 from mpi4py import MPI
 
 import forward.fem.dolfinx  # noqa: F401  (all ranks initialise PETSc, or none)
-from uq.evaluation.turns import gather_here
+from uq.evaluation.work_queue import gather_here
 
 
 def groups(*sizes):

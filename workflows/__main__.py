@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BaseException as error:
         world = _world()
         if world is not None:
-            from uq.evaluation.turns import end_job
+            from uq.evaluation.work_queue import end_job
 
             end_job(world, error)
         reason = reason_to_stop(error)

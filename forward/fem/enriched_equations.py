@@ -88,11 +88,11 @@ class EnrichedEquations:
     def visit(self, solution: Linearised, at: FloatArray | None = None) -> Discretisation:
         """Set parameters, loads and state to those of a solution of the body, or to a state (U⁺_local,) near it."""
         equations, key = self.equations, solution if at is None else at
-        if equations.latest.solution is not key:
+        if equations.linearisation_point.solution is not key:
             equations.set_parameters(solution.parameters, solution.stiffer)
             equations.at_load(1.0)
             equations.set_state(self.up(solution.state) if at is None else at)
-            equations.latest.solution = key
+            equations.linearisation_point.solution = key
         return equations
 
     def imbalance(self, solution: Linearised, at: FloatArray | None = None) -> FloatArray:
@@ -229,11 +229,11 @@ class EnrichedEquations:
 
     def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
         equations, key = self.visit(solution, at), solution if at is None else at
-        if equations.latest.factorised is not key:
+        if equations.linearisation_point.factorised is not key:
             if self._alone:
                 self._reference.release()
             equations.factorise(self.up(solution.state) if at is None else at)
-            equations.latest.factorised = equations.latest.solution = key
+            equations.linearisation_point.factorised = equations.linearisation_point.solution = key
 
 
 def _same(one: ReferenceSolution | Linearised, other: ReferenceSolution | Linearised) -> bool:

@@ -56,14 +56,16 @@ class Discretisation(Sensitivities):
 
     def set_parameters(self, parameters: FloatArray, stiffer: float = 1.0) -> None:
         """Set the values (d,) of the parameters, and a factor on the stiffness of tools."""
-        self.latest.rounding = None
+        self.linearisation_point.rounding = None
         if float(self._stiffer.value) != stiffer:
             self._stiffer.value = stiffer
-            self.latest.moved()
-        if self.latest.parameters is not None and np.array_equal(parameters, self.latest.parameters):
+            self.linearisation_point.moved()
+        if self.linearisation_point.parameters is not None and np.array_equal(
+            parameters, self.linearisation_point.parameters
+        ):
             return
-        self.latest.parameters = np.array(parameters, dtype=float)
-        self.latest.moved()
+        self.linearisation_point.parameters = np.array(parameters, dtype=float)
+        self.linearisation_point.moved()
         self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
         for i in self.scalars:  # the other numbers stay
             if (constant := self._constants.get(self.parameters[i])) is not None:
@@ -185,7 +187,7 @@ class Discretisation(Sensitivities):
 
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
-        self.latest.moved()
+        self.linearisation_point.moved()
         self._load.value = fraction
         self._targets = fraction * self._full_targets
 
@@ -297,7 +299,7 @@ class Discretisation(Sensitivities):
 
     def has_factor(self, u: FloatArray) -> bool:
         """Whether the factor at hand is that of the stiffness at this very array u."""
-        return self.latest.factorised_at is u
+        return self.linearisation_point.factorised_at is u
 
     def stiffness_near(self, u: FloatArray, imbalance: FloatArray, rows: FloatArray) -> FloatArray:
         """Products (k, U_local) of the stiffness of the free unknowns at u (U_local,) with rows, to a few digits.
@@ -339,15 +341,15 @@ class Discretisation(Sensitivities):
         return min(left, 1e-4 * scale) if self._external > 0 else left
 
     def _rounding_without_loads(self) -> float:
-        if self.latest.rounding is None:
+        if self.linearisation_point.rounding is None:
             load = self._load.value.copy()
             self._load.value = 0.0
             few = 4 if self.p is None else 16
-            self.latest.rounding = (
+            self.linearisation_point.rounding = (
                 few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
             )
             self._load.value = load
-        return self.latest.rounding
+        return self.linearisation_point.rounding
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form only along x, since without pressure nothing else resists."""

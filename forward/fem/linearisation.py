@@ -17,7 +17,7 @@ from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unk
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.items import Items
-from forward.fem.latest import Latest
+from forward.fem.linearisation_point import LinearisationPoint
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
 from forward.solvers.system import ROUGH, TIGHT, LinearSolver
@@ -52,7 +52,7 @@ class Linearisation(Forms):
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
         self.work = Work()
-        self.latest = Latest()
+        self.linearisation_point = LinearisationPoint()
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance, often=True)
         # Equations beside others are those of an estimate, which has ways of its own.
@@ -194,7 +194,7 @@ class Linearisation(Forms):
 
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
-        self.latest.moved()
+        self.linearisation_point.moved()
         self.unknowns.give(self._state, u)
 
     def state(self) -> FloatArray:
@@ -298,19 +298,19 @@ class Linearisation(Forms):
         self.set_state(u)
         self.work.assemblies += 1
         self.work.factorisations += 1
-        self.latest.factorised = None  # a factorisation that fails leaves no factor
+        self.linearisation_point.factorised = None  # a factorisation that fails leaves no factor
         self._curved.value = float(curved)
         try:
             self._solver.factorise()
         finally:
             self._curved.value = 1.0
-        self.latest.factorised_at = u
+        self.linearisation_point.factorised_at = u
 
     def release(self) -> None:
         """Free the factor, if there is one."""
         if "_solver" in vars(self) and self._solver.memory():
             self._solver.release()
-        self.latest.factorised = None
+        self.linearisation_point.factorised = None
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right; rows of prescribed unknowns hold their values."""
@@ -319,8 +319,8 @@ class Linearisation(Forms):
             if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
                 w = np.zeros_like(right)
                 w[self.fixed] = known
-                assert self.latest.factorised_at is not None
-                self.set_state(self.latest.factorised_at)
+                assert self.linearisation_point.factorised_at is not None
+                self.set_state(self.linearisation_point.factorised_at)
                 right = right - self.stiffness_times(w)
                 right[self.fixed] = known
         return self.back_substitute(right, tolerance=ROUGH)
@@ -359,12 +359,12 @@ class Linearisation(Forms):
 
     def assembled_stiffness(self) -> Any:
         """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
-        self.latest.factorised = None
+        self.linearisation_point.factorised = None
         return self._matrix.assembled()
 
     def sparse_stiffness(self) -> csr_matrix:
         """The stiffness (U, U) at the state that is set, in one process; the factor of `factorise` is lost."""
-        self.latest.factorised = None
+        self.linearisation_point.factorised = None
         return self._matrix.sparse()
 
     def inertia(self) -> int | None:

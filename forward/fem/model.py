@@ -96,7 +96,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             With the load fraction where the solver stopped, the reason, and the history of its iterations.
         """
         equations = self.equations
-        equations.latest.begin()
+        equations.linearisation_point.begin()
         self.require_admissible(parameters)
         guess = guess or Guess()
         way = self.way(parameters, guess)
@@ -109,8 +109,10 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)
         solution = self.solution(parameters, found, equations.work, way, stiffer)
-        if equations.symmetric and equations.latest.factorised_at is found.state:  # to count its eigenvalues
-            equations.latest.factorised = solution
+        if (
+            equations.symmetric and equations.linearisation_point.factorised_at is found.state
+        ):  # to count its eigenvalues
+            equations.linearisation_point.factorised = solution
         return solution
 
     def finer_mesh(self, spare: float) -> FinerMesh:
@@ -185,7 +187,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             return self.reference.solve_uncounted(right)
 
         for found in finish_all(tasks(), solve, self.together):
-            equations.latest.begin()  # the last factor may be that of any of them
+            equations.linearisation_point.begin()  # the last factor may be that of any of them
             point, way, work = begun.popleft()
             yield found if isinstance(found, SolveError) else self.solution(point, found, work, way)
 

@@ -259,7 +259,7 @@ class HistoryModel(OneByOne):
             With the place on the path where it stops, and the outputs before.
         """
         equations, settings = self.equations, self.spec.solver
-        equations.latest.begin()
+        equations.linearisation_point.begin()
         self.body.require_admissible(np.append(parameters, self.values[-1]))
         equations.work = Work()
         stiffer, history, passed = 1.0, list[str](), list[Passed]()

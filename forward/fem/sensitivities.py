@@ -135,7 +135,7 @@ class Sensitivities(Linearisation):
         shifts
             What tools have moved besides (m), by their labels.
         """
-        self.latest.moved()
+        self.linearisation_point.moved()
         self.unknowns.give(self._before, u)
         self._share.value = share
         for label, shift in shifts.items():

@@ -80,11 +80,11 @@ class FiniteElementSolution:
     def visit(self) -> Discretisation:
         """Return the equations, set to parameters and state of this solution."""
         equations = self._model.equations
-        if equations.latest.solution is not self:
+        if equations.linearisation_point.solution is not self:
             equations.set_parameters(self.parameters, self.stiffer)
             equations.at_load(1.0)
             equations.set_state(self.state)
-            equations.latest.solution = self
+            equations.linearisation_point.solution = self
         equations.work = self.work
         return equations
 
@@ -97,9 +97,9 @@ class FiniteElementSolution:
             If the factor shows that the equilibrium is unstable.
         """
         equations = self.visit()
-        if equations.latest.factorised is not self:
+        if equations.linearisation_point.factorised is not self:
             equations.factorise(self.state)
-            equations.latest.factorised = self
+            equations.linearisation_point.factorised = self
             if self.stability == Stability.SCREENED and equations.symmetric:
                 negative = equations.inertia()
                 if negative is not None and negative > 0:
@@ -140,7 +140,7 @@ class FiniteElementSolution:
         For tangents, `directions` (k, d) are given. By default the tolerance is that of derivatives.
         """
         model = self._model
-        near = self.reference is not None and model.equations.latest.factorised is not self
+        near = self.reference is not None and model.equations.linearisation_point.factorised is not self
         if near and self.reference is not None and self._rotation is not None and len(right) <= FEW:
             if tolerance is None:
                 tolerance = model.spec.solver.derivative_tolerance

@@ -40,7 +40,7 @@ class BodySpace:
         the vertices.
         """
         equations = self._equations
-        equations.latest.forget_parameters()
+        equations.linearisation_point.forget_parameters()
         space = spaces.scalar_space(equations.mesh, degree or equations.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in equations.fields}
         return {label: factors for label, factors in found.items() if factors is not None}

@@ -329,7 +329,7 @@ class Sampler:
                 coefficients[position] = 1.0
                 field.set(coefficients)
                 slopes[:, k] = at()[chosen, 0] - base
-            equations.latest.forget_parameters()
+            equations.linearisation_point.forget_parameters()
             found.append((number, base, slopes))
         return tuple(found)
 

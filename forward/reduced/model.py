@@ -21,9 +21,9 @@ from forward.materials.admissible import Admission
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError, Stability, Work
 from forward.pointwise import ExplicitSolution, OneByOne
 from forward.reduced.data import ReducedData, ReducedSpace
-from forward.reduced.level import Level
+from forward.reduced.lockstep import SINGLE, TOGETHER, TOLERANCE, equilibria
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
-from forward.reduced.together import SINGLE, TOGETHER, TOLERANCE, equilibria
+from forward.reduced.reduced_equations import ReducedEquations
 
 if TYPE_CHECKING:
     from forward.fem.space import Observation
@@ -101,7 +101,7 @@ class ReducedModel(OneByOne):
         for path, value in kept.items():
             self.base[data.parameters.index(path)] = value
         self.alone = alone
-        self.level = Level(data, data.levels[-1 if alone else 0], self.which)
+        self.level = ReducedEquations(data, data.levels[-1 if alone else 0], self.which)
         self.spec = Hyperelastic.model_validate(data.spec)
         self.space = ReducedSpace(data, self.places, self.base)
         self.differentiable = True
@@ -153,11 +153,11 @@ class ReducedModel(OneByOne):
             yield from self._solve_together(points[i : i + self.together])
 
     @cached_property
-    def _together(self) -> Level:
+    def _together(self) -> ReducedEquations:
         """The equations in the precision that lockstep needs."""
         if self._unbalanced < SINGLE:
             return self.level
-        return Level(self.data, self.data.levels[-1 if self.alone else 0], self.which, np.float32)
+        return ReducedEquations(self.data, self.data.levels[-1 if self.alone else 0], self.which, np.float32)
 
     @cached_property
     def _inverse(self) -> FloatArray:
@@ -188,9 +188,9 @@ class ReducedModel(OneByOne):
                 yield from super().solve_many(point[None])
 
     @cached_property
-    def larger(self) -> Level:
+    def larger(self) -> ReducedEquations:
         """The nested larger model."""
-        return Level(self.data, self.data.levels[-1], self.which)
+        return ReducedEquations(self.data, self.data.levels[-1], self.which)
 
     @cached_property
     def full(self) -> ForwardModel:
@@ -404,7 +404,7 @@ def observed_by(specimen: SpecimenModel, models: tuple[ReducedModel, ...]) -> Jo
     return Joined(tuple(found), specimen.outputs, specimen.labels)
 
 
-def _slopes(level: Level, K: FloatArray, F: FloatArray) -> FloatArray:
+def _slopes(level: ReducedEquations, K: FloatArray, F: FloatArray) -> FloatArray:
     """Return derivatives (N, d) of the coordinates of equilibria by all parameters, from those of the forces."""
     slopes = np.zeros(F.shape)
     for k, (number, _) in enumerate(level.data.lifts):

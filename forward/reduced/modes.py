@@ -241,7 +241,7 @@ class AtRest:
     def set(self) -> None:
         """Set the equations to it."""
         equations = self.equations
-        equations.latest.begin()
+        equations.linearisation_point.begin()
         equations.set_parameters(self._nominal)
         equations.at_load(0.0)
         equations.set_state(np.zeros(equations.size))

@@ -8,7 +8,7 @@ import numpy as np
 
 from forward.model import FloatArray, SolveError, Work
 from forward.reduced.data import ReducedData
-from forward.reduced.level import Level
+from forward.reduced.reduced_equations import ReducedEquations
 
 ITERATIONS = 25
 TOLERANCE = 1e-12  # of the forces, relative to what they would be if they did not cancel
@@ -20,10 +20,12 @@ SEARCHES = 12  # lengths of a step that are tried there
 
 # Finds coordinates (N,) and the stiffness (N, N) there, from all parameters (d,) and coordinates (N,); None where there
 # is no way.
-Way = Callable[[Level, FloatArray, FloatArray, Work], "tuple[FloatArray, FloatArray] | None"]
+Way = Callable[[ReducedEquations, FloatArray, FloatArray, Work], "tuple[FloatArray, FloatArray] | None"]
 
 
-def newton(level: Level, whole: FloatArray, c: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
+def newton(
+    level: ReducedEquations, whole: FloatArray, c: FloatArray, work: Work
+) -> tuple[FloatArray, FloatArray] | None:
     """Find an equilibrium (`Way`); steps are shortened where forces grow."""
     free, c = level.free, c.copy()
     step, before, still = np.zeros(level.modes), np.inf, False
@@ -53,7 +55,9 @@ def newton(level: Level, whole: FloatArray, c: FloatArray, work: Work) -> tuple[
     return None
 
 
-def under_tools(level: Level, whole: FloatArray, c: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
+def under_tools(
+    level: ReducedEquations, whole: FloatArray, c: FloatArray, work: Work
+) -> tuple[FloatArray, FloatArray] | None:
     """Find an equilibrium (`Way`) by its energy: forces grow by orders where points begin to touch, energies fall.
 
     Steps are as long as the work of the forces on them has fallen to a half, its sign included (H. Matthies, G. Strang,
@@ -89,7 +93,9 @@ def _step(K: FloatArray, R: FloatArray, work: Work) -> FloatArray | None:
     return step
 
 
-def _length(level: Level, whole: FloatArray, c: FloatArray, step: FloatArray, first: float, work: Work) -> float:
+def _length(
+    level: ReducedEquations, whole: FloatArray, c: FloatArray, step: FloatArray, first: float, work: Work
+) -> float:
     """Return how much of a step (n,) to go, at most all, by the work of the forces on it, `first` < 0 at its begin."""
     low, high, below, length = 0.0, 1.0, first, 1.0
     for _ in range(SEARCHES):
@@ -109,7 +115,9 @@ def _length(level: Level, whole: FloatArray, c: FloatArray, step: FloatArray, fi
     return length
 
 
-def in_steps(way: Way, level: Level, data: ReducedData, whole: FloatArray, work: Work) -> tuple[FloatArray, FloatArray]:
+def in_steps(
+    way: Way, level: ReducedEquations, data: ReducedData, whole: FloatArray, work: Work
+) -> tuple[FloatArray, FloatArray]:
     """Go from the nearest snapshot to the parameters (d,), in more and more steps.
 
     Raises
@@ -149,7 +157,7 @@ def outside_of(data: ReducedData, whole: FloatArray) -> str:
     return f"outside the trained range: {', '.join(found[:3])}" if found else ""
 
 
-def predictor(data: ReducedData, level: Level) -> Callable[[FloatArray], FloatArray]:
+def predictor(data: ReducedData, level: ReducedEquations) -> Callable[[FloatArray], FloatArray]:
     """Interpolate the snapshots by |r|³ and linear functions (M. D. Buhmann, Radial Basis Functions, 2003).
 
     Returns

@@ -16,7 +16,7 @@ from forward.observables.largest import MaxDisplacement, MaxVonMises
 from forward.reduced.data import Output
 from forward.reduced.integrands import Sampler, of_density
 from forward.reduced.kernels import Kernel
-from forward.reduced.level import LENGTH
+from forward.reduced.reduced_equations import LENGTH
 
 NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
 

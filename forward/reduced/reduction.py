@@ -14,11 +14,11 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
-from forward.reduced.level import Level
 from forward.reduced.limits import mistakes
 from forward.reduced.modes import AtRest, boxes, enough
 from forward.reduced.newton import stable
 from forward.reduced.outputs import Outputs
+from forward.reduced.reduced_equations import ReducedEquations
 from forward.reduced.rules import STATES, Rules, Training
 from forward.reduced.snapshots import Snapshots, solved
 
@@ -342,7 +342,7 @@ def _definite(data: ReducedData) -> bool:
 
     Modes on which no force of any snapshot works, by symmetry, are not integrated by rules that are trained on forces.
     """
-    level = Level(data, data.levels[-1], np.zeros(0, dtype=np.int64))
+    level = ReducedEquations(data, data.levels[-1], np.zeros(0, dtype=np.int64))
     for i in np.linspace(0, len(data.snapshots) - 1, LOOKED_AT).round().astype(int):
         K = level.stiffness(data.coordinates[i], data.snapshots[i])[1][level.free, level.free]
         if not stable((K + K.T) / 2, level.pressures):

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
-from forward.reduced.level import Level
 from forward.reduced.model import ReducedModel
+from forward.reduced.reduced_equations import ReducedEquations
 
 CLOSE = 1e-4  # forces left, relative to what they would be if they did not cancel, at which a frame is done
 MOST = 3  # corrections in a frame
@@ -173,7 +173,7 @@ class Stream:
         self.behind = self.takes + self.besides > within
         if self.behind:
             return self.linear(parameters)
-        level: Level = self.level
+        level: ReducedEquations = self.level
         modes = self.modes + self.here.slopes @ (parameters - self.parameters)
         if self.lost:
             modes = self.here.modes + self.here.slopes @ (parameters - self.here.parameters)

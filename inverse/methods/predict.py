@@ -104,7 +104,7 @@ def record(before: Band, after: Band, mesh_error: FloatArray, share: FloatArray 
 
 def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
     """Return what draws of the parameters of a model, in their order, say on its outputs, with `samples` solves."""
-    from uq.estimators.of_draws import with_errors_of_draws
+    from uq.estimators.input_sample_error import with_errors_of_draws
     from uq.methods.chaos import Chaos
 
     objection = draws.objection()

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
-from uq.estimators.chosen import Chosen, Pooled
 from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
+from uq.estimators.subsampled_difference import Chosen, Pooled
 
 THRESHOLDS = 129
 FEWER = 0.5  # samples that may differ unseen
@@ -165,7 +165,9 @@ def quantiles_of_groups(
 def quantiles_of_chosen(
     pooled: Pooled, found: Chosen, offset: FloatArray, probabilities: tuple[float, ...]
 ) -> Quantiles:
-    """Return quantiles of the outputs of model 0, of pools of which some points were chosen (`uq.estimators.chosen`).
+    """Return quantiles of the outputs of model 0, of pools of which some points were chosen.
+
+    How they are chosen: `uq.estimators.subsampled_difference`.
 
     The share below a threshold is that of the predictions, and what the chosen points say they miss.
     """

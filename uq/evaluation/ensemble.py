@@ -1,8 +1,8 @@
 """Rank groups that evaluate blocks of points in parallel.
 
 Rank 0 runs the method; the other ranks serve its requests. A group (the ranks that share one model) takes the next
-block when it is free (`uq.evaluation.turns`). Results do not depend on which group computes a block: blocks are added
-in order.
+block when it is free (`uq.evaluation.work_queue`). Results do not depend on which group computes a block: blocks are
+added in order.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from forward.pointwise import OfModel
 from uq.evaluation.block import BlockSolver, Merger
 from uq.evaluation.checkpoint import Checkpoint, read
 from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
-from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
+from uq.evaluation.work_queue import Progress, WorkQueue, abort_all, end_job, gather_here
 
 T = TypeVar("T")
 O = TypeVar("O")
@@ -54,7 +54,7 @@ class Ensemble:
         self.rank_groups = rank_groups
         self.index = index
         self.say: Callable[[str], None] = lambda line: None
-        self._turns: Turns | None = None
+        self._turns: WorkQueue | None = None
 
     def count(self, done: int, failed: int) -> None:
         """Count solves of this group that are not points of a request; rank 0 is told while something runs."""
@@ -62,9 +62,9 @@ class Ensemble:
             self._turns.count(done, failed)
 
     @contextmanager
-    def turns(self, progress: Progress) -> Iterator[Turns]:
+    def turns(self, progress: Progress) -> Iterator[WorkQueue]:
         """Let groups take turns, and count: `progress` on rank 0 is told the counts of all; collective."""
-        with Turns.of(self.world, self.group, self.index, progress) as found:
+        with WorkQueue.of(self.world, self.group, self.index, progress) as found:
             self._turns = found
             try:
                 yield found
@@ -325,7 +325,7 @@ class EnsembleEvaluate(OfModel):
 class _Worker:
     """The part of every rank in an order."""
 
-    def __init__(self, ensemble: Ensemble, models: _Models, checkpoint: Checkpoint | None, turns: Turns) -> None:
+    def __init__(self, ensemble: Ensemble, models: _Models, checkpoint: Checkpoint | None, turns: WorkQueue) -> None:
         self._ensemble = ensemble
         self.models = models
         self.checkpoint = checkpoint

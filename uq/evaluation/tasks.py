@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.turns import Progress
+    from uq.evaluation.work_queue import Progress
 
 _SOLVED = "evaluations"  # group of a file
 
@@ -131,7 +131,7 @@ def run_tasks(
     list
         The outcomes in the order of the names on rank 0; None on the other ranks.
     """
-    from uq.evaluation.turns import abort_all
+    from uq.evaluation.work_queue import abort_all
 
     world, group = ensemble.world, ensemble.group
     keys = [] if checkpoint is None else [checkpoint.key(_Task(number, name)) for number, name in enumerate(names)]

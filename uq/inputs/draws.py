@@ -7,7 +7,7 @@ nets of Sobol' points fall evenly, and neighbours in the cube are neighbours amo
 such as Rosenblatt's, are smoother, but the error of the density remains however many points are taken.)
 
 The draws are a sample of what they stand for: `effective` is the number of independent ones that they are worth, and
-what an estimate errs for that reason is not seen in the points taken from them (`uq.estimators.of_draws`).
+what an estimate errs for that reason is not seen in the points taken from them (`uq.estimators.input_sample_error`).
 """
 
 from __future__ import annotations

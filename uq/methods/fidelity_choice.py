@@ -1,8 +1,8 @@
 """A third way to spend what a multifidelity study has: full solves where two cheap models differ.
 
 The pilot tells which two cheap models follow the model of the study best, and, with the points taken since, how much
-of its variance the choice leaves (`uq.estimators.chosen`). From that and predicted costs follow how many points a pool
-gets and how many of them are chosen, such that the largest relative error of a mean is least.
+of its variance the choice leaves (`uq.estimators.subsampled_difference`). From that and predicted costs follow how many
+points a pool gets and how many of them are chosen, such that the largest relative error of a mean is least.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from forward.findings import Finding
 from forward.model import FloatArray
-from uq.estimators.chosen import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, correlations
 from uq.estimators.moments import Estimates, ratio
 from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
+from uq.estimators.subsampled_difference import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.tails import of_influences, unseen
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Taken, Team

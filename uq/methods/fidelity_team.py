@@ -15,7 +15,7 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import COMPANY, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
-from uq.methods.cheap import CheapModel
+from uq.methods.low_fidelity import CheapModel
 from uq.methods.method import TEXTBOOK
 from uq.surrogates.linearisation import Linearisation, linearise
 

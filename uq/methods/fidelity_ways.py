@@ -30,7 +30,7 @@ from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
 from uq.surrogates.gate import agree, wrong
-from uq.surrogates.reach import beyond
+from uq.surrogates.outside_samples import beyond
 from uq.surrogates.regression import Regression, tails_of
 from uq.surrogates.taylor import Control, expansion
 

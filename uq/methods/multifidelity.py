@@ -27,10 +27,10 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN, Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
-from uq.methods.cheap import CHEAP, CheapModel
 from uq.methods.fidelity_choice import ByChoice
 from uq.methods.fidelity_team import OWN_LABEL, PILOT, Team
 from uq.methods.fidelity_ways import ByExpansion, ByModels
+from uq.methods.low_fidelity import CHEAP, CheapModel
 from uq.methods.method import MESH, Amount
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED, Probability
 from uq.surrogates.linearisation import local_dataset

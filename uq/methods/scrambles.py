@@ -24,7 +24,7 @@ from uq.surrogates.basis import Basis
 from uq.surrogates.field_regression import Deviations
 from uq.surrogates.gate import agree, wrong
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.reach import Beyond, beyond, drawn_beyond
+from uq.surrogates.outside_samples import Beyond, beyond, drawn_beyond
 from uq.surrogates.regression import tails_of
 from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 

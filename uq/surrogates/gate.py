@@ -8,7 +8,7 @@ samples in turn (`repeated`), and an expansion c counts
 - by how well samples integrate c_k − c, which is like f − c, and whose moments are known (`wrong`): where they are
   further off than their scatter says, they do not see the places that matter, and that is claimed;
 - where there are no samples but those of the fit, by the moments of the c_k (`Trial.spread`);
-- with what it has beyond all samples (`uq.surrogates.reach`): there it is a guess;
+- with what it has beyond all samples (`uq.surrogates.outside_samples`): there it is a guess;
 - only if its mean and standard deviation are those of the plain samples, within their errors (`agree`).
 
 No solve is taken for it.

@@ -33,7 +33,7 @@ from uq.surrogates.basis import (
     rows_of,
 )
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
-from uq.surrogates.reach import Beyond, beyond
+from uq.surrogates.outside_samples import Beyond, beyond
 
 BoolArray = NDArray[np.bool_]
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples

@@ -21,7 +21,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, gauss_rule
 from uq.surrogates.field_regression import Deviations
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.reach import normal_rule
+from uq.surrogates.outside_samples import normal_rule
 
 STEP = 0.5  # of the difference quotients, in standard deviations: wide, to capture the curvature where the samples lie
 MARGIN = 0.25  # of the range of its samples, by which an expansion is used beyond them on either side

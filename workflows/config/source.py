@@ -161,7 +161,7 @@ class Source(Settings):
 
     def findings(self, model: ModelSpec, inputs: Inputs) -> Iterator[Finding]:
         """Find what the draws say before anything is solved."""
-        from uq.estimators.of_draws import findings_of_source
+        from uq.estimators.input_sample_error import findings_of_source
 
         yield from findings_of_source(inputs)
         materials = model.materials(inputs.names)

@@ -117,7 +117,7 @@ def _run(
 ) -> int:
     from mpi4py import MPI
 
-    from uq.evaluation.turns import alone
+    from uq.evaluation.work_queue import alone
 
     world = MPI.COMM_WORLD
     begin = time.monotonic()

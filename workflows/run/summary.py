@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.findings import findings
 from workflows.results.summary import summarise
 from workflows.run import own_code
@@ -43,7 +43,7 @@ def summarised(
     done = _of_tasks(outcomes, every) if outcomes else _of_solves(study, evaluations)
     seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
-    stability, joined = branch.counts(every), branch.joined_counts(every)
+    stability, joined = failure_domain.counts(every), failure_domain.joined_counts(every)
     none = np.zeros(len(WORK), dtype=np.int64)
     return {
         "study": name,

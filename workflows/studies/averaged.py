@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from forward.findings import Finding
 from forward.materials.material import constants
 from forward.scalars import Mistake
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.estimators.averaged import averaged
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
@@ -144,7 +144,7 @@ class AveragedStudy(Study):
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Say of each candidate where it has no answer."""
         for name, found in evaluations.items():
-            told = branch.findings(self.parts[name].inputs, found, continued=False)
+            told = failure_domain.findings(self.parts[name].inputs, found, continued=False)
             add(dataset, *(one.of(f"Candidate '{name}'") for one in told))
         return with_unknown_meshes(self, dataset)
 

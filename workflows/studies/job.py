@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble, EnsembleEvaluate
     from uq.evaluation.tasks import Outcome
-    from uq.evaluation.turns import Progress
+    from uq.evaluation.work_queue import Progress
 
 MOVED = "moved points"  # in names of models
 

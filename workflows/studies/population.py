@@ -20,7 +20,7 @@ from forward.model import SolveError
 from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.population import Columns, Population, Scale, prior_names
-from uq.estimators.of_draws import findings_of_few
+from uq.estimators.input_sample_error import findings_of_few
 from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluations
-    from uq.evaluation.turns import Progress
+    from uq.evaluation.work_queue import Progress
 
 KEPT = ("model", "data", "method", "candidates", "parameters", "correlations")  # blocks that a posterior depends on
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from forward.model import SolveError, Stability
 from uq.accuracy.budget import spare_for
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -59,7 +59,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
-            from workflows.studies.within import within
+            from workflows.studies.accuracy_run import within
 
             return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
         found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
@@ -159,9 +159,9 @@ def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset
     if study.source is None:
         return found
     in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
-    from uq.estimators import of_draws
+    from uq.estimators import input_sample_error
 
-    return of_draws.with_errors_of_draws(found, study.inputs, in_turn)
+    return input_sample_error.with_errors_of_draws(found, study.inputs, in_turn)
 
 
 def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
@@ -193,15 +193,15 @@ def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) ->
 def with_stability(study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
     """Add how the stability of each sample was tested, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
-    add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
-    if not branch.counts([evaluations]):
+    add(dataset, *failure_domain.findings(study.inputs, evaluations, continued=continued))
+    if not failure_domain.counts([evaluations]):
         return dataset
     if "points" in dataset and dataset.points.dims == ("sample", "parameter"):
-        known = branch.by_sample(dataset.points.to_numpy(), evaluations)
+        known = failure_domain.by_sample(dataset.points.to_numpy(), evaluations)
         meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
         dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
-        meanings = ", ".join(f"{number}: {name}" for number, name in enumerate(branch.JOINED))
-        joined = branch.joined_by_sample(dataset.points.to_numpy(), evaluations)
+        meanings = ", ".join(f"{number}: {name}" for number, name in enumerate(failure_domain.JOINED))
+        joined = failure_domain.joined_by_sample(dataset.points.to_numpy(), evaluations)
         dataset = dataset.assign(joined=("sample", joined, {"meanings": meanings}))
     return dataset
 

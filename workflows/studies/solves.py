@@ -17,7 +17,7 @@ from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
 from forward.model import FloatArray, SolveError
 from forward.words import number, with_unit
-from uq.estimators.branch import of_jumps
+from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
 from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request
 from uq.inputs.random_parameters import Inputs

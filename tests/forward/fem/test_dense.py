@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from forward.fem.enriched import EnrichedState
-from forward.fem.latest import Latest
+from forward.fem.linearisation_point import LinearisationPoint
 from forward.fem.path import HistorySolution, Increment, Passed
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
@@ -41,7 +41,7 @@ class Equations:
         self.K[:, 0, :], self.K[:, :, 0] = 0, 0
         self.K[:, 0, 0] = 1
         self.P[:, :, 0] = 0
-        self.at, self.latest, self.symmetric = 0, Latest(), False
+        self.at, self.linearisation_point, self.symmetric = 0, LinearisationPoint(), False
 
     def set_parameters(self, parameters, stiffer):
         pass

@@ -174,7 +174,7 @@ def test_outputs_may_be_cut_off_beyond_those_of_the_snapshots(full, snapshots, s
 
 
 def test_what_lockstep_does_not_find_newtons_method_does(full, small, monkeypatch):
-    monkeypatch.setattr("forward.reduced.together.ITERATIONS", 2)
+    monkeypatch.setattr("forward.reduced.lockstep.ITERATIONS", 2)
     model = ReducedModel(small, full.parameters, tested=False)
     (found,) = model.solve_many(NOMINAL[None] + 0.5 * SPREAD)
     expected = ReducedModel(small, full.parameters).solve(NOMINAL + 0.5 * SPREAD)

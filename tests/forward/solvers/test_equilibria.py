@@ -15,7 +15,7 @@ from forward.model import Guess, ReferenceSolution, SolveError, Stability
 from forward.solvers import stability
 from forward.solvers.rotations import turn
 from forward.solvers.steps import finish, plain
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluations, Failure
 from uq.inputs.random_parameters import Inputs
@@ -279,17 +279,17 @@ def test_where_a_branch_ends_is_found(inputs):
         (C1 < 7e3, r"all with material.C1 ≤ 69\d\d(\.\d)?, none with material.C1 ≥ 7\d\d\d"),
         (load / C1 > 1.3e-2, r"− 0\.\d+ |^all with .*material.C1"),
     ):
-        found = list(branch.findings(inputs, evaluations(points, refused), continued=False))
+        found = list(failure_domain.findings(inputs, evaluations(points, refused), continued=False))
         assert [one.severity for one in found] == ["warning"]
         assert f"{refused.sum()} of 200 samples have no stable equilibrium" in found[0].text
-        where = branch.separated(inputs, points, refused, ~refused)
+        where = failure_domain.separated(inputs, points, refused, ~refused)
         assert re.search(expected, where), where
-    (one,) = branch.findings(inputs, evaluations(points, load > 120), continued=True)
+    (one,) = failure_domain.findings(inputs, evaluations(points, load > 120), continued=True)
     assert one.severity == "error"
     assert "expansion" in one.text
     # A half-space of both parameters that no bound of one can tell.
     scaled = (points - inputs.mean) / inputs.std
-    where = branch.separated(inputs, points, scaled @ [1, -0.5] > 0.4, scaled @ [1, -0.5] <= 0.4)
+    where = failure_domain.separated(inputs, points, scaled @ [1, -0.5] > 0.4, scaled @ [1, -0.5] <= 0.4)
     assert "loads.traction.size − 0." in where
     assert where.endswith(("have an answer", "has an answer")) or "none with" in where
 
@@ -307,10 +307,10 @@ def test_loads_that_follow_the_body_are_named():
 def test_without_refusals_nothing_is_said(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     none = np.zeros(20, dtype=bool)
-    assert list(branch.findings(inputs, evaluations(points, none), continued=True)) == []
+    assert list(failure_domain.findings(inputs, evaluations(points, none), continued=True)) == []
     untested = evaluations(points, none, np.zeros(20, dtype=np.int8))
-    assert branch.counts([untested]) == {}
-    assert branch.counts([evaluations(points, none)])["screened"] == 20
+    assert failure_domain.counts([untested]) == {}
+    assert failure_domain.counts([evaluations(points, none)])["screened"] == 20
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_where_solves_failed_is_found(inputs, continued, words):
     points = inputs.points(random_points(0, 0, 60, 2))
     failed = points[:, 0] > 120
     states = evaluations(points, failed, np.zeros(60, dtype=np.int8))
-    (one,) = branch.findings(inputs, states, continued=continued)
+    (one,) = failure_domain.findings(inputs, states, continued=continued)
     assert one.severity == "warning"
     assert f"{failed.sum()} of 60 samples have no answer: all with loads.traction.size ≥ 12" in one.text
     assert words in one.text
@@ -329,16 +329,15 @@ def test_where_solves_failed_is_found(inputs, continued, words):
 def test_failures_here_and_there_have_no_bound(inputs):
     points = inputs.points(random_points(0, 0, 60, 2))
     failed = np.sin(37 * points[:, 0]) > 0.5
-    assert (
-        branch.separated(inputs, points, failed, ~failed) == "no bound on the parameters separates them from the others"
-    )
+    said = failure_domain.separated(inputs, points, failed, ~failed)
+    assert said == "no bound on the parameters separates them from the others"
 
 
 def test_what_the_screen_missed_is_an_error(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     refused = np.arange(20) < 2
     known = np.where(refused, [Stability.MISSED], [Stability.SCREENED]).astype(np.int8)
-    texts = list(branch.findings(inputs, evaluations(points, refused, known), continued=False))
+    texts = list(failure_domain.findings(inputs, evaluations(points, refused, known), continued=False))
     assert [one.severity for one in texts] == ["warning", "error"]
     assert "2 unstable equilibria" in texts[1].text
 
@@ -349,7 +348,7 @@ def test_samples_get_what_is_known_of_them(inputs):
     made = evaluations(points, known == 3, known)
     again = replace(made, stability=np.array([2, 2, 2, 1], dtype=np.int8))
     both = evaluations(np.vstack([points, points]), np.tile(known == 3, 2), np.append(known, again.stability))
-    np.testing.assert_array_equal(branch.by_sample(points[::-1], both), [1, 3, 2, 1])
+    np.testing.assert_array_equal(failure_domain.by_sample(points[::-1], both), [1, 3, 2, 1])
 
 
 @pytest.mark.fem

@@ -13,7 +13,7 @@ from forward.pointwise import FunctionModel
 from forward.solvers import newton as newtons
 from forward.solvers.acceptance import Diverged
 from forward.solvers.joined import same
-from uq.estimators import branch
+from uq.estimators import failure_domain
 from uq.evaluation.block import BlockSolver
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request, audited
@@ -103,7 +103,7 @@ def test_a_turned_state_is_recognised_wherever_it_comes_from():
 def small_steps(model, point, count=64):
     """Raise the loads by small steps of Newton's method from the last state."""
     equations, state = model.equations, np.zeros(model.equations.size)
-    equations.latest.begin()
+    equations.linearisation_point.begin()
     equations.set_parameters(point)
     for k in range(1, count + 1):
         state = newtons.newton(equations, model.spec.solver, state, [], k / count)[0].state
@@ -192,7 +192,7 @@ def test_an_arch_snaps_where_raising_the_load_makes_it(arch, mean):
     model = alone(arch)
     # Small steps from rest, each by Newton's method from the last state.
     equations, state = model.equations, np.zeros(model.equations.size)
-    equations.latest.begin()
+    equations.linearisation_point.begin()
     equations.set_parameters(np.array([60.0]))
     sags = {}
     for k in range(1, 121):
@@ -225,7 +225,7 @@ def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
     model = alone(arch)
     equations, settings, most = model.equations, model.spec.solver, 60.0
     state, load, step = np.zeros(equations.size), 0.0, 1 / 64
-    equations.latest.begin()
+    equations.linearisation_point.begin()
     equations.set_parameters(np.array([most]))
     while step > 1e-5:
         try:
@@ -239,7 +239,7 @@ def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
     for more in (1e-3, 2e-3):
         one = model.solve(np.array([(1 + more) * load * most]))
         assert one.work.snaps == 1
-        equations.latest.begin()
+        equations.linearisation_point.begin()
         there = newtons.newton(equations, settings, above.state, [], 1.0)[0].state  # down from above
         assert same(equations, one.state, there)
 
@@ -277,9 +277,9 @@ def test_what_is_drawn_is_followed_from_the_reference():
     assert not found.counted("calls").any()
     assert not found.counted("audit_factorisations").any()  # Lanczos' process tells
     assert found.joined.all()
-    counts = branch.joined_counts([found])
+    counts = failure_domain.joined_counts([found])
     assert (counts["audited"], counts["screened"]) == (sum(drawn), 64 - sum(drawn))
-    assert not list(branch.of_jumps([found], inputs))
+    assert not list(failure_domain.of_jumps([found], inputs))
 
 
 @pytest.mark.unit
@@ -292,11 +292,13 @@ def test_jumps_are_said_with_their_share():
     work[3:5, WORK.index("others")] = 1
     work[:, WORK.index("screens")] = 1
     made = replace(made, work=work)
-    jumped, other = branch.of_jumps([made], inputs)
+    jumped, other = failure_domain.of_jumps([made], inputs)
     assert jumped.severity == other.severity == "warning"
     assert "8 of 20 samples (40 %)" in jumped.text
     assert "all with loads.traction.size ≥ 51" in jumped.text
     assert "2 of 20 samples (10 %)" in other.text
-    assert next(branch.of_jumps([made], inputs, continued=True)).severity == "error"
-    np.testing.assert_array_equal(branch.joined_by_sample(points[[0, 3, 19]], made), [1, 3, 4])
-    assert not list(branch.of_jumps([replace(made, work=work[:, :5])], inputs))  # what an earlier version has kept
+    assert next(failure_domain.of_jumps([made], inputs, continued=True)).severity == "error"
+    np.testing.assert_array_equal(failure_domain.joined_by_sample(points[[0, 3, 19]], made), [1, 3, 4])
+    assert not list(
+        failure_domain.of_jumps([replace(made, work=work[:, :5])], inputs)
+    )  # what an earlier version has kept

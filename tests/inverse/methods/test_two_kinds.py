@@ -10,7 +10,7 @@ from scipy.stats import norm
 from forward.conformance import check_derivatives
 from forward.fem.finer import extrapolated
 from forward.hyperelastic import Hyperelastic
-from forward.joined import JoinedModels
+from forward.joined_models import JoinedModels
 from forward.material_tests import MaterialTests
 from forward.materials.material_point import HomogeneousModel
 from workflows.config.mistakes import StudyError

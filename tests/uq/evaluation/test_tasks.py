@@ -162,7 +162,7 @@ from mpi4py import MPI
 import xarray as xr
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.tasks import run_tasks
-from uq.evaluation.turns import Counter
+from uq.evaluation.work_queue import Counter
 
 reset = Counter.reset
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from forward.pointwise import FunctionModel
-from uq.estimators.of_draws import with_errors_of_draws
+from uq.estimators.input_sample_error import with_errors_of_draws
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.draws import Draws

@@ -8,7 +8,7 @@ from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import hyperbolic, orthonormal
 from uq.surrogates.gate import wrong
-from uq.surrogates.reach import beyond
+from uq.surrogates.outside_samples import beyond
 
 
 def test_what_is_beyond_a_box_is_exact():

@@ -13,9 +13,9 @@ from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
+from workflows.studies.accuracy_run import contradictions
 from workflows.studies.tolerance import _next
 from workflows.studies.tolerance_asked import Assessed, dimension, out_of_reach, rate_of
-from workflows.studies.within import contradictions
 
 TINY = ROOT / "configs" / "tiny.toml"
 OWN = ROOT / "configs" / "own-model.toml"

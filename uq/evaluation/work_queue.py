@@ -27,7 +27,7 @@ SHORTEST, SHARE, LONGEST = 1e-5, 1.1, 0.01  # pauses (s) while waiting: about a 
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results
 
 
-class Turns:
+class WorkQueue:
     """The turns of the rank groups of one world; making and using it is collective.
 
     Parameters
@@ -46,7 +46,7 @@ class Turns:
 
     @classmethod
     @contextmanager
-    def of(cls, world: Any, group: Any, index: int, progress: Progress) -> Iterator[Turns]:
+    def of(cls, world: Any, group: Any, index: int, progress: Progress) -> Iterator[WorkQueue]:
         """Make the counters, and free them at the end; collective."""
         with counter(world) as turn, counter(world) as solves, counter(world) as failures:
             yield cls(world, group, index, progress, (turn, solves, failures))

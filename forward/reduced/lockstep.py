@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.reduced.kernels import Integrand
-from forward.reduced.level import Level
+from forward.reduced.reduced_equations import ReducedEquations
 from forward.solvers.anderson import scaled_eigenpairs
 
 TOGETHER = 64  # samples
@@ -24,7 +24,11 @@ SINGLE = 1e-5  # from which on single precision is enough
 
 
 def equilibria(
-    level: Level, parameters: FloatArray, modes: FloatArray, inverse: FloatArray, tolerance: float = TOLERANCE
+    level: ReducedEquations,
+    parameters: FloatArray,
+    modes: FloatArray,
+    inverse: FloatArray,
+    tolerance: float = TOLERANCE,
 ) -> tuple[FloatArray, list[int]]:
     """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes, with an inverse stiffness (n, n).
 
@@ -102,7 +106,7 @@ def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(vectors, along)[..., 0] / size)
 
 
-def _still(level: Level, parameters: FloatArray) -> FloatArray:
+def _still(level: ReducedEquations, parameters: FloatArray) -> FloatArray:
     """Forces (N,) that do not depend on the state."""
     numbers, coefficients = level.numbers(parameters), level.coefficients(parameters)
     R = level.proportional(parameters)
@@ -117,7 +121,7 @@ def _still(level: Level, parameters: FloatArray) -> FloatArray:
 class _Moving:
     """A virtual work that depends on the state, at the parameters (s, d) of several samples."""
 
-    def __init__(self, work: Integrand, level: Level, parameters: FloatArray) -> None:
+    def __init__(self, work: Integrand, level: ReducedEquations, parameters: FloatArray) -> None:
         self._work = work
         self._numbers = [level.numbers(point) for point in parameters]
         self._inputs = np.array([work.without_state(level.coefficients(point)).copy() for point in parameters])

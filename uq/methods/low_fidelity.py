@@ -206,10 +206,10 @@ class OtherModel(CheapModel):
 CHEAP = Kinds(
     "cheap-model",
     {
-        "mesh": "uq.methods.cheap:Coarser",
-        "iterations": "uq.methods.cheap:FewIterations",
-        "reduced": "uq.methods.cheap:ReducedModel",
-        "model": "uq.methods.cheap:OtherModel",
+        "mesh": "uq.methods.low_fidelity:Coarser",
+        "iterations": "uq.methods.low_fidelity:FewIterations",
+        "reduced": "uq.methods.low_fidelity:ReducedModel",
+        "model": "uq.methods.low_fidelity:OtherModel",
     },
     CheapModel,
 )

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uq.estimators.chosen import Design, Pool, Pooled, choice, shares
+from uq.estimators.subsampled_difference import Design, Pool, Pooled, choice, shares
 
 MEAN, STD = np.exp(0.32), np.sqrt(np.exp(0.64) * (np.exp(0.64) - 1) + 0.25)
 DESIGN = Design((1, 2), np.array([MEAN]), np.array([STD]), np.array([4 * STD**2]))

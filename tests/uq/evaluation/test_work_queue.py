@@ -2,8 +2,8 @@
 
 from types import SimpleNamespace
 
-from uq.evaluation import turns
-from uq.evaluation.turns import Turns
+from uq.evaluation import work_queue
+from uq.evaluation.work_queue import WorkQueue
 
 
 class World:
@@ -25,7 +25,7 @@ class World:
 
 
 def test_a_result_that_arrives_while_solves_are_counted(monkeypatch):
-    monkeypatch.setattr(turns, "SECONDS_BETWEEN_COUNTS", -1.0)
+    monkeypatch.setattr(work_queue, "SECONDS_BETWEEN_COUNTS", -1.0)
     world, taken = World(), iter([0, 2])
 
     class Solves:
@@ -35,7 +35,7 @@ def test_a_result_that_arrives_while_solves_are_counted(monkeypatch):
             return 0
 
     received = []
-    one = Turns(
+    one = WorkQueue(
         world,
         SimpleNamespace(rank=0, size=1),
         0,

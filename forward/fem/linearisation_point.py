@@ -8,7 +8,7 @@ from forward.model import FloatArray
 
 
 @dataclass
-class Latest:
+class LinearisationPoint:
     """The point at which a body is set, and the one whose stiffness is factorised.
 
     Every change of the body is recorded here, so that nothing set or computed at one point is used at another.

@@ -20,7 +20,7 @@ LENGTH = 3  # in place of an axis
 LEAST = 0.1  # of the forces of the largest snapshot: below, forces that are left are measured against this
 
 
-class Level:
+class ReducedEquations:
     """A reduced model with so many modes at its points.
 
     Parameters
@@ -170,7 +170,7 @@ class _Output:
 
     whole = False
 
-    def __init__(self, output: Output, level: Level) -> None:
+    def __init__(self, output: Output, level: ReducedEquations) -> None:
         self.output, self.level = output, level
 
     def value(self, c: FloatArray, parameters: FloatArray) -> float:
@@ -256,7 +256,7 @@ class _Largest(_Output):
 class _OfDensity(_Output):
     """An output of values at points: their weighted sum, or the largest."""
 
-    def __init__(self, output: Output, level: Level, points: Points, numbers: int) -> None:
+    def __init__(self, output: Output, level: ReducedEquations, points: Points, numbers: int) -> None:
         super().__init__(output, level)
         assert output.density is not None
         self._density = Integrand(output.density, points, numbers, level.real)
@@ -310,7 +310,7 @@ class _Peak(_OfDensity):
         return weights
 
 
-def _of_output(output: Output, level: Level, numbers: int) -> _Output:
+def _of_output(output: Output, level: ReducedEquations, numbers: int) -> _Output:
     match output.kind:
         case "linear":
             return _Linear(output, level)
@@ -328,6 +328,6 @@ def _of_output(output: Output, level: Level, numbers: int) -> _Output:
             raise ValueError(f"the file has an output of the unknown kind '{output.kind}'")
 
 
-def _all(points: Points, level: Level) -> Points:
+def _all(points: Points, level: ReducedEquations) -> Points:
     """Return all points, with the coordinates of a level."""
     return points.some(np.arange(len(points.weights)), points.weights, level.count)
