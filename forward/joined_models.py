@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.sparse import csr_matrix
+from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
-from forward.combine import Joined, Mapped, Sparse
+from forward.combine import Joined, Mapped, Rows, Sparse
 from forward.fem.cost import Times, sum_of
 from forward.findings import Finding
 from forward.materials.admissible import Materials
+from forward.model import ForwardModel
 from forward.registry import OfKind
 from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import nearest
@@ -200,3 +202,28 @@ class JoinedModels(ModelSpec):
         for name, model in self.models.items():
             if model.coefficients:
                 yield ("models", name, "fields"), "random fields, expected numbers only", len(model.coefficients)
+
+
+@dataclass(frozen=True)
+class JoinedMeshes:
+    """Joined models on finer meshes: of each, or None of those without meshes."""
+
+    parts: tuple[Any, ...]
+
+    def of(self, observed: Any) -> ForwardModel:
+        """Return the model of what all outputs tend to, and of the gaps between the meshes (`forward.fem.finer`)."""
+        joined: Any = observed.model if isinstance(observed, Rows) else observed
+        found = []
+        for meshes, part in zip(self.parts, joined.models, strict=True):
+            model, count = part.model, len(part.outputs)
+            both = vstack([identity(count), csr_matrix((count, count))], format="csr")
+            fine = Rows(model, both, tuple(map(str, range(2 * count)))) if meshes is None else meshes.of(model)
+            found.append(replace(part, model=fine))
+        whole = replace(joined, models=tuple(found), outputs=tuple(one for part in found for one in part.outputs))
+        # Of each part both in turn, and so of all.
+        sizes = [len(part.outputs) for part in joined.models]
+        S = vstack([block_diag([kron(half, identity(n)) for n in sizes]) for half in ([1, 0], [0, 1])], format="csr")
+        if isinstance(observed, Rows):
+            S = block_diag([observed.S] * 2, format="csr") @ S
+        gaps = (f"{name} (between the meshes)" for name in observed.outputs)
+        return Rows(whole, S, (*observed.outputs, *gaps))

@@ -17,19 +17,20 @@ boxes and blocks with fields are divided, and again at the rims of what is held 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
+from scipy.sparse import csr_matrix, identity, kron
 
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
 from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows
+from forward.joined_models import JoinedMeshes
 from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError
 from forward.pointwise import OfOne, OneByOne
 
@@ -350,31 +351,6 @@ class FinerMeshes:
         weights = csr_matrix(identity(len(body.outputs))) if rows is None else rows.S
         found = limit(begun, weights, observed.outputs, self.share)
         return found if self.otherwise is None else Otherwise(found, self.otherwise.of(observed))
-
-
-@dataclass(frozen=True)
-class JoinedMeshes:
-    """Joined models on finer meshes: of each, or None of those without meshes."""
-
-    parts: tuple[Any, ...]
-
-    def of(self, observed: Any) -> ForwardModel:
-        """Return the model of what all outputs tend to, and of the gaps between the meshes, as of `limit`."""
-        joined: Any = observed.model if isinstance(observed, Rows) else observed
-        found = []
-        for meshes, part in zip(self.parts, joined.models, strict=True):
-            model, count = part.model, len(part.outputs)
-            both = vstack([identity(count), csr_matrix((count, count))], format="csr")
-            fine = Rows(model, both, tuple(map(str, range(2 * count)))) if meshes is None else meshes.of(model)
-            found.append(replace(part, model=fine))
-        whole = replace(joined, models=tuple(found), outputs=tuple(one for part in found for one in part.outputs))
-        # Of each part both in turn, and so of all.
-        sizes = [len(part.outputs) for part in joined.models]
-        S = vstack([block_diag([kron(half, identity(n)) for n in sizes]) for half in ([1, 0], [0, 1])], format="csr")
-        if isinstance(observed, Rows):
-            S = block_diag([observed.S] * 2, format="csr") @ S
-        gaps = (f"{name} (between the meshes)" for name in observed.outputs)
-        return Rows(whole, S, (*observed.outputs, *gaps))
 
 
 class OtherMesh(OneByOne):

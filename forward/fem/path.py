@@ -3,8 +3,7 @@
 Mostly steps only say where the curve is known. With friction the state depends on the states before, and the load grows
 in increments. With the states u_i at their ends, F_i(u_i, u_{i−1}, ω) = 0. Tangents go forward through the increments,
 K_i du_i = −∂F_i/∂ω dω − C_i du_{i−1} with C_i = ∂F_i/∂u_{i−1}, and adjoints back, K_iᵀλ_i = ∂ψ/∂u_i − C_{i+1}ᵀλ_{i+1}:
-they are the derivatives of what is computed, for one factor of each increment. What items keep stands behind u_i.
-What is differentiated is the path with its increments as they are; one that had to be halved is part of it.
+they are those of the path as it is computed, for one factor of each increment. What items keep stands behind u_i.
 """
 
 from __future__ import annotations

@@ -15,8 +15,6 @@ polynomial of a parameter with tails), its second moment comes from where no sam
 estimated error is reliable. So a control that increases the scatter is dropped: β = 0, see `_helps`.
 
 Either expectation may also be a sum of independently estimated terms (a telescoping sum over meshes): see `combine`.
-
-Scalars and fields, with and without controls, use the same sums: one file, so that each formula is written once.
 """
 
 from __future__ import annotations

@@ -34,9 +34,10 @@ from workflows.studies.solves import of_answers
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.finer import FinerMeshes, JoinedMeshes
+    from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
     from forward.hyperelastic import Hyperelastic
+    from forward.joined_models import JoinedMeshes
     from forward.specimen import Specimen
     from inverse.data.shared_motion import SharedMotion
     from inverse.methods.infer import Starts

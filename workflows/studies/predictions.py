@@ -13,8 +13,9 @@ from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
-    from forward.fem.finer import FinerMeshes, JoinedMeshes
+    from forward.fem.finer import FinerMeshes
     from forward.fem.locking import Decision
+    from forward.joined_models import JoinedMeshes
     from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
 
