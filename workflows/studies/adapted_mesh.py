@@ -46,14 +46,13 @@ def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable
         if world.rank == 0 and found is not None:
             _keep(study, found, path)
     read = ensemble.together(lambda: study.model.on_mesh(str(path)) if world.rank == 0 else None)
-    contents = world.bcast(None if read is None else read.body.contents)  # type: ignore[attr-defined]
+    contents = world.bcast(None if read is None else read.bodies[0].body.contents)
     return study.of(study.model.on_mesh(str(path), contents))
 
 
 def kept(study: S) -> S:
     """Return a study on such a mesh as its results have it, which may be moved."""
-    body = study.model.body  # type: ignore[attr-defined]
-    return study.of(study.model.on_mesh(MESH, body.contents))
+    return study.of(study.model.on_mesh(MESH, study.solid.body.contents))
 
 
 def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
@@ -91,7 +90,7 @@ def history(study: SamplingBlocks) -> dict[str, Any] | None:
 
 
 def _path(study: SamplingBlocks) -> Path:
-    return Path(study.model.body.file)  # type: ignore[attr-defined]  # bodies that are adapted have files
+    return Path(study.solid.body.file)
 
 
 def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
@@ -102,7 +101,7 @@ def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     if told is None:
         return dataset
     cycles = told["cycles"]
-    mesh, shares = study.model.body.load(), indicators_of(_path(study))  # type: ignore[attr-defined]
+    mesh, shares = study.solid.body.load(), indicators_of(_path(study))
 
     def of_outputs(name: str) -> tuple[tuple[str, str], Any]:
         return ("cycle", "output"), np.array([cycle[name] for cycle in cycles], dtype=float)
@@ -123,7 +122,7 @@ def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
 
 def _finding(study: SamplingBlocks, told: dict[str, Any]) -> Finding:
     """Say what errors are left, and why."""
-    adapt = study.model.adapt  # type: ignore[attr-defined]
+    adapt = study.solid.adapt
     last, first = told["cycles"][-1], told["cycles"][0]
     named = [told["outputs"][i] for i in adapt.named(study.model)]
     left = []

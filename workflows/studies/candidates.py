@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from forward.bodies.geometry import Vector
+from forward.material_tests import TestedMaterial
 from forward.materials.admissible import Materials
-from forward.materials.material import MATERIALS, constants, incompressible, of_volume
-from forward.registry import KindError
 from forward.scalars import Mistake
-from forward.settings import Settings, nearest, shown
+from forward.settings import Settings
 from forward.spec import MEASURED, ModelSpec
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
@@ -42,7 +40,7 @@ class CandidateBlock(Settings):
         return inputs_of(self.parameters, self.correlations)
 
 
-class CandidateModel(CandidateBlock):
+class CandidateModel(TestedMaterial, CandidateBlock):
     """A candidate material with its prior.
 
     Parameters
@@ -53,13 +51,6 @@ class CandidateModel(CandidateBlock):
         across both.
     """
 
-    material: dict[str, float | str | tuple[Vector, ...]]
-
-    @property
-    def kind(self) -> str:
-        """Kind of the material."""
-        return str(self.material["kind"])
-
     @property
     def inputs(self) -> Inputs:
         """The random constants."""
@@ -68,48 +59,19 @@ class CandidateModel(CandidateBlock):
     @property
     def materials(self) -> Materials:
         """The material as a function of the random constants."""
-        return Materials(self.kind, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
-
-    @property
-    def fixed(self) -> dict[str, float]:
-        """Constants that do not vary."""
-        return {name: value for name, value in self.material.items() if isinstance(value, float)}
-
-    @property
-    def fibres(self) -> tuple[Vector, ...]:
-        """Directions of the families of fibres."""
-        return tuple(self.material.get("fibres", ()))  # type: ignore[arg-type]
+        return Materials(self.energy, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
 
     @model_validator(mode="after")
     def _check(self) -> CandidateModel:
-        kind = self.material.get("kind")
-        if kind is None:
-            raise ValueError("material.kind: missing")
+        wrong = next(self.mistakes_of_material(self.parameters), None)
+        if wrong is not None:
+            raise ValueError(wrong)
         try:
-            MATERIALS[str(kind)]
-        except KindError as error:
-            raise ValueError(f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}") from None
-        numbers = {name for name, value in self.material.items() if isinstance(value, float)}
-        words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
-        if words:
-            raise ValueError(f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number")
-        known = constants(self.kind)
-        given = dict.fromkeys([*self.fixed, *self.parameters])
-        for name in given:
-            if name not in known:
-                raise ValueError(f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}")
-            if name in self.fixed and name in self.parameters:
-                raise ValueError(f"'{name}' is given in material and in parameters, expected one of them")
-        left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
-        missing = [name for name in known if name not in given and name not in left_out]
-        if missing:
-            raise ValueError(f"missing: {', '.join(missing)}, expected in material or parameters")
-        try:
-            wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
+            unfit = next(mistakes_of_materials(self.inputs, self.materials), None)
         except ValueError:  # correlations, which are reported elsewhere
             return self
-        if wrong is not None:
-            raise ValueError(f"parameters {', '.join(wrong[2])}: {wrong[1]}")
+        if unfit is not None:
+            raise ValueError(f"parameters {', '.join(unfit[2])}: {unfit[1]}")
         return self
 
 

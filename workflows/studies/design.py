@@ -64,7 +64,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
     @property
     def field(self) -> bool:
         """Whether values of a field at the vertices are what is unknown."""
-        return any(field.basis == "nodes" for field in getattr(self.model, "fields", ()))
+        return any(field.basis == "nodes" for body in self.model.bodies for field in body.fields)
 
     @property
     def inputs(self) -> Inputs:
@@ -148,7 +148,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
             yield from wrong
             if wrong:
                 return
-        fields = getattr(self.model, "fields", ())
+        fields = [field for body in self.model.bodies for field in body.fields]
         nodal = [i for i, field in enumerate(fields) if field.basis == "nodes"]
         if nodal and (len(fields) > 1 or self.given):
             message = "a field of nodal values is unknown alone, expected no other fields and no parameters"

@@ -197,7 +197,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
     def _of_outputs(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of outputs."""
         yield from self.model.mistakes_of_mesh()
-        for i, field in enumerate(getattr(self.spec, "fields", ())):
+        for i, field in enumerate(field for body in self.spec.bodies for field in body.fields):
             if field.basis == "nodes":
                 message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
                 yield ("model", "fields", i, "basis"), message, field.basis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 from pydantic import Field
 
@@ -45,6 +45,11 @@ class SamplingBlocks(Sourced):
         spec, asked = self.model.over(ranges(self.given)), self.accuracy.tolerance
         solver = spec.solver_tolerance
         return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
+
+    @property
+    def solid(self) -> Any:
+        """The body on whose mesh the model is solved (`forward.loaded.LoadedBody`)."""
+        return self.model.bodies[0]
 
     @property
     def models(self) -> dict[str, ModelSpec]:

@@ -341,7 +341,7 @@ class Selection(Comparison):
 
     def described(self, name: str) -> str:
         """Material of a candidate."""
-        return self.candidates[name].kind
+        return self.candidates[name].energy
 
     @cached_property
     def data_groups(self) -> dict[str, Measurements]:
@@ -363,11 +363,11 @@ class Selection(Comparison):
         """Make the model of a candidate in a group."""
         candidate = self.candidates[name]
         names = tuple(candidate.parameters)
-        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), names, candidate.fibres)
+        return HomogeneousModel(candidate.energy, candidate.fixed, self._tests(group), names, candidate.fibres)
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the constants of a candidate."""
-        return units(self.candidates[label.partition("/")[0]].kind)
+        return units(self.candidates[label.partition("/")[0]].energy)
 
     @property
     def _all_tests(self) -> tuple[MaterialTest, ...]:
@@ -388,7 +388,7 @@ class Selection(Comparison):
                 yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
                 return
         for name, candidate in self.candidates.items():
-            objections = (unfit(candidate.kind, test.mode, candidate.fibres) for test in self._all_tests)
+            objections = (unfit(candidate.energy, test.mode, candidate.fibres) for test in self._all_tests)
             objection = next(filter(None, objections), None)
             if objection is not None:
                 yield ("candidates", name, "material"), objection, candidate.material

@@ -120,7 +120,7 @@ class Synthesis(FromPython, StudyKind):
         if isinstance(self.model, Specimen):
             yield from self._mistakes_of_specimen(self.model)
         yield from self.model.mistakes_of_mesh()
-        for i, field in enumerate(getattr(self.model, "fields", ())):
+        for i, field in enumerate(field for body in self.model.bodies for field in body.fields):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis

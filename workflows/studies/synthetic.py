@@ -67,9 +67,9 @@ def _head(model: ModelSpec, method: Synthesize) -> str:
     """Return the first line of a file: of what the data are."""
     noise = method.noise.model_dump(exclude_none=True)
     errors = f"errors {', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {method.seed}"
-    body = getattr(model, "body", None)
-    if body is None:
+    if len(model.bodies) != 1:
         return f"# Synthetic: {model.description}, {errors}.\n"
+    body = model.bodies[0].body
     return f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), {errors}.\n"
 
 

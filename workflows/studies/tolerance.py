@@ -116,9 +116,11 @@ def on_fine_mesh(
     changed = told["body"]
     if "adapt" in changed:
         return _refined(study, _adapting(study, changed["adapt"]), ensemble, directory, say)
-    body = study.model.body  # type: ignore[attr-defined]
+    if not changed:
+        return study
+    body = study.solid.body
     body = body.model_validate(body.model_dump(exclude={"contents"}) | changed)
-    return study.of(study.model.model_copy(update={"body": body})) if changed else study
+    return study.of(study.model.model_copy(update={"body": body}))
 
 
 def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
@@ -152,8 +154,8 @@ def _body(study: SamplingBlocks, first: SamplingBlocks) -> dict[str, Any]:
     if study.model is first.model:
         return {}
     if study.model.adaptive:
-        return {"adapt": study.model.adapt.tolerance}  # type: ignore[attr-defined]
-    body = study.model.body  # type: ignore[attr-defined]
+        return {"adapt": study.solid.adapt.tolerance}
+    body = study.solid.body
     return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
 
 
@@ -281,7 +283,7 @@ def _next(
             return study.model, more[0], ""
         if not how:
             return None, now.estimates, f"{takes}; it {words}"
-        before = getattr(study.model, "adapt", None)
+        before = study.solid.adapt
         if before is not None and (len(meshes) > MOST_MESHES or study.spec.unknowns * STEP > before.unknowns):
             return None, now.estimates, f"{takes}; finer ones would take more than {_memory(study)}"
         error = now.relative if before is None else before.tolerance

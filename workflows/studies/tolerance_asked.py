@@ -115,18 +115,16 @@ def refinement(study: SamplingBlocks) -> tuple[str, str]:
     model = study.model
     if model.adaptive:
         return "", "is refined as model.adapt says, and no further"
-    body = getattr(model, "body", None)
-    objection = None
+    body, objection = study.solid.body, None
     try:
         model.finer(2.0)
     except ModelError as error:
         objection = str(error)
     except ValueError:
         objection = "it would be too large"
-    assert body is not None
     if objection is None and body.cell != "tetrahedron":
         return "cells", "gets more cells along all edges, if its error is too large"
-    if body.cell == "tetrahedron" and not any(field.basis != "modes" for field in getattr(model, "fields", ())):
+    if body.cell == "tetrahedron" and not any(field.basis != "modes" for field in study.solid.fields):
         return "adapt", "is refined where its error arises, if that is too large"
     return "", f"is not refined: {objection}"
 
@@ -249,7 +247,7 @@ def most_unknowns(study: SamplingBlocks) -> int:
 
 def cells(study: SamplingBlocks) -> tuple[int, ...]:
     """Cells along each edge, or how often those of a file are halved."""
-    body = study.model.body  # type: ignore[attr-defined]
+    body = study.solid.body
     return tuple(body.cells) if hasattr(body, "cells") else (2**body.levels,)
 
 
@@ -306,7 +304,7 @@ def out_of_reach(study: SamplingBlocks, first: SamplingBlocks, meshes: Sequence[
     meshes
         Those seen.
     """
-    now, degree = meshes[-1], int(study.model.body.degree)  # type: ignore[attr-defined]
+    now, degree = meshes[-1], int(study.solid.body.degree)
     if not math.isfinite(now.share):
         return None
     d = dimension(first)

@@ -126,7 +126,7 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
 def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
     """Return the scene of a specimen that was inverted: its stiffness, inclusions, and measured points."""
     points, cells, kind = _mesh(one)
-    inclusions = getattr(study.model, "inclusions", ())
+    inclusions = study.model.inclusions
     names = [str(name) for name in one["parameter"].values]
     insides = []
     box = points.min(axis=0), points.max(axis=0)
@@ -314,7 +314,7 @@ def _inclusions_of(of: xr.Dataset, study: Any, points: FloatArray) -> Iterator[I
         return
     names, means = [str(name) for name in of["parameter"].values], of["parameter_mean"].to_numpy()
     box = points.min(axis=0), points.max(axis=0)
-    for inclusion in getattr(study.model, "inclusions", ()):
+    for inclusion in (one for body in study.model.bodies for one in body.inclusions):
         yield _ball(inclusion, names, box, inclusion.label, means, "inside")
 
 
