@@ -12,7 +12,6 @@ from forward.machine import MIB
 from forward.registry import OfKind
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
-from uq.accuracy.doubts import Told
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
@@ -20,6 +19,9 @@ from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.priors import inputs_of, ranges
 from workflows.config.source import Sourced
 from workflows.studies.predictions import estimates_paid
+
+if TYPE_CHECKING:
+    from uq.accuracy.doubts import Told
 
 
 class SamplingBlocks(Sourced):
@@ -118,6 +120,8 @@ class SamplingBlocks(Sourced):
     @property
     def told(self) -> Told:
         """What is known of the outputs beside their values."""
+        from uq.accuracy.doubts import Told
+
         outputs = self.spec.returned
         never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
         units = {one.name: one.unit for one in outputs}

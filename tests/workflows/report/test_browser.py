@@ -202,7 +202,9 @@ SHAPE = -0.1 * CUBE[:, :1] * np.array([0.2, 1.0, 0.0])
 
 def turned(folder, dataset, inputs, field, quantities):
     """Write a page with a body and the sliders of an expansion."""
-    told = sliders(dataset, SimpleNamespace(given=inputs.marginals, inputs=inputs, units_of=lambda _: {}))
+    told = sliders(
+        dataset, SimpleNamespace(given=inputs.marginals, inputs=inputs, correlations=(), units_of=lambda _: {})
+    )
     assert told is not None
     scene = Scene(CUBE, np.array(HEXAHEDRON), 12, np.eye(3)[2], field, quantities, sliders=told)
     (folder / "report.html").write_text(render("x", [("body", [Heading("x", 1), turning(scene, "a body")])]))
