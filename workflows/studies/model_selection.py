@@ -143,7 +143,8 @@ class ModelSelection(OfCandidates, Comparison):
         if not has_mesh(spec):
             return spec.hidden or f"a model of kind '{spec.kind}' has no mesh"
         try:
-            finer(spec)
+            for body in spec.bodies:
+                finer(body)
         except ValueError as error:  # a mesh that is not divided, or would be too large
             return one_line(str(error))
         return ""

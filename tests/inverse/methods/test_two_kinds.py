@@ -173,3 +173,16 @@ def test_tables_that_are_none(study, tables, said):
     folder, blocks, *_ = study
     with pytest.raises(StudyError, match=said):
         parse(blocks | {"data": {"tables": tables}}, folder=folder)
+
+
+def test_candidates_of_joined_models_are_looked_at_on_finer_meshes(study):
+    """The finer meshes are those of their bodies, as they are of an inversion."""
+    folder, blocks, *_ = study
+    candidates = {"one": {"parameters": PRIOR}}
+    data = {"outputs": {"block.tip": -0.2, "strip.simple-shear": 4e3}, "sigma": {"block.tip": 0.1}}
+    method = {"kind": "select", "noise": {"relative": 0.1}}
+    it = parse({"model": MODEL, "candidates": candidates, "data": data, "method": method}, folder=folder)
+    assert it.unchecked == {"one": ""}
+    assert [spec.kind for spec in it.specs] == ["joined", "hyperelastic", "hyperelastic"]
+    inverted = parse(blocks | {"method": {"kind": "invert"}}, folder=folder)
+    assert inverted.specs[1:] == it.specs[1:]
