@@ -136,7 +136,7 @@ outputs = [{ name = "reach", kind = "mean-displacement", on = "x-max", component
 
 [data]
 outputs = { reach = [0.0212, 0.0208] }
-sigma = { reach = 4e-4 }
+sigma = { reach = 4e-3 }
 
 [candidates.fung]
 model.material = { kind = "fung", c = 4e3, b = 2.0, D1 = 4e3 }
@@ -150,7 +150,7 @@ parameters."material.C1" = { kind = "log-normal", mean = 2e3, std = 5e2 }
 
 [method]
 kind = "select"
-samples = 32
+samples = 64
 starts = 1
 noise = {}
 """
