@@ -49,10 +49,11 @@ def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
         message = "a specimen is predicted in load cases and at places, expected predict.cases and predict.observed"
         yield ("predict", "model"), message, asked.model
         return
-    for name in ("cases", "observed") if not specimen else ():
-        if getattr(asked, name):
+    of_specimen = {"cases": [one.name for one in asked.cases], "observed": [one.name for one in asked.observed]}
+    for name, given in of_specimen.items() if not specimen else ():
+        if given:
             message = f"a model of kind '{study.model.kind}' has none, expected predict.model = {{ outputs = [...] }}"
-            yield ("predict", name), message, [str(one.name) for one in getattr(asked, name)]
+            yield ("predict", name), message, given
             return
     if not study.field and asked.solves(field=False) < LEAST:
         yield ("predict", "samples"), f"expected at least {LEAST}", asked.samples

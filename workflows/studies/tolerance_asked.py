@@ -95,9 +95,10 @@ def mistakes(study: SamplingBlocks) -> Iterator[Mistake]:
             f"{', '.join(AIMING)}{' by regression' if method.kind == 'chaos' else ''}"
         )
         yield ("method", "kind"), message, method.kind
-    if getattr(method, "tolerance", None) is not None:
+    another = getattr(method, "tolerance", None)
+    if another is not None:
         message = "another tolerance than accuracy.tolerance, which counts all errors; expected one of the two"
-        yield ("method", "tolerance"), message, getattr(method, "tolerance")  # noqa: B009
+        yield ("method", "tolerance"), message, another
     if asked < LEAST:
         yield ("accuracy", "tolerance"), f"below what rounding leaves of results, expected at least {LEAST:g}", asked
     solver = study.model.solver_tolerance
