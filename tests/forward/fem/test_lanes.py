@@ -13,8 +13,8 @@ from forward import native
 from forward.bodies.geometry import Box
 from forward.fem.dolfinx import assembly, compile, lanes, meshes, spaces, version
 from tests.bodies import loaded_body
+from tests.forward.fem.test_lockstep import field
 from tests.forward.fem.test_mixed import cantilever
-from tests.forward.fem.test_together import field
 
 pytestmark = [pytest.mark.fem, pytest.mark.wheel, pytest.mark.flags]
 

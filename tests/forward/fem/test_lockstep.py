@@ -165,7 +165,7 @@ def test_as_one_ends_the_next_begins(monkeypatch):
 
 SCRIPT = """
 import numpy as np
-from tests.forward.fem import test_together as t
+from tests.forward.fem import test_lockstep as t
 from tests.ranks import groups
 from workflows.config.study import load
 
