@@ -9,7 +9,8 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, eye
 
 from forward.model import (
     FloatArray,
@@ -60,14 +61,18 @@ class Rows(OfOne):
         return DerivedSolution(self.model.solve(parameters, guess), S=self.S)
 
 
+def picked(which: Sequence[int] | NDArray[np.int64], count: int) -> csr_matrix:
+    """Return the matrix (n, count) that takes n of so many numbers, by their places."""
+    return eye(count, format="csr")[np.array(which, dtype=np.int64)]
+
+
 def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
     """Return the model of some outputs, by number; names are numbered where one is there several times."""
     names = [model.outputs[i] for i in which]
     numbered = tuple(
         f"{name}.{names[:k].count(name)}" if names.count(name) > 1 else name for k, name in enumerate(names)
     )
-    entries = np.ones(len(names)), np.array(which, dtype=np.int64), np.arange(len(names) + 1)
-    return Rows(model, csr_matrix(entries, shape=(len(names), len(model.outputs))), numbered)
+    return Rows(model, picked(which, len(model.outputs)), numbered)
 
 
 class Affine(Protocol):

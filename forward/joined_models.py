@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
-from forward.combine import Joined, Mapped, Rows, Sparse
+from forward.combine import Joined, Mapped, Rows, Sparse, picked
 from forward.fem.cost import Times, sum_of
 from forward.findings import Finding
 from forward.materials.admissible import Materials
@@ -175,10 +175,9 @@ class JoinedModels(ModelSpec):
         for name, model in self.models.items():
             own = [(path, self.path_of(name, path)) for path in model.scalars]
             acting = [(path, parameters.index(whole)) for path, whole in own if whole in parameters]
-            columns = [column for _, column in acting]
             part = model.build(comm, tuple(path for path, _ in acting))
-            A = csr_matrix((np.ones(len(acting)), columns, np.arange(len(acting) + 1)), (len(acting), len(parameters)))
-            made.append(Mapped(part, Sparse(A, np.zeros(len(acting))), parameters))
+            by = Sparse(picked([column for _, column in acting], len(parameters)), np.zeros(len(acting)))
+            made.append(Mapped(part, by, parameters))
         return Joined(tuple(made), tuple(one.name for one in self.outputs), tuple(f"model '{n}'" for n in self.models))
 
     @model_validator(mode="after")

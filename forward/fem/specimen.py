@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import eye
 
 from forward.bodies.geometry import AXES
-from forward.combine import Joined, JoinedSolution, Mapped, Sparse
+from forward.combine import Joined, JoinedSolution, Mapped, Sparse, picked
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import relative
 from forward.fem.equations import Discretisation
@@ -190,7 +189,7 @@ def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         loaded = spec.loaded(case)
         where = np.flatnonzero(np.isin(parameters, [*loaded.scalars, *loaded.coefficients]))
         bodies.append(loaded.build(comm, tuple(parameters[i] for i in where)))
-        by = Sparse(eye(len(parameters), format="csr")[where], np.zeros(len(where)))
+        by = Sparse(picked(where, len(parameters)), np.zeros(len(where)))
         models.append(Mapped(bodies[-1], by, parameters))
     none = np.zeros(0, dtype=np.int64)
     model = SpecimenModel(

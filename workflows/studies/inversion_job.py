@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from forward.registry import named
 from inverse.criticism.finer import Finer
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
@@ -225,8 +224,9 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
     @cache
     def before() -> Band:
         assert predicted is not None
-        found: Band = named("workflows.studies.predicted:prior_band")(study, beside(f"prior, {PREDICTED}", predicted))
-        return found
+        from workflows.studies.predicted import prior_band
+
+        return prior_band(study, beside(f"prior, {PREDICTED}", predicted))
 
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
         def on(name: str, model: ForwardModel) -> SerialEvaluate:
@@ -307,8 +307,10 @@ def _inverting_field(
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
     predicting: FieldPredictions | None = None
     if study.predict is not None:
+        from workflows.studies.predicted import of_field
+
         other = _predicted(study, ensemble)
-        predicting = named("workflows.studies.predicted:of_field")(study, lambda name: states_of(name, other))
+        predicting = of_field(study, lambda name: states_of(name, other))
 
     def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
         data, errors = problem.data, problem.errors
@@ -338,8 +340,9 @@ def _reduced(study: InversionBlocks) -> Callable[[ForwardModel], ForwardModel] |
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
     found = zip(study.reduced.values(), bodies, acting, strict=True)
     models = tuple(one.standing_for(body, paths) for one, body, paths in found)
-    observed_by = named("forward.reduced.model:observed_by")
-    return lambda observed: cast("ForwardModel", observed_by(observed, models))
+    from forward.reduced.model import observed_by
+
+    return lambda observed: observed_by(cast("SpecimenModel", observed), models)
 
 
 def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
@@ -363,7 +366,9 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
 
         found = _inverted(study, made, seen, _problem(study, 0, seen, on, ensemble.say), full, cheap, None)
         if predicted is not None:
-            before = partial(named("workflows.studies.predicted:prior_band"), study, on(PREDICTED, predicted))
+            from workflows.studies.predicted import prior_band
+
+            before = partial(prior_band, study, on(PREDICTED, predicted))
             found = _with_predictions(study, found, predicted, on, before)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 

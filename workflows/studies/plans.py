@@ -61,7 +61,7 @@ def of_sampling(study: SamplingBlocks, memory: float, rank_groups: int) -> list[
         if study.accuracy.tolerance is not None:  # the study's number is of a method alone
             estimates = f"{tolerance_asked.COUNTS[0]} to {tolerance_asked.COUNTS[-1]} estimates on each mesh"
         lines.append(f"mesh error  {estimates} in elements of one degree more; none with accuracy.mesh_error = false")
-        never = never_estimable(spec, [output.name for output in spec.returned])
+        never = never_estimable(spec)
         if never:
             lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")
     needed = memory + BYTES_OF_PROGRAM

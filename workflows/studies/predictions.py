@@ -60,10 +60,11 @@ def of_file(spec: ModelSpec) -> bool:
     return any(isinstance(one.body, MeshFile) for one in spec.bodies)
 
 
-def never_estimable(spec: ModelSpec, names: Collection[str]) -> tuple[str, ...]:
+def never_estimable(spec: ModelSpec, names: Collection[str] | None = None) -> tuple[str, ...]:
     """Return those outputs of a body, of some by their names, of which no error of a mesh can be estimated."""
     outputs = spec.returned if has_mesh(spec) else ()
-    return tuple(one.name for one in outputs if one.name in names and not getattr(one, "estimable", True))
+    some = outputs if names is None else [one for one in outputs if one.name in names]
+    return tuple(one.name for one in some if not getattr(one, "estimable", True))
 
 
 def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:

@@ -18,7 +18,7 @@ from uq.methods.method import MESH, METHODS, Method
 from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.priors import inputs_of, ranges
 from workflows.config.source import Sourced
-from workflows.studies.predictions import estimates_paid
+from workflows.studies.predictions import estimates_paid, never_estimable
 
 if TYPE_CHECKING:
     from uq.accuracy.doubts import Told
@@ -122,10 +122,10 @@ class SamplingBlocks(Sourced):
         """What is known of the outputs beside their values."""
         from uq.accuracy.doubts import Told
 
-        outputs = self.spec.returned
-        never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
-        units = {one.name: one.unit for one in outputs}
-        return Told(units, never, self.spec.solver_tolerance or 0.0, contact=self.spec.touched)
+        units = {one.name: one.unit for one in self.spec.returned}
+        return Told(
+            units, frozenset(never_estimable(self.spec)), self.spec.solver_tolerance or 0.0, contact=self.spec.touched
+        )
 
 
 S = TypeVar("S", bound=SamplingBlocks)

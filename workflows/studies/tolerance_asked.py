@@ -22,7 +22,7 @@ from forward.words import number
 from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
 from uq.methods.method import UNASKED
-from workflows.studies.predictions import times_of
+from workflows.studies.predictions import never_estimable, times_of
 
 if TYPE_CHECKING:
     from uq.accuracy.goal import Goal
@@ -140,7 +140,7 @@ def findings(study: SamplingBlocks) -> Iterator[Finding]:
             why = "it is not estimated, so that the tolerance will not be said to be kept"
         yield Finding("tolerance-without-mesh", "warning", {"why": why})
         return
-    unknown = [output.name for output in study.spec.returned if not getattr(output, "estimable", True)]
+    unknown = never_estimable(study.spec)
     if unknown:
         yield Finding("tolerance-without-mesh-of", "warning", about=entries(unknown))
     how, words = refinement(study)
