@@ -11,12 +11,12 @@ from pydantic import Field, field_validator, model_serializer, model_validator
 from forward.findings import Finding
 from forward.settings import Settings, nearest
 from workflows.config.blocks import AVERAGED, KEPT, STACKED
+from workflows.config.one_model import OneModel
 from workflows.config.priors import findings_of_impossible
 
 if TYPE_CHECKING:
     from forward.scalars import Mistake, Scalar
     from forward.spec import ModelSpec
-    from uq.inputs.distributions import Distribution
     from uq.inputs.draws import Draws
     from uq.inputs.random_parameters import Inputs
 
@@ -182,8 +182,8 @@ class Source(Settings):
                 yield Finding("constants-changed", "warning", {"source": self.file, "changed": "; ".join(other)})
 
 
-class Sourced(Settings):
-    """A study whose file may name draws among its parameters.
+class Sourced(OneModel):
+    """A study of one model whose file may name draws among its parameters.
 
     Parameters
     ----------
@@ -193,25 +193,10 @@ class Sourced(Settings):
 
     source: Source | None = None
 
-    if TYPE_CHECKING:  # fields of these studies
-
-        @property
-        def model(self) -> ModelSpec:
-            """The model."""
-
-        @property
-        def parameters(self) -> dict[str, Distribution]:
-            """Distributions by paths."""
-
     @cached_property
     def draws(self) -> Draws | None:
         """Draws of numbers of the model, if there is a source of them."""
         return None if self.source is None else self.source.draws_of(self.model.scalars)
-
-    @property
-    def given(self) -> dict[str, Distribution]:
-        """The distributions by the paths of the numbers that they replace, those of draws too."""
-        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
 
     @property
     def by_contents(self) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -14,10 +13,8 @@ from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from inverse.methods.design import Design
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AVERAGED, Correlation
-from workflows.config.priors import findings_of_materials, inputs_of, mistakes_of_priors, ranges
+from workflows.config.blocks import AVERAGED
+from workflows.config.priors import findings_of_materials, ranges
 from workflows.config.source import Sourced
 from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
@@ -56,35 +53,10 @@ class DesignStudy(Sourced, FromPython, StudyKind):
     stopped: ClassVar[str] = "a design"
     explains: ClassVar[bool] = False
 
+    restricted: ClassVar[bool] = True
+
     model: Annotated[ModelSpec, OfKind(MODELS, "specimen")]
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
     method: Design
-
-    @property
-    def field(self) -> bool:
-        """Whether values of a field at the vertices are what is unknown."""
-        return any(field.basis == "nodes" for body in self.model.bodies for field in body.fields)
-
-    @property
-    def inputs(self) -> Inputs:
-        """The unknowns: those that are given, draws, and the standard normal coefficients of random fields.
-
-        None for a field of nodal values.
-        """
-        coefficients = () if self.field else self.model.coefficients
-        materials = self.model.materials(self.given)
-        return inputs_of(self.parameters, self.correlations, coefficients, materials, self.draws)
-
-    @cached_property
-    def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters."""
-        return self.model.over(ranges(self.given))
-
-    @property
-    def specs(self) -> tuple[ModelSpec, ...]:
-        """The model."""
-        return (self.spec,)
 
     @property
     def planned(self) -> int:
@@ -148,8 +120,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
             yield from wrong
             if wrong:
                 return
-        fields = [field for body in self.model.bodies for field in body.fields]
-        nodal = [i for i, field in enumerate(fields) if field.basis == "nodes"]
+        fields, nodal = self.random_fields, self.nodal
         if nodal and (len(fields) > 1 or self.given):
             message = "a field of nodal values is unknown alone, expected no other fields and no parameters"
             yield ("model", "fields", nodal[0], "basis"), message, "nodes"
@@ -160,7 +131,7 @@ class DesignStudy(Sourced, FromPython, StudyKind):
             yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
         yield from self.model.mistakes_of_mesh()
         yield from self.mistakes_of_ranks(self.spec)
-        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs, self.draws)
+        yield from self.mistakes_of_parameters()
         yield from mistakes_of_values(self.method, self.model)
 
 

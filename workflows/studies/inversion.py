@@ -15,7 +15,7 @@ from forward.settings import nearest
 from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import not_installed
-from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_priors, ranges
+from workflows.config.priors import findings_of_materials, mistakes_of_factor, ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.measured_outputs import MeasuredOutputs
@@ -164,7 +164,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         if self.method.chains == "hmc" and self.method.reduced is not None:
             message = "follows the gradients of the body itself, expected 'pcn' or 'emcee' with a reduced model"
             yield ("method", "chains"), message, self.method.chains
-        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
+        yield from self.mistakes_of_parameters()
         yield from mistakes_of_factor(self.method.noise, "method", "noise")
         for name, value in self.data.truth.items():
             if name not in self.model.scalars:
@@ -177,7 +177,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
 
     def _of_specimen(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of displacements."""
-        nodal = [i for i, field in enumerate(self.model.fields) if field.basis == "nodes"]
+        nodal = self.nodal
         if nodal and (len(self.model.fields) > 1 or self.parameters):
             message = "a field of nodal values is inverted alone, expected no other fields and no parameters"
             yield ("model", "fields", nodal[0], "basis"), message, "nodes"
@@ -197,10 +197,9 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
     def _of_outputs(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of outputs."""
         yield from self.model.mistakes_of_mesh()
-        for i, field in enumerate(field for body in self.spec.bodies for field in body.fields):
-            if field.basis == "nodes":
-                message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
-                yield ("model", "fields", i, "basis"), message, field.basis
+        for i in self.nodal:
+            message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
+            yield ("model", "fields", i, "basis"), message, "nodes"
         yield from self.mistakes_of_ranks(self.spec)
         if not self.parameters and not self.model.coefficients:
             yield ("parameters",), "nothing is unknown, expected at least one prior", {}

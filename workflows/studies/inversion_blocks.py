@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
@@ -14,10 +14,11 @@ from forward.settings import Settings
 from forward.spec import MEASURED
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
-from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation, Parallel
-from workflows.config.priors import inputs_of, ranges
+from workflows.config.blocks import Parallel
+from workflows.config.one_model import OneModel
+from workflows.config.priors import ranges
 from workflows.studies.measured import DataFiles, as_block, data_as
 from workflows.studies.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import never_estimable
@@ -64,12 +65,12 @@ class Predict(Settings):
         return self.samples
 
 
-class InversionBlocks(Settings):
+class InversionBlocks(OneModel):
     """The blocks of an inversion, as `workflows.studies.inversion.Inversion` explains them."""
 
+    restricted: ClassVar[bool] = True
+
     model: Annotated[Any, MEASURED]
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
     data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(as_block)]
     method: Invert = Invert()
     predict: Predict | None = None
@@ -83,27 +84,10 @@ class InversionBlocks(Settings):
 
     # --- the model ---------------------------------------------------------------------------------------------------
 
-    @cached_property
-    def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters."""
-        found: ModelSpec = self.model.over(ranges(self.parameters))
-        return found
-
     @property
     def specimen(self) -> Specimen | None:
         """The model, if it is a specimen, of which displacements were measured."""
         return self.spec if isinstance(self.spec, Specimen) else None
-
-    @property
-    def field(self) -> bool:
-        """Whether values of a field at the vertices are what is unknown."""
-        return self.specimen is not None and any(field.basis == "nodes" for field in self.model.fields)
-
-    @cached_property
-    def inputs(self) -> Inputs:
-        """The unknown parameters; none for a field of nodal values."""
-        coefficients = () if self.field else self.model.coefficients
-        return inputs_of(self.parameters, self.correlations, coefficients, self.model.materials(self.parameters))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from forward.model import ModelError
 from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
 from workflows.config.blocks import Accuracy
-from workflows.config.priors import findings_of_draws, inputs_of, mistakes_of_priors, ranges
+from workflows.config.priors import findings_of_draws, inputs_of, ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.sampling_blocks import SamplingBlocks
 from workflows.studies.study import Sampled, StudyKind
@@ -187,7 +187,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         if not self.given and not self.model.coefficients:
             or_field = ", or one of model.fields" if self.spec.meshed else ""
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
-        yield from mistakes_of_priors(self.spec, self.parameters, self.correlations, lambda: self.inputs, self.draws)
+        yield from self.mistakes_of_parameters()
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
             from workflows.studies import tolerance_asked
 

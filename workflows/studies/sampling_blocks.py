@@ -6,17 +6,13 @@ import math
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
-from pydantic import Field
-
 from forward.machine import MIB
 from forward.registry import OfKind
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Accuracy, Correlation, Parallel
-from workflows.config.priors import inputs_of, ranges
+from workflows.config.blocks import Accuracy, Parallel
+from workflows.config.priors import ranges
 from workflows.config.source import Sourced
 from workflows.studies.predictions import estimates_paid, never_estimable
 
@@ -28,18 +24,11 @@ class SamplingBlocks(Sourced):
     """The blocks of a study that samples a model, as `workflows.studies.sampling.Study` explains them."""
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
 
     if TYPE_CHECKING:  # of every study
         parallel: Parallel
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
-        return inputs_of(self.parameters, self.correlations, self.model.coefficients, draws=self.draws)
 
     @cached_property
     def spec(self) -> ModelSpec:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
-
-from pydantic import Field
 
 from forward.registry import named
 from forward.scalars import Mistake
@@ -15,10 +12,8 @@ from forward.spec import MEASURED, ModelSpec
 from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
-from uq.inputs.distributions import Distribution
-from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Correlation
-from workflows.config.priors import inputs_of, mistakes_of_priors, ranges
+from workflows.config.one_model import OneModel
+from workflows.config.priors import ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
@@ -34,7 +29,7 @@ if TYPE_CHECKING:
     from uq.evaluation.request import Evaluate
 
 
-class Synthesis(FromPython, StudyKind):
+class Synthesis(OneModel, FromPython, StudyKind):
     """What synthetic data to make: displacements of a specimen, or outputs of any other model.
 
     Parameters
@@ -54,29 +49,12 @@ class Synthesis(FromPython, StudyKind):
     explains: ClassVar[bool] = False
 
     model: Annotated[ModelSpec, MEASURED]
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
     method: Synthesize
-
-    @cached_property
-    def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters."""
-        return self.model.over(ranges(self.parameters))
-
-    @cached_property
-    def inputs(self) -> Inputs:
-        """What is drawn for each data set."""
-        return inputs_of(self.parameters, self.correlations, self.model.coefficients)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the model before anything is solved."""
         return self.model.findings_over(ranges(self.parameters))
-
-    @property
-    def specs(self) -> tuple[ModelSpec, ...]:
-        """The model."""
-        return (self.spec,)
 
     @property
     def planned(self) -> int:
@@ -120,11 +98,10 @@ class Synthesis(FromPython, StudyKind):
         if isinstance(self.model, Specimen):
             yield from self._mistakes_of_specimen(self.model)
         yield from self.model.mistakes_of_mesh()
-        for i, field in enumerate(field for body in self.model.bodies for field in body.fields):
-            if field.basis == "nodes":
-                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
-                yield ("model", "fields", i, "basis"), message, field.basis
-        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
+        for i in self.nodal:
+            message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+            yield ("model", "fields", i, "basis"), message, "nodes"
+        yield from self.mistakes_of_parameters()
 
     def _mistakes_of_specimen(self, model: Specimen) -> Iterator[Mistake]:
         method = self.method
