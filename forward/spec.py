@@ -55,11 +55,14 @@ class ModelSpec(Settings):
         Whether a solve can be stopped after some iterations.
     shareable
         Whether several ranks can work on one solve.
+    placed
+        Whether data tell where it is observed: displacements at places, in load cases. Of others outputs are measured.
     """
 
     meshed: ClassVar[bool] = False
     iterative: ClassVar[bool] = False
     shareable: ClassVar[bool] = False
+    placed: ClassVar[bool] = False
 
     if TYPE_CHECKING:  # fields or properties, as the kind has them
 

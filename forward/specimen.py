@@ -144,6 +144,7 @@ class Specimen(Solid):
     """
 
     shareable: ClassVar[bool] = True
+    placed: ClassVar[bool] = True
     kind: Literal["specimen"] = "specimen"
     cases: tuple[LoadCase, ...] = Field(min_length=1)
     observed: tuple[Observed, ...] = ()

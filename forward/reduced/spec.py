@@ -256,7 +256,7 @@ class Reduced(ModelSpec):
         if lost:
             yield f"made without the outputs {', '.join(lost[:5])}"
 
-    def standing_for(self, body: Hyperelastic, parameters: tuple[str, ...]) -> Any:
+    def standing_for(self, body: ModelSpec, parameters: tuple[str, ...]) -> Any:
         """Load it with the outputs of a body, and its values of all numbers that are not parameters."""
         data = named("forward.reduced.data:load")(Path(self.file))
         kept = {path: number.value for path, number in body.scalars.items() if path in data.parameters}

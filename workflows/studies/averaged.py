@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -29,7 +29,6 @@ from workflows.studies.sampling_job import with_errors_of_draws, with_unknown_me
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.model import HyperelasticModel
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -136,7 +135,7 @@ class AveragedStudy(Study):
         units = {output.name: output.unit for output in self.model.returned}
         mesh: tuple[Any, ...] = (None, None, 0)
         if self.model.meshed:
-            space = cast("HyperelasticModel", model).space
+            space: Any = model.space
             mesh = (space.coordinates, *space.cells())
         told = {"candidates": {one.name: one.probability for one in self.candidates}}
         return MethodJob(model, others, task, recorders, labelled=lambda found: label(found, units, *mesh), told=told)

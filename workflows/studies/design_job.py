@@ -7,14 +7,14 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.bodies.geometry import AXES
 from forward.model import FloatArray, ModelError, SolveError
 from forward.scalars import Mistake
-from forward.specimen import Observed, Specimen
+from forward.specimen import Observed
 from inverse.designs.candidates import NEAR, Values
 from inverse.designs.fields import of_field
 from inverse.methods.invert import derivable
@@ -26,7 +26,6 @@ from workflows.studies.predictions import has_mesh
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.specimen import SpecimenModel
     from forward.model import ForwardModel, Solution
     from forward.spec import ModelSpec
     from inverse.methods.design import Design
@@ -45,7 +44,7 @@ SIDES = {f"{axis}-{side}": (k, end) for k, axis in enumerate(AXES) for side, end
 
 def mistakes(method: Design, spec: ModelSpec) -> Iterator[Mistake]:
     """Find what a design asks for that a model does not have; nothing where only its mesh knows."""
-    values = known(spec) if isinstance(spec, Specimen) else of_outputs(spec)
+    values = known(spec) if spec.placed else of_outputs(spec)
     if values is None:
         return
     if not values.names:
@@ -64,7 +63,7 @@ def of_outputs(spec: ModelSpec) -> Values:
     return Values(names, np.full((len(names), 3), np.nan), tuple(steps), tuple(parts))
 
 
-def known(spec: Specimen) -> Values | None:
+def known(spec: Any) -> Values | None:
     """Say what the values of a specimen are; None where nodes of a mesh from a file are observed."""
     names, places, cases, parts = list[str](), list[FloatArray](), list[str](), list[str]()
     for case in spec.cases:
@@ -82,7 +81,7 @@ def known(spec: Specimen) -> Values | None:
     return Values(tuple(names), np.array(places).reshape(-1, 3), tuple(cases), tuple(parts))
 
 
-def _points(spec: Specimen, item: Observed) -> FloatArray | None:
+def _points(spec: Any, item: Observed) -> FloatArray | None:
     """Points (n, 3) at which displacements are measured: nodes of a side as they lie on a cube of cells of one size."""
     if item.on is None:
         return np.array(item.at)
@@ -106,7 +105,7 @@ def job(
     derivable(model, spec.kind)
     values = values_of(spec, model)
     if field:
-        return _of_field(method, cast("Specimen", spec), ensemble, checkpoint, model, values)
+        return _of_field(method, spec, ensemble, checkpoint, model, values)
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -125,18 +124,18 @@ def job_of_models(
 ) -> MethodJob:
     """Make the models, which are all observed at the places of the first one; collective over the group."""
     first, *others = specs
-    model = specs[first].build(ensemble.group, inputs[first].names)
+    model: Any = specs[first].build(ensemble.group, inputs[first].names)
     values = values_of(specs[first], model)
     recorders: dict[str, Recorder] = {}
 
     def made(name: str) -> ForwardModel:
-        other = specs[name].build(ensemble.group, inputs[name].names)
-        if isinstance(specs[name], Specimen) and isinstance(specs[first], Specimen):
-            of = cast("SpecimenModel", model)
-            return cast("SpecimenModel", other).observing(of.places, of.axes.tolist(), of.cases.tolist())
-        if other.outputs != model.outputs:
+        other: Any = specs[name].build(ensemble.group, inputs[name].names)
+        if specs[name].placed and specs[first].placed:
+            other = other.observing(model.places, model.axes.tolist(), model.cases.tolist())
+        elif other.outputs != model.outputs:
             raise ModelError(f"{name} gives {', '.join(other.outputs[:3])}, …, expected the outputs of {first}")
-        return other
+        found: ForwardModel = other
+        return found
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         for name in specs:
@@ -148,7 +147,7 @@ def job_of_models(
 
 
 def _of_field(
-    method: Design, spec: Specimen, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
+    method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
     prior = spec.fields[0].prior(spec.body)
@@ -200,9 +199,9 @@ def uncalibrated(solution: Solution) -> FloatArray | None:
     return None if error is None else error.outputs
 
 
-def values_of(spec: ModelSpec, model: Any) -> Values:
+def values_of(spec: Any, model: Any) -> Values:
     """Say of each output of a model what it is and where it is measured."""
-    if not isinstance(spec, Specimen):
+    if not spec.placed:
         return of_outputs(spec)
     cases = [spec.cases[number] for number in model.cases]
     parts = [
@@ -218,7 +217,7 @@ def values_of(spec: ModelSpec, model: Any) -> Values:
 def files(spec: ModelSpec, found: xr.Dataset) -> dict[str, str]:
     """Return a table of the chosen observations, and of a specimen what other studies take, by their names."""
     texts = {"design.csv": _table(found)}
-    if isinstance(spec, Specimen):
+    if spec.placed:
         lines = "".join(f"    {_inline(block)},\n" for block in observed(found))
         texts["observed.toml"] = f"# What was chosen, for the block [model] of a specimen.\nobserved = [\n{lines}]\n"
         texts["observed.csv"] = _form(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from pydantic import ValidationError
 
@@ -18,12 +18,10 @@ from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
-    from forward.hyperelastic import Hyperelastic
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -156,7 +154,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             yield from self._of_specimen()
         else:
             yield from self._of_outputs()
-            yield from cast("MeasuredOutputs", self.data).mistakes(self.model)
+            yield from self.data.mistakes(self.model)
         if self.method.reduced is not None:
             yield from self._of_reduced(self.method.reduced)
         if self.method.chains is not None:
@@ -217,7 +215,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
                 message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
                 yield (*place, "file"), message, given.file
                 return
-            bodies = {case.name: self.specimen.loaded(case) for case in self.specimen.cases}
+            bodies: dict[str, Any] = {case.name: self.specimen.loaded(case) for case in self.specimen.cases}
         else:
             if self.method.expansion is not None:
                 message = "stands for the body in place of a reduced model, expected one of both"
@@ -229,7 +227,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
                 message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
                 yield place, message, given.file
                 return
-            bodies = {"": cast("Hyperelastic", self.spec)}
+            bodies = {"": self.spec}
         try:
             found = self.reduced
         except ValidationError as error:

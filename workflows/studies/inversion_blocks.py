@@ -85,9 +85,9 @@ class InversionBlocks(OneModel):
     # --- the model ---------------------------------------------------------------------------------------------------
 
     @property
-    def specimen(self) -> Specimen | None:
-        """The model, if it is a specimen, of which displacements were measured."""
-        return self.spec if isinstance(self.spec, Specimen) else None
+    def specimen(self) -> Any:
+        """The model, if it is a specimen, of which displacements were measured; else None."""
+        return self.spec if self.spec.placed else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,7 +102,7 @@ class InversionBlocks(OneModel):
         """The model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
         asked = self.predict
         assert asked is not None
-        if isinstance(self.model, Specimen):
+        if self.model.placed:
             own = self.model.over(ranges(self.parameters))
             known = {case.name: case for case in own.cases}
             cases = tuple(_acting(case, known) for case in asked.cases) or own.cases

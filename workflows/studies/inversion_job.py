@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from workflows.studies.findings_inversion import judged
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
-from workflows.studies.measured import motion_of
+from workflows.studies.measured import motion_of, observing
 from workflows.studies.predictions import FINER, finer_meshes, has_mesh
 from workflows.studies.solves import of_answers
 
@@ -34,10 +34,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.finer import FinerMeshes
-    from forward.fem.specimen import SpecimenModel
-    from forward.hyperelastic import Hyperelastic
     from forward.joined_models import JoinedMeshes
-    from forward.specimen import Specimen
     from inverse.data.shared_motion import SharedMotion
     from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
@@ -108,20 +105,20 @@ def _outputs(study: InversionBlocks, ensemble: Ensemble) -> _Made:
     return _Made(model, lambda number: _Observed(model, there))
 
 
-def _specimen(study: InversionBlocks, spec: Specimen, ensemble: Ensemble) -> _Made:
+def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
-    model: SpecimenModel = spec.build(ensemble.group, names)
+    model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
     meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean)
 
     def look(points: FloatArray) -> FloatArray:
-        return study.stiffness(vertices[0], points) + model.log_fields(points)
+        return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
 
     def observed(number: int) -> _Observed:
         data = study.measured(number)
         try:
-            own = model.observing(data.places, data.axes, data.cases, data.along)
+            own = observing(model, data)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
         there = None if meshes is None else meshes.of(own)
@@ -302,7 +299,7 @@ def _inverting_field(
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
 
-    model = cast("SpecimenModel", made.model)
+    model: Any = made.model
     prior = study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
     predicting: FieldPredictions | None = None
@@ -326,7 +323,7 @@ def _predicted(study: InversionBlocks, ensemble: Ensemble) -> ForwardModel:
     return study.predicted.build(ensemble.group, study.acting)
 
 
-def _reduced(study: InversionBlocks) -> Callable[[ForwardModel], ForwardModel] | None:
+def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel] | None:
     """Load what stands for a model with which data are compared; None where that is asked itself.
 
     What it returns is collective over the ranks of that model.
@@ -334,7 +331,7 @@ def _reduced(study: InversionBlocks) -> Callable[[ForwardModel], ForwardModel] |
     if study.method.reduced is None:
         return None
     if study.specimen is None:
-        alone: ForwardModel = study.reduced[""].standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
+        alone: ForwardModel = study.reduced[""].standing_for(study.spec, study.inputs.names)
         return lambda observed: alone
     bodies = [study.specimen.loaded(case) for case in study.specimen.cases]
     acting = [tuple(p for p in study.inputs.names if p in {*one.scalars, *one.coefficients}) for one in bodies]
@@ -342,7 +339,7 @@ def _reduced(study: InversionBlocks) -> Callable[[ForwardModel], ForwardModel] |
     models = tuple(one.standing_for(body, paths) for one, body, paths in found)
     from forward.reduced.model import observed_by
 
-    return lambda observed: observed_by(cast("SpecimenModel", observed), models)
+    return lambda observed: observed_by(observed, models)
 
 
 def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from forward.bodies.geometry import AXES, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
+from forward.combine import selected
 from forward.files import meshes
 from forward.settings import Settings, one_line
 from forward.spec import SPECIMEN, usual_kind
@@ -31,7 +32,9 @@ from workflows.config.mistakes import StudyError, lines
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
-    from forward.model import FloatArray
+    from forward.model import FloatArray, ForwardModel
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec
     from forward.specimen import Specimen
     from inverse.data.shared_motion import SharedMotion
 
@@ -120,7 +123,11 @@ class DataFiles(Reading):
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
 
-    def read(self, folder: Path, model: Specimen) -> Found:
+    def mistakes(self, model: ModelSpec) -> Iterator[Mistake]:
+        """Find names that are none of a model: files have them, and say so when they are read."""
+        yield from ()
+
+    def read(self, folder: Path, model: Any) -> Found:
         """Read the files, in a folder or in the working directory, of displacements of a specimen.
 
         Raises
@@ -155,7 +162,7 @@ class DisplacementFile(Reading):
     digest: str = ""
     source: tuple[str, ...] = ()
 
-    def read(self, folder: Path, specimen: Specimen) -> Measurements:
+    def read(self, folder: Path, specimen: Any) -> Measurements:
         """Read the file; a DataError if it cannot be used."""
         return read_on(folder / self.file, specimen, self)
 
@@ -238,6 +245,20 @@ def motion_of(found: Measurements, body: Body) -> SharedMotion | None:
     from inverse.data.shared_motion import SharedMotion
 
     return SharedMotion.of(found, onto(body) if found.on_surface else None)
+
+
+def observing(model: Any, data: Measurements) -> ForwardModel:
+    """Return what data are compared with: some outputs of a model, or what a specimen shows where they are; collective.
+
+    Raises
+    ------
+    ValueError
+        If a place is farther from the mesh than the mesh can be from the body.
+    """
+    if data.some:
+        return selected(model, tuple(model.outputs.index(name) for name in data.names))
+    found: ForwardModel = model.observing(data.places, data.axes, data.cases, data.along)
+    return found
 
 
 def onto(body: Body) -> Callable[[FloatArray], FloatArray]:

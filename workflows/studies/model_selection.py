@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from forward.combine import selected
 from forward.fem.finer import finer
 from forward.findings import Finding
 from forward.model import ForwardModel
 from forward.scalars import Mistake
 from forward.settings import one_line, shown
 from forward.spec import ModelSpec
-from forward.specimen import Specimen
 from forward.words import named
 from inverse.criticism.comparison import Candidate
 from inverse.criticism.doubts import not_estimable
@@ -29,14 +27,13 @@ from workflows.config.mistakes import StudyError, refused
 from workflows.config.priors import ranges
 from workflows.studies.candidates import OfCandidates, changed, spec_of
 from workflows.studies.material_tests import WHOLE, expanded
-from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of
+from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of, observing
 from workflows.studies.measured_outputs import OutputFile
 from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
 from workflows.studies.selection import Comparison, Selection
 from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
-    from forward.fem.specimen import SpecimenModel
     from inverse.data.shared_motion import SharedMotion
 
 SECONDS = 1e-3  # of a solve about which nothing is known
@@ -88,7 +85,7 @@ class ModelSelection(OfCandidates, Comparison):
         if self.data.digest:
             return self
         try:
-            found = self.data.read(folder, cast("Any", next(iter(self.of_candidates.values()))))
+            found = self.data.read(folder, next(iter(self.of_candidates.values())))
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         source = (*found.source, *(f"truth: {name} = {value}" for name, value in found.truth.items()))
@@ -104,9 +101,9 @@ class ModelSelection(OfCandidates, Comparison):
 
         Forms differ a little on a mesh: if one specimen needs pressures, all that can have them do.
         """
-        given = {name: spec_of(changed(self.model, one.model)) for name, one in self.candidates.items()}
+        given: dict[str, Any] = {name: spec_of(changed(self.model, one.model)) for name, one in self.candidates.items()}
         of_inputs = {name: ranges(one.parameters) for name, one in self.candidates.items()}
-        free = {name: one for name, one in given.items() if isinstance(one, Specimen) and one.formulation == "auto"}
+        free = {name: one for name, one in given.items() if one.placed and one.formulation == "auto"}
         mixed = {name: one for name, one in free.items() if one.mixable}
         if not any(one.decision(of_inputs[name]).mixed for name, one in free.items()):
             mixed = {}
@@ -189,15 +186,15 @@ class ModelSelection(OfCandidates, Comparison):
                 seconds += SECONDS * solves
                 continue
             derivatives = cost.tangents_of_sample(len(self.candidates[name].parameters))
-            seconds += self.searches(name) * (cost.textbook if isinstance(spec, Specimen) else cost.sample)
+            seconds += self.searches(name) * (cost.textbook if spec.placed else cost.sample)
             seconds += self.method.samples * cost.sample + solves * derivatives
         return seconds * self.evidences / len(self.of_candidates)
 
     def described(self, name: str) -> str:
         """A candidate in words: of a specimen its material and mesh."""
-        spec = self.of_candidates[name]
-        if not isinstance(spec, Specimen):
-            return spec.description
+        spec: Any = self.of_candidates[name]
+        if not spec.placed:
+            return str(spec.description)
         body, loaded = spec.body, spec.loaded(spec.cases[0])
         mixed = ", mixed" if loaded.mixed else ""
         return f"{loaded.energy} on {body.cells_in_words} cells ({body.cell}, degree {body.degree}{mixed})"
@@ -205,17 +202,19 @@ class ModelSelection(OfCandidates, Comparison):
     def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
         """Make the model of a candidate; collective."""
         spec = self.of_candidates[name]
-        model, found = spec.build(comm, tuple(self.candidates[name].parameters)), self.measurements
-        if found.some:
-            derivable(model, spec.kind)
-            return selected(model, tuple(model.outputs.index(output) for output in found.names))
-        found = found.in_model(cast("Specimen", spec).observable)
-        return cast("SpecimenModel", model).observing(found.places, found.axes, found.cases, found.along)
+        model = spec.build(comm, tuple(self.candidates[name].parameters))
+        derivable(model, spec.kind)
+        return observing(model, self._data_of(spec))
+
+    def _data_of(self, spec: Any) -> Measurements:
+        """Return the data as a candidate numbers what it has in its load cases."""
+        found: Measurements = self.measurements
+        return found if found.some else found.in_model(spec.observable)
 
     def shared(self, name: str, group: str) -> SharedMotion | None:
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
-        spec, found = cast("Specimen", self.of_candidates[name]), self.measurements
-        return None if found.some else motion_of(found.in_model(spec.observable), spec.body)
+        spec: Any = self.of_candidates[name]
+        return None if self.measurements.some else motion_of(self._data_of(spec), spec.body)
 
     @model_validator(mode="before")
     @classmethod
@@ -240,6 +239,7 @@ class ModelSelection(OfCandidates, Comparison):
     def _unobserved(self) -> Iterator[Mistake]:
         """Find what candidates do not have of what was measured."""
         found = self.measurements
+        spec: Any
         for name, spec in self.of_candidates.items():
             place = ("candidates", name, "model")
             if found.some:
@@ -247,7 +247,7 @@ class ModelSelection(OfCandidates, Comparison):
                 lost = next((output for output in found.names.tolist() if output not in known), None)
                 if lost is not None:
                     yield (*place, "outputs"), f"no output '{lost}', of which there are data", known
-            elif isinstance(spec, Specimen):
+            elif spec.placed:
                 has = spec.observable
                 pairs = dict.fromkeys(zip(found.tests.tolist(), found.names.tolist(), strict=True))
                 case, what = next(((one, what) for one, what in pairs if what not in has.get(one, ())), ("", ""))

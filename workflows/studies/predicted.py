@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import Specimen, in_words, shared_paths
+from forward.specimen import in_words, shared_paths
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.scalars import Mistake
-    from forward.spec import ModelSpec
     from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
@@ -43,7 +42,7 @@ LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 
 def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
     """Find what cannot be predicted."""
-    asked, specimen = study.predict, isinstance(study.model, Specimen)
+    asked, specimen = study.predict, study.model.placed
     assert asked is not None
     if specimen and asked.model:
         message = "a specimen is predicted in load cases and at places, expected predict.cases and predict.observed"
@@ -81,9 +80,9 @@ def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
         yield ("predict",), f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted", {}
 
 
-def _of_shared_paths(measured: ModelSpec, made: ModelSpec, unknown: tuple[str, ...]) -> Iterator[Mistake]:
+def _of_shared_paths(measured: Any, made: Any, unknown: tuple[str, ...]) -> Iterator[Mistake]:
     """Find unknowns that would give what is predicted another load than it states."""
-    if not (isinstance(measured, Specimen) and isinstance(made, Specimen)):
+    if not (measured.placed and made.placed):
         return
     there = [case.model_copy(update={"name": f"what is predicted in {case.name}"}) for case in made.cases]
     for path, values in shared_paths([*measured.cases, *there]).items():

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -34,7 +34,7 @@ from workflows.studies.job import Job, MethodJob
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-    from forward.model import FloatArray, ForwardModel, Solution
+    from forward.model import FloatArray, Solution
     from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
 
@@ -139,15 +139,15 @@ class KeptStates:
 
     spread: FloatArray | None
 
-    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+    def on(self, model: Any) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → rows (1 + m + k, U_local)."""
-        spread, body = self.spread, cast("HyperelasticModel", model)
+        spread = self.spread
         if spread is None:
             return lambda solution, _: np.asarray(solution.state)[None]
 
         def rows(solution: Solution, point: FloatArray) -> FloatArray:
             tangents = solution.state_tangent(directions(spread, point))
-            return np.vstack([solution.state, adjoint_states(body, solution), tangents])
+            return np.vstack([solution.state, adjoint_states(model, solution), tangents])
 
         return rows
 
@@ -160,9 +160,9 @@ class KeptStates:
         return rows
 
 
-def job(method: Reduce, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, directory: Path) -> Job:
+def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: Path) -> Job:
     """Make the body on every group; collective over the group."""
-    model = cast("HyperelasticModel", spec.build(ensemble.group, inputs.names))
+    model: HyperelasticModel = spec.build(ensemble.group, inputs.names)
     recorders: dict[str, Recorder] = {}
     told: dict[str, Any] = {}
 
@@ -171,7 +171,8 @@ def job(method: Reduce, spec: ModelSpec, inputs: Inputs, ensemble: Ensemble, dir
 
         if ensemble.group.size == 1:
             return model
-        return cast("HyperelasticModel", spec.build(MPI.COMM_SELF, inputs.names))
+        made: HyperelasticModel = spec.build(MPI.COMM_SELF, inputs.names)
+        return made
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)

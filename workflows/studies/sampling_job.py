@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
 
         return MethodJob(function, others, task, recorders, labelled=described, told=told)
 
-    model = cast("HyperelasticModel", function)
+    model: Any = function
     # Rank 0 may leave the task by an exception: nothing collective may follow it.
     cells, kind = model.space.cells()
     regions = model.space.regions()

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.spec import MEASURED, ModelSpec
-from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
 from workflows.config.one_model import OneModel
@@ -64,7 +63,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is made, and how long that will take."""
         sets, cost = len(self.method.fraction), self.spec.cost()
-        names = [] if isinstance(self.model, Specimen) else [output.name for output in self.model.returned]
+        names = [] if self.model.placed else [output.name for output in self.model.returned]
         return [
             f"method      {self.method.kind}",
             *(f"{what:10}  {found}" for what, found in self.model.described(ranges(self.parameters))),
@@ -76,7 +75,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
         """Make the model; collective."""
         model = self.spec.build(ensemble.group, self.inputs.names)
-        if isinstance(self.model, Specimen):
+        if self.model.placed:
             of_specimen = named("workflows.studies.synthetic_displacements:displacements")
             made: Synthetic = of_specimen(self.model, self.method, self.inputs, model, ensemble)
         else:
@@ -95,7 +94,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
-        if isinstance(self.model, Specimen):
+        if self.model.placed:
             yield from self._mistakes_of_specimen(self.model)
         yield from self.model.mistakes_of_mesh()
         for i in self.nodal:
@@ -103,7 +102,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
             yield ("model", "fields", i, "basis"), message, "nodes"
         yield from self.mistakes_of_parameters()
 
-    def _mistakes_of_specimen(self, model: Specimen) -> Iterator[Mistake]:
+    def _mistakes_of_specimen(self, model: Any) -> Iterator[Mistake]:
         method = self.method
         if not model.observed and not any(case.outputs for case in model.cases):
             message = "nothing is observed, expected boundaries or points, or outputs of load cases"
