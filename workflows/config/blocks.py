@@ -87,7 +87,9 @@ class Report(Settings):
 
 def located(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the blocks of a study with the folder of its sections, which it names relative to its own."""
-    block = blocks.get("report")
-    if not isinstance(block, Mapping) or not isinstance(place := block.get("folder", ""), str):
-        return dict(blocks)
-    return {**blocks, "report": {**block, "folder": str((folder / place).resolve())}}
+    match blocks.get("report"):
+        case {"folder": str(place), **rest}:
+            return {**blocks, "report": {**rest, "folder": str((folder / place).resolve())}}
+        case {**block} if "folder" not in block:
+            return {**blocks, "report": {**block, "folder": str(folder.resolve())}}
+    return dict(blocks)

@@ -13,6 +13,7 @@ from forward.settings import Settings, nearest
 from workflows.config.blocks import AVERAGED, KEPT, STACKED
 from workflows.config.one_model import OneModel
 from workflows.config.priors import findings_of_impossible
+from workflows.config.tables import at
 
 if TYPE_CHECKING:
     from forward.scalars import Mistake, Scalar
@@ -23,9 +24,7 @@ if TYPE_CHECKING:
 
 def averages(blocks: Mapping[str, Any]) -> bool:
     """Whether the source that stands among the parameters of a study means all candidates of a comparison."""
-    parameters = blocks.get("parameters")
-    source = parameters.get("from") if isinstance(parameters, Mapping) else None
-    return isinstance(source, Mapping) and source.get("model") in (AVERAGED, STACKED)
+    return at(blocks, "parameters", "from", "model") in (AVERAGED, STACKED)
 
 
 class Source(Settings):
@@ -232,8 +231,8 @@ class Sourced(OneModel):
     @classmethod
     def _take_source(cls, value: Any) -> Any:
         """Take the source from among the parameters."""
-        parameters = value.get("parameters") if isinstance(value, dict) else None
-        if not isinstance(parameters, dict) or "from" not in parameters:
+        source = at(value, "parameters", "from")
+        if source is None:
             return value
-        rest = {path: block for path, block in parameters.items() if path != "from"}
-        return value | {"parameters": rest, "source": parameters["from"]}
+        rest = {path: block for path, block in value["parameters"].items() if path != "from"}
+        return value | {"parameters": rest, "source": source}

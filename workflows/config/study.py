@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
@@ -17,6 +17,7 @@ from uq.methods.method import METHODS
 from workflows.config.blocks import AVERAGED, KEPT, located
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.source import Sourced, averages
+from workflows.config.tables import EACH, at, changed, deeper_than, leaves
 from workflows.studies.study import SAMPLING, STUDIES, UNNAMED, WITHOUT_EFFECT, StudyKind
 
 _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
@@ -24,7 +25,6 @@ DEEPEST = 32  # levels of lists and tables in a study
 LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smallest is one over the first
 MOST_LINES = 50
 REDUCED = "reduced"  # the kind of a model that is a file
-EACH = "*"  # element of a list, on a way of keys
 _OPTIONS = "model.config"  # of another program's model, of which nothing is known
 
 
@@ -50,9 +50,9 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     blocks = dict(document)
     for assignment in overrides:
         _override(blocks, assignment)
-    if _deeper_than(blocks, DEEPEST):
+    if deeper_than(blocks, DEEPEST):
         raise StudyError(f"lists and tables are nested too deeply, expected at most {DEEPEST} levels")
-    beyond = [f"{place}: {why}" for place, value in _leaves(blocks) for why in _beyond(place, value)]
+    beyond = [f"{place}: {why}" for place, value in leaves(blocks) for why in _beyond(place, value)]
     if beyond:
         raise StudyError(*beyond[:MOST_LINES])
     modules = list(dict.fromkeys(dotted(blocks)))
@@ -62,37 +62,28 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         make_visible(modules, [folder.resolve(), Path.cwd()], "kind")
     try:
         blocks = located(_located(blocks, folder), folder)
-        method = blocks.get("method")
-        kind = method.get("kind") if isinstance(method, Mapping) else None
-        another = isinstance(kind, str) and kind not in METHODS.own and kind in STUDIES
-        usual = AVERAGED if averages(blocks) else SAMPLING
-        found: StudyKind = STUDIES[str(kind) if another else usual].made(blocks, folder)
+        kind, usual = str(at(blocks, "method", "kind")), AVERAGED if averages(blocks) else SAMPLING
+        another = kind not in METHODS.own and kind in STUDIES
+        found: StudyKind = STUDIES[kind if another else usual].made(blocks, folder)
     except ValidationError as error:
         apart = [kind for kind in STUDIES.own if kind not in UNNAMED]
         raise StudyError(*lines(error, apart=apart)) from None
     return found
 
 
-def _deeper_than(tree: Any, most: int) -> bool:
-    """Whether lists and tables are nested more deeply than this."""
-    level = [tree]
-    for _ in range(most):
-        level = [item for one in level for item in (one.values() if isinstance(one, dict) else one)]
-        level = [item for item in level if isinstance(item, dict | list)]
-    return bool(level)
-
-
 def _beyond(place: str, value: Any) -> Iterator[str]:
     """Say of a number, or of those in a list, that it cannot be calculated with: its square may be none."""
     if place.startswith(_OPTIONS):
         return
-    if isinstance(value, list):
-        for item in value:
-            yield from _beyond(place, item)
-    elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-        yield f"an integer of {value.bit_length()} bits, expected at most 63"
-    elif isinstance(value, float) and 0 < abs(value) < math.inf and not 1 / LARGEST <= abs(value) <= LARGEST:
-        yield f"{value:g} is too {'large' if abs(value) > 1 else 'small'}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}"
+    match value:
+        case [*items]:
+            for item in items:
+                yield from _beyond(place, item)
+        case int() if abs(value) > LARGEST_INTEGER:
+            yield f"an integer of {value.bit_length()} bits, expected at most 63"
+        case float() if 0 < abs(value) < math.inf and not 1 / LARGEST <= abs(value) <= LARGEST:
+            size = "large" if abs(value) > 1 else "small"
+            yield f"{value:g} is too {size}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}"
 
 
 def _located(blocks: Any, folder: Path) -> dict[str, Any]:
@@ -101,28 +92,30 @@ def _located(blocks: Any, folder: Path) -> dict[str, Any]:
     What is not a mesh may be in the working directory too.
     """
 
+    def beside(file: Any) -> Any:
+        """A file beside a study or in the working directory, or each of several by name."""
+        match file:
+            case str():
+                place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+                return str(place.resolve())
+            case {**files}:
+                return {name: beside(one) for name, one in files.items()}
+            case _:
+                return file
+
     def in_block(given: Any) -> Any:
         return {"file": given} if isinstance(given, str) else given
 
-    def beside(file: Any) -> Any:
-        """A file beside a study or in the working directory, or each of several by name."""
-        if isinstance(file, Mapping):
-            return {name: beside(one) for name, one in file.items()}
-        if not isinstance(file, str):
-            return file
-        place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
-        return str(place.resolve())
-
     def of_draws(block: Any) -> Any:
         """In the directory of results that were begun with them, draws are kept."""
-        kept = isinstance(block, Mapping) and block.get("digest") and (folder / KEPT).exists()
-        return _changed(block, ("file",), lambda file: str((folder / KEPT).resolve()) if kept else beside(file))
+        kept = at(block, "digest") and (folder / KEPT).exists()
+        return changed(block, ("file",), lambda file: str((folder / KEPT).resolve()) if kept else beside(file))
 
     def of_model(model: Any) -> Any:
-        if isinstance(model, Mapping) and model.get("kind") == REDUCED:
-            return _changed(model, ("file",), beside)
+        if at(model, "kind") == REDUCED:
+            return changed(model, ("file",), beside)
         mesh = ("body", "file")
-        return _changed(model, mesh, lambda file: str((folder / file).resolve()) if isinstance(file, str) else file)
+        return changed(model, mesh, lambda file: str((folder / file).resolve()) if isinstance(file, str) else file)
 
     for way, change in (
         (("method", "source"), beside),
@@ -135,20 +128,8 @@ def _located(blocks: Any, folder: Path) -> dict[str, Any]:
         (("method", "cheap", EACH, "model"), of_model),
         (("model",), of_model),
     ):
-        blocks = _changed(blocks, way, change)
+        blocks = changed(blocks, way, change)
     return dict(blocks)
-
-
-def _changed(blocks: Any, way: Sequence[str], change: Callable[[Any], Any]) -> Any:
-    """Return a table in which what stands at a way of keys, if anything does, is changed."""
-    if not way:
-        return change(blocks)
-    key, *rest = way
-    if key == EACH:
-        return [_changed(one, rest, change) for one in blocks] if isinstance(blocks, list) else blocks
-    if not isinstance(blocks, Mapping) or key not in blocks:
-        return blocks
-    return {**blocks, key: _changed(blocks[key], rest, change)}
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
@@ -158,8 +139,7 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
 
 def kind_of(path: Path) -> str:
     """Return the kind of the method of a study in a TOML file; empty without one."""
-    method = _document(path).get("method")
-    return str(method.get("kind", "")) if isinstance(method, Mapping) else ""
+    return str(at(_document(path), "method", "kind") or "")
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -227,7 +207,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
     Blocks on which results do not depend do not count, nor does the path of a mesh, as long as the mesh is the same.
     """
-    before, after = (dict(_leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
+    before, after = (dict(leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
     for digest, file in _FILES.items():
         for place in [one for one in before if one == digest or one.startswith(f"{digest}.")]:
             if before[place] == after.get(place):
@@ -251,17 +231,6 @@ _FILES = {
     "method.reduced.digest": "method.reduced.file",
     "parameters.from.digest": "parameters.from.file",
 }
-
-
-def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, f"{place}.{key}" if place else key)
-    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
-        for i, item in enumerate(value):
-            yield from _leaves(item, f"{place}[{i}]")
-    else:
-        yield place, value
 
 
 def _override(blocks: dict[str, Any], assignment: str) -> None:

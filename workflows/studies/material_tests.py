@@ -13,6 +13,7 @@ from forward.settings import Settings, nearest
 from inverse.data.reader import AnyReader, table_of
 from inverse.data.table import DataError, Table, needed
 from workflows.config.mistakes import StudyError, lines
+from workflows.config.tables import at
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
@@ -250,11 +251,10 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     StudyError
         If that cannot be done.
     """
-    data = document.get("data")
-    if not isinstance(data, Mapping) or "file" not in data:
+    if at(document, "data", "file") is None:
         return dict(document)
     try:
-        table = DataFile.model_validate(dict(data))
+        table = DataFile.model_validate(dict(document["data"]))
     except ValidationError as error:
         raise StudyError(*lines(error, "data")) from None
     return {**document, "data": table.read(folder)}

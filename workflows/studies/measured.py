@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -29,6 +29,7 @@ from inverse.data.registration import ToSurface, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
+from workflows.config.tables import at
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
@@ -73,7 +74,7 @@ class _Given:
 
 def data_as(blocks: Any, of_specimen: type[Settings], of_outputs: type[Settings]) -> Any:
     """Return the blocks of a study whose `data`, if it is a table, is of the block that the model decides on."""
-    data = blocks.get("data") if isinstance(blocks, Mapping) else None
+    data = at(blocks, "data")
     if data is None or isinstance(data, Settings):
         return blocks
     block = of_specimen if usual_kind(blocks.get("model")) == SPECIMEN else of_outputs

@@ -25,6 +25,7 @@ from inverse.methods.invert import derivable
 from inverse.methods.selection import SelectSpecimens
 from workflows.config.mistakes import StudyError, refused
 from workflows.config.priors import ranges
+from workflows.config.tables import at
 from workflows.studies.candidates import OfCandidates, changed, spec_of
 from workflows.studies.material_tests import WHOLE, expanded
 from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of, observing
@@ -220,9 +221,9 @@ class ModelSelection(OfCandidates, Comparison):
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
-        data = blocks.get("data") if isinstance(blocks, Mapping) else None
-        if isinstance(data, Mapping) and "measured" in data:  # results of earlier versions hold all numbers
-            blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": data.get("source", ())}}
+        if at(blocks, "data", "measured") is not None:  # results of earlier versions hold all numbers
+            source = blocks["data"].get("source", ())
+            blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": source}}
         return data_as(blocks, DisplacementFile, OutputFile)
 
     def mistakes(self) -> Iterator[Mistake]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from forward.findings import Finding
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
+from workflows.config.tables import at
 from workflows.studies.predictions import duration, times_of
 from workflows.studies.reduction_job import Reduce, job
 from workflows.studies.sampling import Study
@@ -88,9 +89,9 @@ def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
     StudyError
         If the case is not one of the specimen's.
     """
-    model, method = blocks.get("model"), blocks.get("method")
-    if not isinstance(model, Mapping) or model.get("kind") != "specimen" or not isinstance(method, Mapping):
+    if at(blocks, "model", "kind") != "specimen" or at(blocks, "method", "kind") is None:
         return blocks
+    model, method = blocks["model"], blocks["method"]
     from forward.specimen import Specimen
 
     specimen = Specimen.model_validate(model)

@@ -16,6 +16,7 @@ from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
 from workflows.config.blocks import Accuracy
 from workflows.config.priors import findings_of_draws, inputs_of, ranges
+from workflows.config.tables import at
 from workflows.run.from_python import FromPython
 from workflows.studies.sampling_blocks import SamplingBlocks
 from workflows.studies.study import Sampled, StudyKind
@@ -153,25 +154,22 @@ class Study(SamplingBlocks, FromPython, StudyKind):
     @classmethod
     def _choose_method(cls, value: Any) -> Any:
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
-        accuracy = value.get("accuracy") if isinstance(value, dict) else None
-        asked = isinstance(accuracy, dict | Accuracy) and "tolerance" in dict(accuracy)
-        if not asked:
-            return value
-        from workflows.studies import tolerance_asked
+        match at(value, "accuracy"):
+            case Accuracy() | {"tolerance": _}:
+                from workflows.studies import tolerance_asked
 
-        return tolerance_asked.completed(value)
+                return tolerance_asked.completed(value)
+            case _:
+                return value
 
     @model_validator(mode="before")
     @classmethod
     def _gather_accuracy(cls, value: Any) -> Any:
         """Take `mesh_error` from beside the blocks into its own, unless that says it too."""
-        if not isinstance(value, dict) or "mesh_error" not in value:
-            return value
-        accuracy = value.get("accuracy", {})
-        if not isinstance(accuracy, dict) or "mesh_error" in accuracy:
-            return value
-        rest = {name: block for name, block in value.items() if name != "mesh_error"}
-        return rest | {"accuracy": accuracy | {"mesh_error": value["mesh_error"]}}
+        match {"accuracy": {}} | value:
+            case {"mesh_error": asked, "accuracy": {**block}, **rest} if "mesh_error" not in block:
+                return rest | {"accuracy": block | {"mesh_error": asked}}
+        return value
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
