@@ -275,3 +275,8 @@ def write_whole(path: Path, data: bytes) -> None:
         remedy = "there is room" if error.errno in FULL else "that is mended"
         message = f"{path}: cannot be written: {error.strerror}; the same command continues once {remedy}"
         raise StopError(message) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text, as `write_whole` does."""
+    write_whole(path, text.encode())

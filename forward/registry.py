@@ -237,6 +237,7 @@ class OfKind:
 
 def _with_reference(block: type[Settings]) -> core_schema.CoreSchema:
     """Return the schema of a block as a separate definition of a JSON Schema, to which others refer."""
+    block.model_rebuild()  # where nothing was checked yet
     found: core_schema.CoreSchema = block.__pydantic_core_schema__
     name = found.get("ref")
     if not isinstance(name, str):

@@ -14,6 +14,7 @@ from typing import NoReturn
 from pydantic import ValidationError
 
 from forward.external.own_modules import OwnCodeError, installed_only, refused
+from forward.machine import write_text
 from forward.readable import size
 from forward.settings import one_line
 from forward.words import NONE, duration
@@ -23,7 +24,7 @@ from workflows.config.study import parse
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.section import SECTIONS, Results, Section, sections
-from workflows.results.directory import read_dataset, read_summary, write_text
+from workflows.results.directory import read_dataset, read_summary
 from workflows.run import own_code
 
 HERE = Path(__file__).parent

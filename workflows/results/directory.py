@@ -31,11 +31,6 @@ UNITS = {"stress": "Pa", "von_mises": "Pa", "moved": "m", "indicator by volume":
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file under another name and rename it into place."""
-    write_whole(path, text.encode())
-
-
 def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
     """Write a netCDF-4 file, with groups, and rename it into place; equal datasets give equal bytes."""
     from uq.evaluation.hdf5 import netcdf

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from forward.external.own_modules import Loaded, Sources, other_code, search, sources
+from forward.machine import write_text
 from forward.registry import dotted, installed
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document
-from workflows.results.directory import write_text
 from workflows.run.version import version
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import Loaded
-from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_whole
+from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from uq.evaluation.request import Evaluations
 from uq.findings import add
@@ -31,7 +31,6 @@ from workflows.results.directory import (
     with_norms,
     write_dataset,
     write_fields,
-    write_text,
 )
 from workflows.run import own_code
 from workflows.run.closing import closing_words

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.findings import Finding
-from forward.machine import write_whole
+from forward.machine import write_text, write_whole
 from forward.registry import named
 from uq.estimators.estimate import part
 from uq.findings import add
-from workflows.results.directory import write_text
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.finer import Finer
 from inverse.methods.invert import derivable
@@ -21,7 +22,6 @@ from uq.evaluation.kept import Kept, KeptModel
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
-from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.adapt import OF_ROUNDING, Adapt
-from forward.machine import MIB, StopError
+from forward.machine import MIB, StopError, write_text
 from forward.model import FloatArray, SolveError
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
@@ -34,7 +34,6 @@ from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from workflows.results.directory import write_text
 from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
