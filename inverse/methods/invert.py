@@ -39,9 +39,19 @@ class ByReduced(Settings):
     digest: str | dict[str, str] | None = None
 
     @property
+    def by_case(self) -> dict[str, str]:
+        """The files by load case; of a body alone, as ""."""
+        return self.file if isinstance(self.file, dict) else {"": self.file}
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """The hashes by load case, as far as they are known."""
+        return self.digest if isinstance(self.digest, dict) else {} if self.digest is None else {"": self.digest}
+
+    @property
     def files(self) -> str:
         """The file, or all of them."""
-        return self.file if isinstance(self.file, str) else ", ".join(self.file.values())
+        return ", ".join(self.by_case.values())
 
 
 class Invert(MeshTreatment, Settings):

@@ -210,7 +210,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             yield place, message, given.files
             return
         if self.specimen is not None:
-            if not isinstance(given.file, dict) or set(given.file) != set(self.parts):
+            if set(given.by_case) != set(self.parts):
                 example = ", ".join(f'{name} = "FILE"' for name in self.parts)
                 message = f"a specimen has a reduced model for each load case, expected file = {{ {example} }}"
                 yield (*place, "file"), message, given.file
@@ -220,7 +220,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             if self.method.expansion is not None:
                 message = "stands for the body in place of a reduced model, expected one of both"
                 yield ("method", "expansion"), message, self.method.expansion
-            if not isinstance(given.file, str):
+            if set(given.by_case) != {""}:
                 yield (*place, "file"), "a body has one reduced model, expected a file", given.files
                 return
             if self.model.kind != "hyperelastic":
@@ -240,5 +240,4 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             known = {*body.scalars, *body.coefficients}
             acting = [path for path in (*self.parameters, *self.model.coefficients) if path in known]
             for said in found[name].differences(body, acting):
-                where, file = (("file", name), given.file[name]) if isinstance(given.file, dict) else ((), given.file)
-                yield (*place, *where), said, file
+                yield (*place, *(("file", name) if name else ())), said, given.by_case[name]

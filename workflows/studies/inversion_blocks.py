@@ -144,10 +144,9 @@ class InversionBlocks(OneModel):
             return {}
         from forward.reduced.spec import Reduced
 
-        files = asked.file if isinstance(asked.file, dict) else {"": asked.file}
-        digests = asked.digest if isinstance(asked.digest, dict) else {"": asked.digest}
-        names = self.parts if isinstance(asked.file, dict) else ("",)
-        hashes = {name: {} if digests.get(name) is None else {"digest": digests[name]} for name in names}
+        files, digests = asked.by_case, asked.digests
+        names = files if "" in files else self.parts
+        hashes = {name: {"digest": digests[name]} if name in digests else {} for name in names}
         return {name: Reduced.model_validate({"file": files[name], **hashes[name]}) for name in names}
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
@@ -206,12 +205,10 @@ class InversionBlocks(OneModel):
         from forward.reduced.spec import digest_of
 
         try:
-            if isinstance(given.file, str):
-                digest: str | dict[str, str] = digest_of(given.file)
-            else:
-                digest = {name: digest_of(file) for name, file in given.file.items()}
+            digests = {name: digest_of(file) for name, file in given.by_case.items()}
         except ModelError:
             return method
+        digest = digests.get("", digests)
         return method.model_copy(update={"reduced": given.model_copy(update={"digest": digest})})
 
     @model_validator(mode="before")

@@ -185,7 +185,7 @@ class DataFile(Settings):
     @property
     def stresses(self) -> dict[Component, tuple[str, str | None]]:
         """Columns of each stress and of its standard deviation."""
-        measured: dict[Component, str] = {"P1": self.measured} if isinstance(self.measured, str) else self.measured
+        measured = self.measured if isinstance(self.measured, dict) else {COMPONENTS[0]: self.measured}
         sigma = self.sigma if isinstance(self.sigma, dict) else dict.fromkeys(measured, self.sigma)
         return {component: (column, sigma.get(component)) for component, column in measured.items()}
 
