@@ -21,7 +21,7 @@ class Reader(Settings):
         """Return what a file holds as the columns of a table: all of one length, by their names.
 
         Names and units are those of tables (`inverse.data.outputs`, `inverse.data.curves`,
-        `inverse.data.displacement_tables`, `workflows.studies.material_tests`). Cells are numbers or texts; NaN and ""
+        `inverse.data.displacement_tables`, `workflows.data.material_tests`). Cells are numbers or texts; NaN and ""
         are empty. Any exception means that the file cannot be read, and its text is shown.
         """
 

@@ -264,6 +264,14 @@ class Inputs:
             return np.ones(len(points), dtype=bool)
         return np.broadcast_to(self.admissible.admissible(dict(zip(self.names, points.T, strict=True))), len(points))
 
+    def drawn(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw parameters (count, d) at which the model is defined."""
+        kept = np.zeros((0, len(self.names)))
+        while len(kept) < count:
+            points = self.from_normals(rng.standard_normal((count, len(self.names))))[0]
+            kept = np.concatenate([kept, points[self.allowed(points)]])
+        return kept[:count]
+
     @cached_property
     def admitted(self) -> float:
         """Probability of parameters for which the model is defined."""

@@ -44,15 +44,6 @@ def inputs_of(
     return Inputs(own, pairs, materials, draws=draws)
 
 
-def admissible(inputs: Inputs, rng: np.random.Generator, count: int) -> FloatArray:
-    """Draw parameters (count, d) for which there is a model."""
-    kept = np.zeros((0, len(inputs.names)))
-    while len(kept) < count:
-        points = inputs.from_normals(rng.standard_normal((count, len(inputs.names))))[0]
-        kept = np.concatenate([kept, points[inputs.allowed(points)]])
-    return kept[:count]
-
-
 def mistakes_of_draws(
     scalars: Mapping[str, Scalar],
     draws: Draws,

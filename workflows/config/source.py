@@ -67,7 +67,7 @@ class Source(Settings):
     @property
     def read(self) -> Source:
         """The same with the hash of the file as it is; a ValueError says that it has changed, or is none."""
-        from workflows.studies.posteriors import Left
+        from workflows.results.posteriors import Left
 
         found = Left(self.file).digest if self.whole else self.drawn.digest
         if self.digest and found != self.digest:
@@ -77,7 +77,7 @@ class Source(Settings):
     @cached_property
     def drawn(self) -> Draws:
         """The draws, by their names in the source; a ValueError says what is wrong with it."""
-        from workflows.studies.posteriors import read
+        from workflows.results.posteriors import read
 
         return read(self.file, self.group, self.model)
 
@@ -96,7 +96,7 @@ class Source(Settings):
     @property
     def material(self) -> dict[str, Any]:
         """The block of the material that was calibrated, as far as it is known."""
-        from workflows.studies.posteriors import Left
+        from workflows.results.posteriors import Left
 
         left = Left(self.file)
         return left.material(self.model) if left.path.is_dir() else {}
@@ -211,7 +211,7 @@ class Sourced(OneModel):
         """The draws, as they were read."""
         if self.source is None or self.source.whole:
             return {}
-        from workflows.studies.posteriors import to_file
+        from workflows.results.posteriors import to_file
 
         return {KEPT: to_file(self.source.drawn)}
 

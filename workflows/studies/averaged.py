@@ -21,8 +21,8 @@ from uq.findings import add
 from workflows.config.blocks import STACKED
 from workflows.config.mistakes import lines
 from workflows.results.directory import label
+from workflows.results.posteriors import NamedCandidate, candidates, read
 from workflows.studies.job import Job, MethodJob
-from workflows.studies.posteriors import NamedCandidate, candidates, read
 from workflows.studies.sampling import Study
 from workflows.studies.sampling_job import with_errors_of_draws, with_unknown_meshes
 

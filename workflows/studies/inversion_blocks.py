@@ -19,8 +19,8 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Parallel
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
-from workflows.studies.measured import DataFiles, as_block, data_as
-from workflows.studies.measured_outputs import MeasuredOutputs
+from workflows.data.measured import DataFiles, as_block, data_as
+from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:

@@ -22,11 +22,11 @@ from uq.evaluation.kept import Kept, KeptModel
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
+from workflows.data.measured import motion_of, observing
 from workflows.studies.findings_inversion import judged
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
-from workflows.studies.measured import motion_of, observing
 from workflows.studies.predictions import FINER, finer_meshes, has_mesh
 from workflows.studies.solves import of_answers
 

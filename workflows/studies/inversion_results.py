@@ -15,7 +15,6 @@ from forward.bodies.inclusions import derived, log_factor
 from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
-from workflows.config.priors import admissible
 from workflows.results.summary import of_meshes
 from workflows.studies.findings_inversion import judged
 
@@ -175,7 +174,7 @@ def _prior_stiffness_std(study: InversionBlocks, places: FloatArray, prior: Noda
 
 def prior_draws(study: InversionBlocks) -> FloatArray:
     """Prior draws (n, d) of the parameters."""
-    return admissible(study.inputs, np.random.default_rng(study.method.seed), PRIOR_DRAWS)
+    return study.inputs.drawn(np.random.default_rng(study.method.seed), PRIOR_DRAWS)
 
 
 def _true_at(study: InversionBlocks, measurement: Measurements | None, places: FloatArray) -> FloatArray:

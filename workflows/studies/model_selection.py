@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.fem.finer import finer
@@ -23,13 +23,13 @@ from inverse.data.measurements import AXES, Measurements
 from inverse.data.table import DataError
 from inverse.methods.invert import derivable
 from inverse.methods.selection import SelectSpecimens
-from workflows.config.mistakes import StudyError, refused
+from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import ranges
 from workflows.config.tables import at
+from workflows.data.material_tests import WHOLE, DataFile
+from workflows.data.measured import DisplacementFile, as_block, data_as, digest_of, motion_of, observing
+from workflows.data.measured_outputs import OutputFile
 from workflows.studies.candidates import OfCandidates, changed, spec_of
-from workflows.studies.material_tests import WHOLE, expanded
-from workflows.studies.measured import DisplacementFile, as_block, data_as, digest_of, motion_of, observing
-from workflows.studies.measured_outputs import OutputFile
 from workflows.studies.predictions import has_mesh, meshes_of, never_estimable
 from workflows.studies.selection import Comparison, Selection
 from workflows.studies.study import StudyKind, bytes_of
@@ -73,7 +73,7 @@ class ModelSelection(OfCandidates, Comparison):
         if not isinstance(blocks.get("model", {}), Mapping):
             raise StudyError(f"model: expected a table, {{ key = value }}; given {shown(blocks['model'])}")
         if "model" not in blocks:
-            return Selection.model_validate(expanded(blocks, folder))
+            return Selection.model_validate(_expanded(blocks, folder))
         return cls.model_validate(blocks).with_data(folder)
 
     @property
@@ -259,3 +259,15 @@ class ModelSelection(OfCandidates, Comparison):
                     yield (*place, "cases"), message, list(has[case][len(AXES) :])
             else:
                 yield (*place, "kind"), "displacements were measured, expected 'specimen'", spec.kind
+
+
+def _expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a document whose table of tests, if it names one, has been read; a StudyError if that cannot be done."""
+    if at(document, "data", "file") is None:
+        return dict(document)
+    try:
+        return {**document, "data": DataFile.model_validate(dict(document["data"])).read(folder)}
+    except ValidationError as error:
+        raise StudyError(*lines(error, "data")) from None
+    except DataError as error:
+        raise StudyError(*error.args) from None

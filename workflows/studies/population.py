@@ -25,9 +25,9 @@ from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
+from workflows.results.posteriors import Left, draws_in
 from workflows.run.from_python import FromPython
 from workflows.studies.job import Job
-from workflows.studies.posteriors import Left, draws_in
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
 
 def _file(data: dict[str, Any], specimen: str, folder: Path) -> Path:
     """Return the file of a data set, which has to be as it was; errors as of `of_one`."""
-    from workflows.studies.measured import digest_of as digest_of_file
+    from workflows.data.measured import digest_of as digest_of_file
 
     known = {one["name"]: one for one in data.get("sets", [])}
     where = "expected method.study, the file of the study that the source is of"

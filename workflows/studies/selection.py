@@ -17,6 +17,7 @@ from forward.materials.material_point import HomogeneousModel, MaterialTest, unf
 from forward.model import ForwardModel
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
+from inverse.criticism import selected as results
 from inverse.criticism.assessment import NEEDED, own_seconds
 from inverse.criticism.comparison import Candidate
 from inverse.criticism.finer import Finer
@@ -27,11 +28,10 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
+from workflows.data.material_tests import DataFile, MeasuredTest, MeasuredTests
 from workflows.run.from_python import FromPython
-from workflows.studies import selection_results as results
 from workflows.studies.candidates import CandidateModel
 from workflows.studies.job import MOVED, MethodJob
-from workflows.studies.material_tests import DataFile, MeasuredTest, MeasuredTests
 from workflows.studies.predictions import (
     FINER,
     NOT_ASKED,

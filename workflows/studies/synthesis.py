@@ -13,11 +13,11 @@ from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
+from workflows.data.synthetic import Synthetic, files_of, outputs
 from workflows.run.from_python import FromPython
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
-from workflows.studies.synthetic import Synthetic, files_of, outputs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -76,7 +76,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
         """Make the model; collective."""
         model = self.spec.build(ensemble.group, self.inputs.names)
         if self.model.placed:
-            of_specimen = named("workflows.studies.synthetic_displacements:displacements")
+            of_specimen = named("workflows.data.synthetic_displacements:displacements")
             made: Synthetic = of_specimen(self.model, self.method, self.inputs, model, ensemble)
         else:
             made = outputs(self.model, model)

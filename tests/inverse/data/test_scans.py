@@ -21,7 +21,7 @@ from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from tests.fuzz import damaged_bytes
 from workflows.config.study import load
-from workflows.studies.measured import DisplacementFile, digest_of, motion_of, read_on, scan_of
+from workflows.data.measured import DisplacementFile, digest_of, motion_of, read_on, scan_of
 
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 POINTS = 50 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1.0]])  # mm

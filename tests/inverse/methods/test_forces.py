@@ -17,8 +17,8 @@ from inverse.data.table import DataError
 from tests.launch import run_script
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
+from workflows.data.measured import motion_of
 from workflows.run.run import run as run_study
-from workflows.studies.measured import motion_of
 
 CUBE = """
 [model]

@@ -15,8 +15,8 @@ from tests.launch import TISSUQ, run, run_script
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
+from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.run.plan import plan
-from workflows.studies.measured_outputs import MeasuredOutputs
 
 A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
 MEAN, STD = np.array([1.0, -1.0]), np.array([0.5, 2.0])

@@ -13,6 +13,7 @@ from scipy.stats import multivariate_normal
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from inverse.criticism.assessment import weighted
 from inverse.criticism.comparison import Candidate, criticise, probabilities
+from inverse.criticism.selected import doubts_of_selection, findings, grade, untrusted
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.evidence import evidence
@@ -31,10 +32,9 @@ from uq.inputs.random_parameters import Inputs
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
+from workflows.data.material_tests import MeasuredTest
 from workflows.run.plan import plan
 from workflows.starter import starter
-from workflows.studies.material_tests import MeasuredTest
-from workflows.studies.selection_results import doubts_of_selection, findings, grade, untrusted
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")

@@ -20,6 +20,7 @@ import forward.fem.finer
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
+from inverse.criticism.selected import doubts_of_selection, trusted_on_meshes
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import SerialEvaluate
@@ -33,7 +34,6 @@ from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies.model_selection import ModelSelection
 from workflows.studies.predictions import meshes_of, of_file
-from workflows.studies.selection_results import doubts_of_selection, trusted_on_meshes
 
 pytestmark = pytest.mark.fem
 STUDY = """

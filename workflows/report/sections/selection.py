@@ -10,13 +10,13 @@ import numpy as np
 
 from forward.readable import percent, size
 from forward.words import NONE, named, number, settings, with_error
+from inverse.criticism.selected import bayes_factor, by_probability, chance, conflicts, grade, ranking
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
 from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
-from workflows.studies.selection_results import bayes_factor, by_probability, chance, conflicts, grade, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -18,7 +18,7 @@ from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import log_factor
 from forward.bodies.surface import Surface
 from inverse.data.measurements import Measurements, kinds
-from workflows.studies.synthetic import Synthetic
+from workflows.data.synthetic import Synthetic
 
 if TYPE_CHECKING:
     import xarray as xr

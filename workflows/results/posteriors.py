@@ -16,11 +16,11 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
+from inverse.data.tables_of_draws import of_table
 from inverse.low_dimensional.posterior import NOISE
 from uq.evaluation.hdf5 import variables
 from uq.inputs.draws import Draws
 from workflows.config.blocks import AVERAGED, KEPT, STACKED
-from workflows.studies.tables_of_draws import of_table
 
 if TYPE_CHECKING:
     import xarray as xr

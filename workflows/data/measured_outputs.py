@@ -23,7 +23,7 @@ from inverse.data.outputs import read_outputs, stated
 from inverse.data.reader import AnyReader
 from inverse.data.table import DataError, others
 from workflows.config.mistakes import StudyError
-from workflows.studies.measured import DataSet, FileNames, Found, Positive, digest_of, read_files
+from workflows.data.measured import DataSet, FileNames, Found, Positive, digest_of, read_files
 
 Stated = dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]]  # one or several, by output
 TABLES = "tables"  # name of the data set of several tables

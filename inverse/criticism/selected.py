@@ -11,7 +11,6 @@ import numpy as np
 from forward.findings import Finding
 from forward.readable import percent
 from forward.words import number, with_error
-from workflows.config.priors import admissible
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -381,5 +380,5 @@ def _before(inputs: Inputs, factor: Distribution | None, seed: int) -> dict[str,
     from inverse.low_dimensional.posterior import NOISE
 
     rng = np.random.default_rng(seed)
-    found = dict(zip(inputs.names, admissible(inputs, rng, DRAWS).T, strict=True))
+    found = dict(zip(inputs.names, inputs.drawn(rng, DRAWS).T, strict=True))
     return found if factor is None else found | {NOISE: factor.from_normal(rng.standard_normal(DRAWS))[0]}

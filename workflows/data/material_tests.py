@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
 from inverse.data.reader import AnyReader, table_of
 from inverse.data.table import DataError, Table, needed
-from workflows.config.mistakes import StudyError, lines
-from workflows.config.tables import at
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
@@ -114,14 +112,14 @@ class DataFile(Settings):
 
         Raises
         ------
-        StudyError
+        DataError
             If the table cannot be read, lacks a column, or holds something that is not a number.
         """
         path = folder / self.file
         table = self._table(path)
         tests = self._tests(table, path)
         if not tests:
-            raise StudyError(f"data: {path}: no row is left; data.where and data.between say which ones are kept")
+            raise DataError(f"data: {path}: no row is left; data.where and data.between say which ones are kept")
         return {
             "source": list(table.remarks),
             "tests": [
@@ -142,12 +140,12 @@ class DataFile(Settings):
         try:
             table = table_of(path, self.reader)
         except DataError as error:
-            raise StudyError(*(f"data.file: {line}" for line in error.args)) from None
+            raise DataError(*(f"data.file: {line}" for line in error.args)) from None
         columns = [self.mode, self.at, self.across, self.component, self.group, *self.where]
         columns += [column for pair in self.stresses.values() for column in pair]
         for column in columns:
             if column is not None and column not in table.columns:
-                raise StudyError(f"data: {path} has no column '{column}'; {nearest(column, table.columns)}")
+                raise DataError(f"data: {path} has no column '{column}'; {nearest(column, table.columns)}")
         _refuse_repeats(table, path)
         return table
 
@@ -165,7 +163,7 @@ class DataFile(Settings):
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
-                raise StudyError(f"data: {place}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}")
+                raise DataError(f"data: {place}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}")
             across = None
             if self.across is not None and mode == "biaxial":
                 across = _stretch(row[self.across], place, self.across, positive=True)
@@ -196,16 +194,16 @@ class DataFile(Settings):
             word = row[self.component] or "P1"
             component = next((name for name in COMPONENTS if name == word), None)
             if component is None:
-                raise StudyError(f"data: {place}, {self.component}: '{word}'; {nearest(word, COMPONENTS)}")
+                raise DataError(f"data: {place}, {self.component}: '{word}'; {nearest(word, COMPONENTS)}")
             return {component: next(iter(stresses.values()))}
         found = {c: pair for c, pair in stresses.items() if len(stresses) == 1 or row[pair[0]].strip()}
         strange = next((pair[0] for c, pair in found.items() if c != "P1" and not held), None)
         if strange is not None:
             message = f"data: {place}, {strange}: a stress across, expected an empty cell: nothing acts across there"
-            raise StudyError(message)
+            raise DataError(message)
         if not found:
             message = f"data: {place}: no stress, expected one in {' or '.join(c for c, _ in stresses.values())}"
-            raise StudyError(message)
+            raise DataError(message)
         return found
 
     @model_validator(mode="after")
@@ -243,38 +241,21 @@ class MeasuredTests(Settings):
         return tuple(dict.fromkeys(test.group for test in self.tests))
 
 
-def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a document whose table of data, if it names one, has been read.
-
-    Raises
-    ------
-    StudyError
-        If that cannot be done.
-    """
-    if at(document, "data", "file") is None:
-        return dict(document)
-    try:
-        table = DataFile.model_validate(dict(document["data"]))
-    except ValidationError as error:
-        raise StudyError(*lines(error, "data")) from None
-    return {**document, "data": table.read(folder)}
-
-
 def _refuse_repeats(table: Table, path: Path) -> None:
     seen: dict[tuple[str, ...], int] = {}
     for line, row in zip(table.lines, table.rows, strict=True):
         before = seen.setdefault(tuple(row.values()), line)
         if before != line:
-            raise StudyError(f"data: {path}: lines {before} and {line} are the same, expected each measurement once")
+            raise DataError(f"data: {path}: lines {before} and {line} are the same, expected each measurement once")
 
 
 def _stretch(text: str, place: str, column: str, *, positive: bool) -> float:
     value = _number(text, place, column)
     if positive and value <= 0:
-        raise StudyError(f"data: {place}: {column} is {text!r}, expected a number more than 0: stretches, 1 + strain")
+        raise DataError(f"data: {place}: {column} is {text!r}, expected a number more than 0: stretches, 1 + strain")
     if abs(value) > LARGEST_STRETCH:
         message = f"data: {place}: {column} is {text!r}, expected a stretch (1 is undeformed), or an amount of shear"
-        raise StudyError(message)
+        raise DataError(message)
     return value
 
 
@@ -282,4 +263,4 @@ def _number(text: str, place: str, column: str, *, positive: bool = False) -> fl
     try:
         return needed(text, column, positive=positive)
     except ValueError as error:
-        raise StudyError(f"data: {place}: {error}") from None
+        raise DataError(f"data: {place}: {error}") from None
