@@ -13,7 +13,8 @@ from forward.machine import MIB, compiled_forms
 from forward.readable import told
 from uq.evaluation.request import OWN, company_of
 from workflows.config.priors import ranges
-from workflows.studies import tolerance_asked
+from workflows.studies import tolerance_words
+from workflows.studies.levers import COUNTS
 from workflows.studies.predictions import (
     NOT_ASKED,
     PRODUCT,
@@ -52,14 +53,14 @@ def of_sampling(study: SamplingBlocks, memory: float, rank_groups: int) -> list[
         f"parameters  {', '.join([*study.given, *_in_series(spec.coefficients)])}",
         f"outputs     {', '.join(output.name for output in spec.returned)}",
         f"solves      {up_to}{planned:,}{later}",
-        *(tolerance_asked.plan(study) if study.accuracy.tolerance is not None else ()),
+        *(tolerance_words.plan(study) if study.accuracy.tolerance is not None else ()),
     ]
     if spec.cost() is None:  # the time of a solve is unknown
         return lines
     if study.estimates:
         estimates = f"{up_to}{study.estimates} estimates"
         if study.accuracy.tolerance is not None:  # the study's number is of a method alone
-            estimates = f"{tolerance_asked.COUNTS[0]} to {tolerance_asked.COUNTS[-1]} estimates on each mesh"
+            estimates = f"{COUNTS[0]} to {COUNTS[-1]} estimates on each mesh"
         lines.append(f"mesh error  {estimates} in elements of one degree more; none with accuracy.mesh_error = false")
         never = never_estimable(spec)
         if never:

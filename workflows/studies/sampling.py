@@ -68,9 +68,9 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Memory (bytes) of the largest mesh that it may make, and what sets it; 0 where it makes none."""
         if self.accuracy.tolerance is None or not self.estimates:
             return super().growth
-        from workflows.studies import tolerance_asked
+        from workflows.studies.levers import MeshLever
 
-        if not tolerance_asked.refinement(self)[0]:
+        if not MeshLever.of(self).moves:
             return super().growth
         return MIB * self.accuracy.memory, "what accuracy.memory"
 
@@ -84,9 +84,9 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             found = (*found, *self.source.findings(self.spec, self.inputs))
         if self.accuracy.tolerance is None:
             return found
-        from workflows.studies import tolerance_asked
+        from workflows.studies import tolerance_words
 
-        return *found, *tolerance_asked.findings(self)
+        return *found, *tolerance_words.findings(self)
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self.accuracy.mesh_error and self.spec.hidden:
@@ -156,9 +156,9 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
         match at(value, "accuracy"):
             case Accuracy() | {"tolerance": _}:
-                from workflows.studies import tolerance_asked
+                from workflows.studies.levers import completed
 
-                return tolerance_asked.completed(value)
+                return completed(value)
             case _:
                 return value
 
@@ -187,9 +187,9 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         yield from self.mistakes_of_parameters()
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
-            from workflows.studies import tolerance_asked
+            from workflows.studies import tolerance_words
 
-            yield from tolerance_asked.mistakes(self)
+            yield from tolerance_words.mistakes(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
         yield from self.mistakes_of_ranks(self.spec)

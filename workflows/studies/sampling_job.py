@@ -59,7 +59,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
-            from workflows.studies.accuracy_run import within
+            from workflows.studies.tolerance import within
 
             return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
         found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))

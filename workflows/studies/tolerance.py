@@ -1,11 +1,16 @@
-"""A mesh that is fine enough for a tolerance of all errors: found before a study samples, and kept with its results.
+"""How one tolerance for all errors is reached: a loop that moves levers until errors are within it.
 
-On each mesh, the model is linearised at the mean of its parameters and the error of the mesh is estimated at a few:
-what is then not known of the error of means and standard deviations, which is left when they are corrected, is held
-against the tolerance. The mesh that is given is kept where that leaves enough for sampling. Otherwise cells are divided
-so that it will, by the rate at which errors fall; of all such numbers of cells (and of estimates, which are few) the
-cheapest is taken, by predicted times: those of samples, whose number grows as a mesh takes more of the tolerance, and
-of estimates. Tetrahedra are refined where errors arise (`forward.fem.adapt`).
+What can be moved, and what follows from moving it, stands in `workflows.studies.levers`; what is said of it, in
+`workflows.studies.tolerance_words`. The loop has two parts, since results have one mesh:
+
+1. `on_fine_mesh` moves the mesh, and the number of estimates of its error, before anything is sampled. On each mesh the
+   model is linearised at the mean of its parameters and the error of the mesh is estimated at a few: what is then not
+   known of the error of means and standard deviations, which is left when they are corrected, is held against the
+   tolerance (`Assessed`). The mesh is kept where that leaves enough for sampling; else the next one follows from what
+   was seen so far, by predicted times (`MeshLever.step`), unless memory ends far from the tolerance.
+2. `within` moves the method, its degree and the number of its samples (`Method.until`), until sampling takes no more
+   than what the mesh leaves (`Goal`). What is not known of the mesh is known better once outputs are sampled: then
+   sampling goes on if it needs to.
 
 All of this depends on the study only. Blocks of solves are those of the study on that mesh, which finds them again.
 """
@@ -13,64 +18,52 @@ All of this depends on the study only. Blocks of solves are those of the study o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.adapt import OF_ROUNDING, Adapt
-from forward.machine import MIB, StopError, write_text
+from forward.findings import Finding
+from forward.machine import StopError, write_text
 from forward.model import FloatArray, SolveError
+from uq.accuracy.consequences import has
+from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
+from uq.estimators.doubts import equal, unmet
 from uq.estimators.estimate import ESTIMATED, estimate_of
-from uq.estimators.moments import Z
+from uq.estimators.moments import ESTIMATES, Z, half_width
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate
-from uq.inputs.random_parameters import Inputs
+from uq.findings import add
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from workflows.studies import tolerance_words as words
 from workflows.studies.adapted_mesh import FILES as ADAPTED
 from workflows.studies.adapted_mesh import on_adapted_mesh
-from workflows.studies.predictions import times_of
-from workflows.studies.tolerance_asked import (
-    AIM,
-    COUNTS,
-    HOPELESS,
-    RATE,
-    STEP,
-    Assessed,
-    cells,
-    factor,
-    goal,
-    least_share,
-    most_unknowns,
-    out_of_reach,
-    rate_of,
-    refinement,
-)
+from workflows.studies.levers import COUNTS, Assessed, MeshLever, cells, goal
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec
+    from uq.accuracy.goal import Goal
     from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.request import Evaluate, Evaluations
+    from uq.inputs.random_parameters import Inputs
+    from uq.methods.method import Method
     from workflows.studies.sampling_blocks import S, SamplingBlocks
 
 FILE = "tolerance.json"
-KEPT = 0.8  # of the tolerance: what a mesh may take that was not predicted (`AIM`: one that is)
-BETWEEN = 0.1  # error of a mesh between the given one and one that may be out of reach, over that of the former
-OF_ADAPTED = 0.4  # the same of one that is refined where errors arise, which stops soon below what it is asked for
-MOST_MESHES = 4
-FAR = 2.0  # times as many cells: farther, an assumed rate says too little
-DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
-LARGEST = 16.0  # times as many cells along an edge
 POINTS = 4096  # at which tangents are drawn
-SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
+ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
+TRIED = ("unknowns", "cells", "estimates", "share")  # of a mesh
+IN_WORDS = {"mean": "mean", "std": "standard deviation"}
+
+# --- the mesh, before anything is sampled ----------------------------------------------------------------------------
 
 
 def on_fine_mesh(
@@ -88,38 +81,56 @@ def on_fine_mesh(
     StopError
         If meshes seen so far say that memory ends far from the tolerance.
     """
-    world, path = ensemble.world, directory.resolve() / FILE
-    told = world.bcast(_read(path) if world.rank == 0 else None)
-    first, meshes, count = study, list[Assessed](), COUNTS[0]
-    if told is None:
-        _forget(study, world, directory)
-    while told is None:
+    world, first, lever = ensemble.world, study, MeshLever.of(study)
+    found = world.bcast(history(directory) if world.rank == 0 else None)
+    if found is not None:
+        return _on_mesh(study, _moved(lever, found["body"]), ensemble, directory, say) if found["body"] else study
+    _forget(first, world, directory)
+    meshes, count = list[Assessed](), COUNTS[0]
+    while True:
         meshes.append(_assessed(study, ensemble, Checkpoint(directory, identity(study)), count))
-        say(_line(meshes[-1]))
-        finer, count, why = _next(study, first, meshes)
-        if finer is None:
-            told = {
-                "meshes": [one.document for one in meshes],
-                "why": why,
-                "body": _body(study, first),
-                "estimates": count,
-            }
-            if world.rank == 0:
-                write_text(path, json.dumps(told, indent=2, ensure_ascii=False) + "\n")
-            return study
-        if finer is not study.model and (said := out_of_reach(study, first, meshes)):
-            raise StopError(said)
-        if finer.unrefined:
+        say(words.line(meshes[-1]))
+        step = lever.step(study, meshes)
+        if step.model is None:
+            break
+        if step.model is not study.model and (reach := lever.out_of_reach(meshes)) is not None:
+            raise StopError(words.out_of_reach(study, meshes[-1], reach))
+        if step.model.unrefined:
             _forget(first, world, directory)
-        study = _refined(study, finer, ensemble, directory, say)
-    changed = told["body"]
+        study, count = _on_mesh(study, step.model, ensemble, directory, say), step.estimates
+    if world.rank == 0:
+        found = {
+            "meshes": [one.document for one in meshes],
+            "why": words.taken(study, lever, meshes, step),
+            "body": {} if study.model is first.model else _changed(study),
+            "estimates": step.estimates,
+        }
+        write_text(directory.resolve() / FILE, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    return study
+
+
+def _on_mesh(study: S, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
+    """Return the study of a model, whose mesh may have to be refined first; collective."""
+    found = study.of(model)
+    return on_adapted_mesh(found, ensemble, directory, say) if model.unrefined else found
+
+
+def _changed(study: SamplingBlocks) -> dict[str, Any]:
+    """Return what of the body was changed."""
+    adapt, body = study.solid.adapt, study.solid.body
+    if adapt is not None:
+        return {"adapt": adapt.tolerance}
+    return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
+
+
+def _moved(lever: MeshLever, changed: dict[str, Any]) -> ModelSpec:
+    """Return the model with what was changed."""
     if "adapt" in changed:
-        return _refined(study, _adapting(study, changed["adapt"]), ensemble, directory, say)
-    if not changed:
-        return study
-    body = study.solid.body
+        return lever.adapting(changed["adapt"], lever.most_unknowns)
+    body = lever.first.solid.body
     body = body.model_validate(body.model_dump(exclude={"contents"}) | changed)
-    return study.of(study.model.model_copy(update={"body": body}))
+    found: ModelSpec = lever.first.model.model_copy(update={"body": body})
+    return found
 
 
 def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
@@ -131,41 +142,16 @@ def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
 
 def history(directory: Path) -> dict[str, Any] | None:
     """Return how the mesh of a study was found, which stands beside its results; None where it was not looked for."""
-    return _read(directory.resolve() / FILE)
+    with suppress(FileNotFoundError):
+        found: dict[str, Any] = json.loads((directory.resolve() / FILE).read_text(encoding="utf-8"))
+        return found
+    return None
 
 
 def meshes_before(directory: Path) -> list[dict[str, Any]]:
     """Return the meshes that were looked at before the last one, the estimates on which are those of the study."""
-    told = history(directory)
-    return [] if told is None else list(told["meshes"][:-1])
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    return found
-
-
-def _body(study: SamplingBlocks, first: SamplingBlocks) -> dict[str, Any]:
-    """What of the body was changed."""
-    if study.model is first.model:
-        return {}
-    if study.model.adaptive:
-        return {"adapt": study.solid.adapt.tolerance}
-    body = study.solid.body
-    return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
-
-
-def _refined(study: S, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
-    """Return the study of a model, whose mesh may have to be refined first; collective."""
-    if not model.unrefined:
-        return study.of(model)
-    return on_adapted_mesh(study.of(model), ensemble, directory, say)
-
-
-# --- what a mesh takes -----------------------------------------------------------------------------------------------
+    found = history(directory)
+    return [] if found is None else list(found["meshes"][:-1])
 
 
 class Found:
@@ -175,33 +161,24 @@ class Found:
     ----------
     centre, errors
         Those.
-    doubts
-        What is not known of the error of means and standard deviations (2, m), by what tangents say of the outputs;
-        zero where there is no estimate.
-    close
-        The part of it that more estimates would leave (2, m).
     dataset
         Means and standard deviations by tangents, with these errors.
     """
 
     def __init__(
-        self, study: SamplingBlocks, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int = COUNTS[0]
+        self, study: SamplingBlocks, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int
     ) -> None:
         fields = getattr(study.method, "fields", True) and centre.state.size > 0
+        seed = getattr(study.method, "seed", 0)
         self.centre = centre
-        self.errors: MeshErrors = estimate(
-            inputs, evaluate, centre, count, getattr(study.method, "seed", 0), fields=fields
-        )
+        self.errors: MeshErrors = estimate(inputs, evaluate, centre, count, seed, fields=fields)
         points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
         drawn = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
         zero = np.zeros(len(centre.outputs))
-        moments = {"mean": drawn.mean(axis=0), "mean_error": zero, "std": drawn.std(axis=0), "std_error": zero}
+        moments = zip(ESTIMATES, (drawn.mean(axis=0), zero, drawn.std(axis=0), zero), strict=True)
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
-        dataset = dataset.assign({name: (("output",), values) for name, values in moments.items()})
+        dataset = dataset.assign({name: (("output",), values) for name, values in moments})
         self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, study.told)
-        self.doubts = doubts(self.dataset)
-        errors = np.abs([estimate_of(self.dataset, name).mesh for name in ESTIMATED])
-        self.close = np.nan_to_num(self.dataset["mesh_error_unknown"].to_numpy() * errors)
 
 
 def doubts(dataset: xr.Dataset) -> FloatArray:
@@ -226,7 +203,9 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
         if found is not None and found.errors.evaluations.ok.sum() > 1:
             asked, data = goal(study), found.dataset
             sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
-            shares, close = (Z * part / (asked.tolerance * sizes) for part in (found.doubts, found.close))
+            errors = np.abs([estimate_of(data, name).mesh for name in ESTIMATED])
+            known = doubts(data), np.nan_to_num(data["mesh_error_unknown"].to_numpy() * errors)
+            shares, close = (Z * part / (asked.tolerance * sizes) for part in known)
             mean = estimate_of(data, "mean")
             rows = zip(recorder.outputs, *(x.tolist() for x in (mean.value, mean.mesh, mean.doubt)), strict=True)
             means = [row for row in rows if np.isfinite(row[2])]
@@ -239,7 +218,7 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
             float(shares.max()),
             len(inputs.names),
             recorder.outputs[column],
-            ("mean", "standard deviation")[row],
+            IN_WORDS[ESTIMATED[row]],
             [] if close is None else close.tolist(),
             [] if close is None else np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist(),
             relative,
@@ -255,105 +234,105 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
     return result
 
 
-def _line(one: Assessed) -> str:
-    if one.share == np.inf:
-        return f"mesh of {one.unknowns:,} unknowns: too coarse for an estimate of its error"
-    return f"mesh of {one.unknowns:,} unknowns: takes {one.share:.2g} of the tolerance ({one.of} of {one.output})"
+# --- the method, its degree and its samples, on that mesh ------------------------------------------------------------
 
 
-# --- which mesh is next ----------------------------------------------------------------------------------------------
+def within(
+    study: SamplingBlocks,
+    method: Method,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    recorders: dict[str, Recorder],
+    estimates: list[Evaluations],
+    directory: Path,
+) -> xr.Dataset:
+    """Sample until mean and standard deviation of every output are within the tolerance, with their mesh errors.
 
+    It finds its solves where they are stored.
 
-def _next(
-    study: SamplingBlocks, first: SamplingBlocks, meshes: Sequence[Assessed]
-) -> tuple[ModelSpec | None, int, str]:
-    """Return the model on the next mesh and the number of estimates on it, and why that is so.
-
-    None in place of a model where the last mesh is taken.
+    Parameters
+    ----------
+    recorders, estimates
+        Of the job, where evaluations are kept.
+    directory
+        Of the results: how the mesh was found stands there.
     """
-    now = meshes[-1]
-    takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.0f} % of the tolerance once corrected"
-    how, words = refinement(first)
-    if how != "cells":
-        if now.share <= KEPT:
-            return None, now.estimates, takes
-        more = [c for c in COUNTS if c > now.estimates and now.share_with(1.0, c) <= AIM]
-        if more:
-            return study.model, more[0], ""
-        if not how:
-            return None, now.estimates, f"{takes}; it {words}"
-        before = study.solid.adapt
-        if before is not None and (len(meshes) > MOST_MESHES or study.spec.unknowns * STEP > before.unknowns):
-            return None, now.estimates, f"{takes}; finer ones would take more than {_memory(study)}"
-        error = now.relative if before is None else before.tolerance
-        to = 0.1 if now.share == np.inf else float(np.clip(error * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
-        if len(meshes) == 1 and now.close and least_share(first, now, RATE) > HOPELESS:
-            to = max(to, min(BETWEEN * error, 0.5))  # it may be out of reach: a mesh between them tells the rate
-        return _adapting(first, to), COUNTS[0], ""
-    if len(meshes) > MOST_MESHES and now.share > KEPT:
-        return None, now.estimates, f"{takes}, and {len(meshes)} meshes are enough"
-    ways = list(_ways(study, now, rate_of(meshes)))
-    here = [way for way in ways if way.times == 1 and way.estimates == now.estimates and way.share <= KEPT]
-    enough = [*here, *(way for way in ways if way.share <= AIM)]
-    best = min(enough, key=lambda way: way.seconds) if enough else min(ways, key=lambda way: way.share)
-    if best.times == 1 and best.estimates == now.estimates:
-        rest = "" if enough else f"; finer ones would take more than {_memory(study)}"
-        return None, now.estimates, takes + rest
-    if len(meshes) == 1 and best.times > FAR:  # a mesh between them costs little, and tells the rate
-        between = next(way for way in ways if way.times >= best.times**0.5)
-        return between.model, COUNTS[0], ""
-    return best.model, best.estimates, ""
-
-
-def _memory(study: SamplingBlocks) -> str:
-    return f"accuracy.memory = {study.accuracy.memory:,.0f} MiB"
-
-
-@dataclass(frozen=True)
-class _Way:
-    """A mesh that might be taken, its share of the tolerance, and the predicted time (s) of the study on it."""
-
-    times: float
-    model: ModelSpec
-    estimates: int
-    share: float
-    seconds: float
-
-
-def _ways(study: SamplingBlocks, now: Assessed, rate: float) -> Iterator[_Way]:
-    """Go through the meshes with more and more cells for which there is memory, from the given one on."""
-    few, power = SAMPLES[study.method.kind in ("automatic", "chaos") and study.inputs.independent]
-    seen, times = set[int](), 1.0
-    while times <= LARGEST:
+    asked, mesh, before = goal(study), None, history(directory)
+    unknown: tuple[Finding, ...] = ()
+    if study.estimates and before is not None:
         try:
-            model = study.model if times == 1 else study.model.finer(times)
-        except ValueError:  # too large
-            return
-        other = study.of(model)
-        times *= STEP
-        if other.spec.unknowns in seen:
-            continue
-        seen.add(other.spec.unknowns)
-        cost, estimating = times_of(other.spec), other.spec.mesh_error_cost()
-        assert estimating is not None
-        if cost.bytes + estimating.bytes > MIB * study.accuracy.memory and model is not study.model:
-            return
-        finer = factor(cells(study), cells(other))
-        for count in COUNTS:
-            if model is study.model and count < now.estimates:
-                continue
-            share = now.share_with(finer**rate, count)
-            if not now.close and finer > DOUBLED:
-                share = AIM
-            samples = few / max(1 - share**2, 0.05) ** (power / 2)
-            estimates = estimating.once + count * (cost.sample + estimating.seconds)
-            seconds = cost.first + samples * cost.sample + estimates
-            yield _Way(1.0 if model is study.model else finer, model, count, share, seconds)
-
-
-def _adapting(study: SamplingBlocks, tolerance: float) -> ModelSpec:
-    """Return the model with a mesh that is refined until its relative error is so much, or memory ends."""
-    found: ModelSpec = study.model.model_copy(
-        update={"adapt": Adapt(tolerance=tolerance, unknowns=most_unknowns(study))}
-    )
+            mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate), before["estimates"])
+        except SolveError as error:
+            unknown = (failed(f"{error}"),)
+        else:
+            estimates.append(mesh.errors.evaluations)
+            asked = replace(asked, mesh=doubts(mesh.dataset))
+    for _ in range(ATTEMPTS):
+        recorders["/"] = Recorder(evaluate)
+        found = method.until(inputs, recorders["/"], asked)
+        if mesh is None:
+            break
+        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, study.told)
+        asked = replace(asked, mesh=doubts(found))
+        if asked.reached(_moments(found), half_width(found)) <= 1:
+            break
+    add(found, *unknown, first=True)
+    told = _told(study, found, asked, before)
+    found.attrs["accuracy"] = json.dumps(told, ensure_ascii=False)
+    meshes = [] if before is None else before["meshes"]
+    add(found, *words.missed(study, told), *words.contradictions(meshes, told["outputs"]))
     return found
+
+
+def _moments(dataset: xr.Dataset) -> dict[str, FloatArray]:
+    return {name: dataset[name].to_numpy() for name in ESTIMATES}
+
+
+def _told(study: SamplingBlocks, found: xr.Dataset, asked: Goal, before: dict[str, Any] | None) -> dict[str, Any]:
+    """Return what was asked for and reached, by what, and why; nothing that depends on the machine."""
+    names = [str(name) for name in found["output"].values]
+    chosen = json.loads(found.attrs.pop("chosen", "{}")) or {"method": study.method.kind, "reasons": []}
+    parts = asked.parts(_moments(found), half_width(found))
+    sizes = asked.sizes(found["mean"].to_numpy(), found["std"].to_numpy())
+    row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
+    estimates = {name: estimate_of(found, name) for name in ESTIMATED}
+    corrected = np.isfinite(estimates["mean"].corrected)  # the outputs of which the error of the mesh was estimated
+    if before is None:  # nothing to be known, or not asked for; else it was too much
+        known = not (study.spec.meshed or study.spec.hidden) or not study.accuracy.mesh_error
+    else:
+        known = all(corrected[i] for i, name in enumerate(names) if name not in study.told.never)
+    missed = _unmet(found)
+    tried = [] if before is None else [{name: one[name] for name in TRIED} for one in before["meshes"]]
+    mesh = {"unknowns": study.spec.unknowns, "estimated": known and before is not None, "tried": tried}
+    return {
+        "tolerance": asked.tolerance,
+        "reached": float(asked.tolerance * parts["total"][row, column]),
+        "kept": known and not missed and bool((parts["total"] <= 1).all()),
+        "unmet": missed,
+        "worst": {"output": names[column], "of": IN_WORDS[ESTIMATED[row]]},
+        "shares": {source: float(parts[source][row, column]) for source in words.SOURCES},
+        "method": chosen["method"],
+        "reasons": [*([] if before is None else [words.of_mesh(before)]), *chosen["reasons"]],
+        "mesh": mesh if study.spec.meshed else None,
+        "outputs": {
+            name: {
+                estimate: {
+                    "value": float(one.corrected[i] if corrected[i] else one.value[i]),
+                    "error": float(asked.tolerance * parts["total"][k, i] * sizes[k, i]),
+                    "relative_to": float(sizes[k, i]),
+                    **{source: float(parts[source][k, i]) for source in words.SOURCES},
+                }
+                for k, (estimate, one) in enumerate(estimates.items())
+            }
+            for i, name in enumerate(names)
+        },
+    }
+
+
+def _unmet(found: xr.Dataset) -> dict[str, float]:
+    """Return what share of all cases samples may have missed, by output of which all of them are the same."""
+    if not has(found, "values", "sample", "output"):
+        return {}
+    values = found["values"].to_numpy()[found["ok"].to_numpy()]
+    names = np.array([str(name) for name in found["output"].values])
+    return dict.fromkeys(names[equal(values)].tolist(), unmet(len(values))) if len(values) else {}

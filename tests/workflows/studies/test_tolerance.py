@@ -13,9 +13,9 @@ from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
-from workflows.studies.accuracy_run import contradictions
-from workflows.studies.tolerance import _next
-from workflows.studies.tolerance_asked import Assessed, dimension, out_of_reach, rate_of
+from workflows.studies.levers import Assessed, MeshLever, rate_of
+from workflows.studies.tolerance_words import contradictions, taken
+from workflows.studies.tolerance_words import out_of_reach as in_words
 
 TINY = ROOT / "configs" / "tiny.toml"
 OWN = ROOT / "configs" / "own-model.toml"
@@ -143,9 +143,21 @@ def mesh(study, share, estimates=3, between=0.0):
     )
 
 
+def following(study, first, seen):
+    """What is looked at next, and why none is, in words."""
+    lever = MeshLever.of(first)
+    step = lever.step(study, seen)
+    return step.model, step.estimates, taken(first, lever, seen, step)
+
+
+def out_of_reach(first, seen):
+    reach = MeshLever.of(first).out_of_reach(seen)
+    return None if reach is None else in_words(first, seen[-1], reach)
+
+
 def test_a_mesh_that_takes_little_is_kept():
     study = asked(1e-2)
-    model, count, why = _next(study, study, [mesh(study, 0.3)])
+    model, count, why = following(study, study, [mesh(study, 0.3)])
     assert model is None
     assert count == 3
     assert "takes 30 % of the tolerance" in why
@@ -153,7 +165,7 @@ def test_a_mesh_that_takes_little_is_kept():
 
 def test_where_estimates_are_few_there_are_more_of_them():
     study = asked(1e-2)
-    model, count, _ = _next(study, study, [mesh(study, 0.9, between=0.89)])
+    model, count, _ = following(study, study, [mesh(study, 0.9, between=0.89)])
     assert model is study.model
     assert count > 3
 
@@ -161,13 +173,13 @@ def test_where_estimates_are_few_there_are_more_of_them():
 def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     study = asked(1e-2)
     first = mesh(study, 8.0)
-    model, _, _ = _next(study, study, [first])
+    model, _, _ = following(study, study, [first])
     assert model.body.cells[0] in range(6, 14)  # between: an assumed rate says little far away
     finer = study.of(model)
     factor = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     meshes_seen = [first, mesh(finer, 8.0 / factor**2)]
     assert rate_of(meshes_seen) == pytest.approx(2.0)
-    model, _, _ = _next(finer, study, meshes_seen)
+    model, _, _ = following(finer, study, meshes_seen)
     last = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     assert 8.0 / last**2 <= 0.61
     assert 8.0 / (0.7 * last) ** 2 > 0.6
@@ -176,7 +188,7 @@ def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
 def test_a_layer_of_plane_strain_is_refined_in_its_plane():
     study = load(ROOT / "configs" / "cook.toml", ["method={kind='automatic'}", "accuracy.tolerance=1e-3"])
     first = mesh(study, 8.0)
-    model, _, _ = _next(study, study, [first])
+    model, _, _ = following(study, study, [first])
     assert model.body.cells[2] == 1
     assert model.body.cells[0] > study.model.body.cells[0]
     finer = study.of(model)
@@ -209,7 +221,7 @@ def test_memory_ends_refinement():
     assert study.estimates
     seen, model = [mesh(study, 50.0)], study.model
     for _ in range(5):
-        model, _, why = _next(study, study, seen)
+        model, _, why = following(study, study, seen)
         if model is None:
             break
         study = study.of(model)
@@ -221,19 +233,19 @@ def test_memory_ends_refinement():
 @pytest.mark.unit
 def test_what_memory_is_too_small_for_is_known_by_one_mesh_or_two():
     study = asked(1e-4, "accuracy.memory=400", "model.body.cell=tetrahedron", "model.body.degree=1")
-    assert out_of_reach(study, study, [mesh(study, 5.0)]) is None
-    assert out_of_reach(study, study, [mesh(study, np.inf)]) is None
-    said = out_of_reach(study, study, [mesh(study, 2000.0)])
+    assert out_of_reach(study, [mesh(study, 5.0)]) is None
+    assert out_of_reach(study, [mesh(study, np.inf)]) is None
+    said = out_of_reach(study, [mesh(study, 2000.0)])
     assert "even where errors fall as fast as they can" in said
     assert "elements of degree 2 (model.body.degree), more accuracy.memory or a tolerance of" in said
     # What one mesh leaves open, the rate between two tells.
     finer = dataclasses.replace(mesh(study, 20.0 / 2.0), unknowns=8 * study.spec.unknowns)
-    assert out_of_reach(study, study, [mesh(study, 20.0)]) is None
-    assert "as errors have fallen so far" in out_of_reach(study, study, [mesh(study, 20.0), finer])
+    assert out_of_reach(study, [mesh(study, 20.0)]) is None
+    assert "as errors have fallen so far" in out_of_reach(study, [mesh(study, 20.0), finer])
     better = dataclasses.replace(finer, share=20.0 / 4, close=[[20.0 / 4], [0.0]])
-    assert out_of_reach(study, study, [mesh(study, 20.0), better]) is None
+    assert out_of_reach(study, [mesh(study, 20.0), better]) is None
     flat = load(ROOT / "configs" / "cook.toml", ["method={kind='automatic'}", "accuracy.tolerance=1e-3"])
-    assert (dimension(study), dimension(flat)) == (3, 2)
+    assert (MeshLever.of(study).dimension, MeshLever.of(flat).dimension) == (3, 2)
 
 
 # --- whole studies ---------------------------------------------------------------------------------------------------
