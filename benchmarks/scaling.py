@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.beams import CONFIG, beam
+from uq.evaluation.request import FieldSum
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -145,7 +146,7 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class _Moments:
+class _Moments(FieldSum):
     """Sums of a displacement field and of its squares."""
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:

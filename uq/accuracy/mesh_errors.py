@@ -20,7 +20,7 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Solution
 from uq.estimators.indices import shares
 from uq.evaluation.block import merge
-from uq.evaluation.request import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import latin_points, sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
@@ -79,9 +79,10 @@ def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatAr
 
 
 @dataclass(frozen=True)
-class _StateErrors:
+class _StateErrors(FieldSum):
     """Errors of the states at some points (n, d): the sum has a row for each of them, zero where there is none."""
 
+    compact = True
     points: FloatArray
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
@@ -96,9 +97,6 @@ class _StateErrors:
         for point, row in zip(points, rows, strict=True):
             found[(self.points == point).all(axis=1)] = row[0]
         return found
-
-    def sketch(self, rows: FloatArray) -> None:
-        return
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from forward.model import (
     SolveError,
     gathered,
 )
-from uq.evaluation.request import CompactSum, Evaluations, Failure, FieldSum, Request, audited, calibration
+from uq.evaluation.request import Evaluations, Failure, FieldSum, Request, audited, calibration
 
 TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
 
@@ -31,7 +31,7 @@ class BlockSolver:
         self._tangents, self._mesh_errors = request.tangents, request.mesh_errors
         self._saturations = request.saturations
         self._row = request.fields.on(model) if request.fields is not None else None
-        self._compact = isinstance(request.fields, CompactSum)
+        self._compact = request.fields is not None and request.fields.compact
         self._joint = request.joint.on(model) if request.joint is not None else None
         self._together = 1 if request.joint is None else request.joint.size
         self._guess = None if request.start is None else request.start.on(model)
@@ -179,7 +179,7 @@ class Merger:
     """
 
     def __init__(self, fields: FieldSum | None = None) -> None:
-        self._compact = fields if isinstance(fields, CompactSum) else None
+        self._compact = fields if fields is not None and fields.compact else None
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
         self._waiting: list[tuple[FloatArray, FloatArray]] = []

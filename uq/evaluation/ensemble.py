@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -90,9 +90,9 @@ class Ensemble:
 
         A rank that fails alone, while the others wait for it inside `make`, ends the job.
         """
-        found, error = None, None
+        made, error = list[T](), None
         try:
-            found = make()
+            made.append(make())
         except (ValueError, SolveError, StopError) as refusal:  # mistakes of the study are ValueErrors
             error = refusal
         except BaseException as unexpected:
@@ -109,7 +109,7 @@ class Ensemble:
             error = next((one for one in self.world.allgather(error) if one is not None), None)
         if error is not None:
             raise error
-        return cast("T", found)
+        return made[0]
 
     def run(
         self,
@@ -157,7 +157,7 @@ class Ensemble:
         with self.turns(progress) as turns:
             worker = _Worker(self, _Models(model, others or {}, passing), checkpoint, turns)
             return self._followed(
-                lambda: task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes)), worker.work, str | _Order
+                lambda: task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes)), worker.work
             )
 
     def led(self, task: Callable[[Callable[[O], R]], T], step: Callable[[O], R]) -> T | None:
@@ -175,20 +175,20 @@ class Ensemble:
         """
 
         def asked(of: O) -> R:
-            self.told(_Step(of))
+            self.told(of)
             with abort_all(self.world):
                 return step(of)
 
-        return self._followed(lambda: task(asked), lambda told: step(told.of), _Step)
+        return self._followed(lambda: task(asked), step)
 
-    def _followed(self, lead: Callable[[], T], follow: Callable[[Any], object], kinds: Any) -> T | None:
-        """Run `lead` on rank 0, while the others follow all that it tells of these kinds, to its end; collective."""
+    def _followed(self, lead: Callable[[], T], follow: Callable[[Any], object]) -> T | None:
+        """Run `lead` on rank 0, while the others follow all that it tells, to its end; collective."""
         if self.world.rank > 0:
             with abort_all(self.world):
-                while isinstance(order := self.told(None), kinds):
-                    follow(order)
-            if order is not None:
-                raise order
+                while (told := self.told())[1]:
+                    follow(told[0])
+            if told[0] is not None:
+                raise told[0]
             return None
         ended = None
         try:
@@ -197,12 +197,12 @@ class Ensemble:
             ended = _told_to_others(error)
             raise
         finally:
-            self.told(ended)
+            self.told(ended, more=False)
 
-    def told(self, order: O) -> O:
-        """Return what rank 0 says, for which the others may wait long; collective."""
+    def told(self, order: object = None, *, more: bool = True) -> tuple[Any, bool]:
+        """Return what rank 0 says, for which the others may wait long, and whether it says more; collective."""
         gather_here(self.world)
-        told: O = self.world.bcast(order)
+        told: tuple[Any, bool] = self.world.bcast((order, more))
         return told
 
 
@@ -213,13 +213,6 @@ def _told_to_others(error: Exception) -> Exception:
     except Exception:
         return StopError(str(error))
     return error
-
-
-@dataclass(frozen=True)
-class _Step:
-    """What all ranks do a step with."""
-
-    of: Any
 
 
 @dataclass(frozen=True)
@@ -336,7 +329,7 @@ class _Worker:
     def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""
         with abort_all(self._ensemble.world):
-            self._ensemble.told(model)
+            self._ensemble.told((model, None))
             self.models[model]
 
     def dispatch(self, order: _Order, receive: Callable[[int, Evaluations], None], progress: Progress) -> None:
@@ -352,15 +345,16 @@ class _Worker:
             receive(i, block)
 
         with abort_all(self._ensemble.world):
-            self._ensemble.told(order)
+            self._ensemble.told((order.request.model, order))
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 
-    def work(self, order: _Order | str) -> None:
-        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by name."""
-        if isinstance(order, str):
-            self.models[order]
-            return
-        self._turns.follow(order.pending, self._solving(order, lambda done, failed: None))
+    def work(self, told: tuple[str, _Order | None]) -> None:
+        """Compute blocks of an order until none is left, and send them to rank 0; without one, make a model by name."""
+        name, order = told
+        if order is None:
+            self.models[name]
+        else:
+            self._turns.follow(order.pending, self._solving(order, lambda done, failed: None))
 
     def _solving(self, order: _Order, progress: Progress) -> Callable[[int], Evaluations]:
         """Return the function that solves a block of an order, and keeps it."""

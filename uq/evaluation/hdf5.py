@@ -118,7 +118,7 @@ def _attributes(to: Any, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         several = np.atleast_1d(value)
         texts = several.astype(h5py.string_dtype()) if several.dtype.kind == "U" else several
-        to.attrs.create(name, value if isinstance(value, str) else texts)
+        to.attrs.create(name, value if texts is not several and np.ndim(value) == 0 else texts)
 
 
 def _ordered(properties: Any) -> Any:
@@ -155,7 +155,7 @@ def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dic
         If it is no HDF5 file.
     """
     with h5py.File(io.BytesIO(content), "r") as file:
-        part = file[group] if group and isinstance(file.get(group), h5py.Group) else file["/"]
+        part = file[group] if group and file.get(group, getclass=True) is h5py.Group else file["/"]
         return _variables(part), dict(part.attrs)
 
 
@@ -165,7 +165,7 @@ def _variables(part: Any) -> dict[str, Variable]:
     places: dict[int, str] = {}  # names of scales: to look one up takes as long as to read a variable
     for name in part:
         one = part[name]
-        if not isinstance(one, h5py.Dataset) or NO_VARIABLE in bytes(one.attrs.get("NAME", b"")):
+        if h5py.h5i.get_type(one.id) != h5py.h5i.DATASET or NO_VARIABLE in bytes(one.attrs.get("NAME", b"")):
             continue
         about = {key: _plain(one.attrs[key]) for key in one.attrs if key not in OF_FORMAT}
         texts = h5py.check_string_dtype(one.dtype) is not None
@@ -190,7 +190,7 @@ def _dimension(of: Any, axis: int, places: dict[int, str]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    return value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
+    return value[0] if np.shape(value) == (1,) else value
 
 
 def stored_dataset(path: Path) -> xr.Dataset:
@@ -210,7 +210,7 @@ def stored_dataset(path: Path) -> xr.Dataset:
     made, coordinates = {}, set()
     for name, (values, dims, said) in found.items():
         coordinates |= {name} if dims == (name,) else set(said.get("coordinates", "").split())
-        texts = isinstance(values, str) or values.dtype == object
+        texts = np.asarray(values).dtype.kind in "OU"
         kind = np.str_ if texts else bool if said.get("dtype") == "bool" else None
         about_it = {key: value for key, value in said.items() if key not in ("dtype", "coordinates")}
         made[name] = (dims, np.asarray(values, dtype=kind), about_it)

@@ -7,9 +7,10 @@ in order. So the result does not depend on which rank computed which block.
 from __future__ import annotations
 
 import hashlib
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,9 +92,9 @@ class Evaluations:
         Whether the stability of each state (n,) was counted or screened, or refused: `forward.model.Stability`.
     fields
         Sum over the points that did not fail of the rows (k, U) of the requested field sum; in a block of a
-        `CompactSum`, the rows of these points themselves, one point after the other.
+        compact `FieldSum`, the rows of these points themselves, one point after the other.
     sketches
-        What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are merged.
+        What a compact `FieldSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are merged.
     mesh_errors
         Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
     saturations
@@ -156,24 +157,25 @@ class Evaluations:
 
 
 class FieldSum(Protocol):
-    """A quantity of each realisation's state that is summed while realisations are computed."""
+    """A quantity of each realisation's state that is summed while realisations are computed.
 
-    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
-
-
-@runtime_checkable
-class CompactSum(FieldSum, Protocol):
-    """A sum whose terms have many rows that follow from a few rows of each realisation: blocks hold those few.
-
+    The terms of a `compact` one have many rows that follow from a few rows of each realisation: blocks hold those few.
     `on` returns these few; the sum is formed when blocks are added, so that files and messages stay small.
     """
 
+    compact: ClassVar[bool] = False
+
+    @abstractmethod
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
+
     def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, r, U)."""
+        return np.asarray(rows.sum(axis=0))
 
     def sketch(self, rows: FloatArray) -> FloatArray | None:
         """Return a few numbers (n, r, k) to be kept of the rows (n, r, U) of some realisations; or None."""
+        return None
 
 
 class JointSum(Protocol):

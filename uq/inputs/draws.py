@@ -128,7 +128,7 @@ class Draws:
         """
         N = len(self.values)
         rounds = range(start // N, -(-stop // N))
-        base = seed if isinstance(seed, tuple) else (seed,)
+        base = np.atleast_1d(seed).tolist()
         orders = [np.random.default_rng([*base, r]).permutation(N) for r in rounds]
         which = np.concatenate([np.empty(0, dtype=np.int64), *orders])
         return np.asarray(self.values[which[start - N * rounds.start : stop - N * rounds.start]])

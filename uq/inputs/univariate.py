@@ -216,10 +216,9 @@ class Chaospy(Univariate):
         """
         import chaospy
 
-        known = {
-            name: one
-            for name, one in vars(chaospy).items()
-            if isinstance(one, type) and one.__module__.startswith("chaospy.distributions.collection")
+        classes = inspect.getmembers(chaospy, inspect.isclass)
+        known: dict[str, Any] = {
+            n: one for n, one in classes if one.__module__.startswith("chaospy.distributions.collection")
         }
         if self.name not in known:
             raise ValueError(f"chaospy has no distribution '{self.name}'; {nearest(self.name, sorted(known))}")

@@ -123,16 +123,16 @@ class Entry(Settings):
         expected = "expected different numbers of samples, such as [16, 32, 64]"
         if "budgets" not in value:
             raise ValueError(f"gives no budgets, {expected}")
-        budgets = value["budgets"]
-        whole = isinstance(budgets, tuple) and all(isinstance(n, int) and n >= 2 for n in budgets)
-        if not (whole and budgets and len(set(budgets)) == len(budgets)):
-            raise ValueError(f"budgets = {list(budgets) if isinstance(budgets, tuple) else budgets}, {expected}")
+        budgets = np.array(value["budgets"])
+        whole = budgets.dtype.kind == "i" and budgets.ndim == 1 and (budgets >= 2).all()
+        if not (whole and len(np.unique(budgets)) == budgets.size):
+            raise ValueError(f"budgets = {budgets.tolist()}, {expected}")
         refused = [name for name in _NOT_ITS_OWN if name in value]
         if refused:
             raise ValueError(f"gives {' and '.join(refused)}, expected none: a comparison says it for all methods")
         own = {name: value[name] for name in ("name", "budgets") if name in value}
         rest = {name: item for name, item in value.items() if name not in own}
-        return {**own, "sampling": {**rest, "samples": budgets[0]}}
+        return {**own, "sampling": {**rest, "samples": int(budgets[0])}}
 
     @model_validator(mode="after")
     def _check_budgets(self) -> Entry:

@@ -26,7 +26,7 @@ from uq.estimators.quantiles import quantiles
 from uq.estimators.tails import counted, influences
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
@@ -177,7 +177,7 @@ class SensitivityMonteCarlo(MonteCarlo):
 
 
 @dataclass(frozen=True)
-class _JointMoments:
+class _JointMoments(FieldSum):
     """Sum of the monomials of the state's deviation and of its tangent prediction, which is linear in coordinates."""
 
     coordinates: Coordinates

@@ -146,9 +146,10 @@ class Multifidelity(Amount):
         for i, one in enumerate(self.cheap):
             try:
                 wrong = list(one.mistakes(spec))
-            except (ModelError, ValidationError) as error:
-                reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-                wrong = [((), str(reason), one.kind)]
+            except ValidationError as error:
+                wrong = [((), error.errors()[0]["msg"], one.kind)]
+            except ModelError as error:
+                wrong = [((), str(error), one.kind)]
             for place, message, given in wrong:
                 yield ("method", "cheap", i, *place), message, given
 

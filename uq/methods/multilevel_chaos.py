@@ -168,9 +168,9 @@ class MultilevelChaos(Amount):
             found = evaluate(Request(points, fields=sums, start=start, iterations=iterations))
             data = Data.of(found, inputs, None)
             fit = fit_best(bases, basis, data)
-            if start is not None:
-                start = StateExpansion.fitted(basis, fit, found.fields, centre)
-            expected, known = known, _of_expansion(basis, fit, start, evaluate.displacements)
+            states = None if start is None else StateExpansion.fitted(basis, fit, found.fields, centre)
+            start = states
+            expected, known = known, _of_expansion(basis, fit, states, evaluate.displacements)
             levels.append(_Level(0 if finishing else iterations, found, known, known.change_from(expected)))
             settled = self.met(levels[-1].change)
             enough = settled and bool(found.converged[found.ok].all())
@@ -263,9 +263,9 @@ def _of_tangent(centre: Linearisation, count: int) -> _Known:
     )
 
 
-def _of_expansion(basis: Basis, fit: Fit, start: Start | None, count: int) -> _Known:
+def _of_expansion(basis: Basis, fit: Fit, states: StateExpansion | None, count: int) -> _Known:
     outputs = coefficient_moments(fit.coefficients.T, basis.indices)
-    state = start.coefficients[:, :count] if isinstance(start, StateExpansion) else np.zeros((len(basis.indices), 0))
+    state = np.zeros((len(basis.indices), 0)) if states is None else states.coefficients[:, :count]
     field = coefficient_moments(state.T, basis.indices)
     return _Known(
         outputs["mean"],

@@ -17,7 +17,7 @@ from forward.model import FloatArray, ForwardModel, Solution, SolveError, scatte
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
 from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed
-from uq.evaluation.request import Evaluate, Evaluations, Request, Start
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis
@@ -39,7 +39,7 @@ def _products(deviation: FloatArray, controls: tuple[FloatArray, FloatArray] | N
 
 
 @dataclass(frozen=True)
-class _FieldProducts:
+class _FieldProducts(FieldSum):
     """Sum of the products of the state's deviation and of its control, and of its third and fourth power."""
 
     state: FloatArray

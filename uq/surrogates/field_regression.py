@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
-from uq.evaluation.request import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
 from uq.surrogates.gate import Trial, repeated
@@ -34,7 +34,7 @@ AS_GOOD = 1.5  # times the smallest leave-one-out error, up to which the field u
 
 
 @dataclass(frozen=True)
-class Projections:
+class Projections(FieldSum):
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
     A compact sum: blocks hold y_z, the deviation and its slopes.
@@ -55,6 +55,7 @@ class Projections:
         Share (nodes,) of the body that each node represents; by default all count equally.
     """
 
+    compact = True
     basis: Basis
     state: FloatArray
     gradients: bool

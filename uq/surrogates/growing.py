@@ -17,7 +17,7 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Solution, SolveError, scattered
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import OfEvaluate
-from uq.evaluation.request import CompactSum, Evaluate, Evaluations, FieldSum, Request, Start
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import ROWS_PER_TERM, Basis, Candidate, Candidates, hyperbolic, hyperbolic_count, orthonormal
 from uq.surrogates.field_regression import StateExpansion
@@ -60,7 +60,7 @@ class Growing(OfEvaluate):
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request, predicted by what is known when it is their turn."""
-        if request.fields is None or request.start is None or isinstance(request.fields, CompactSum):
+        if request.fields is None or request.start is None or request.fields.compact:
             return self._evaluate(request)
         parts, points = [], request.points
         while len(points):
@@ -107,7 +107,7 @@ class Growing(OfEvaluate):
 
 
 @dataclass(frozen=True)
-class _Beside:
+class _Beside(FieldSum):
     """Projections of the deviations of states from one on the functions of a basis, and another sum."""
 
     basis: Basis

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Prediction, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
 
@@ -90,7 +90,7 @@ class Linearisation:
 
 
 @dataclass(frozen=True)
-class _StateAndSlopes:
+class _StateAndSlopes(FieldSum):
     slopes: bool
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:

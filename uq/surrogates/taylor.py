@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluation.request import Evaluate, Request
+from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, gauss_rule
@@ -219,7 +219,7 @@ def _steps(inputs: Inputs) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _SecondDerivatives:
+class _SecondDerivatives(FieldSum):
     """Sums up to ∂²u/∂t_i∂t_j over points that are displaced from t̄ by ± h_i along one coordinate each."""
 
     coordinates: Coordinates

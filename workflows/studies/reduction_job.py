@@ -23,7 +23,7 @@ from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import Settings
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate, Request
+from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
@@ -134,9 +134,10 @@ class Reduce(Method):
 
 
 @dataclass(frozen=True)
-class KeptStates:
+class KeptStates(FieldSum):
     """Keep the state of each point and, if the spread of its parameters is given, adjoint states and its changes."""
 
+    compact = True
     spread: FloatArray | None
 
     def on(self, model: Any) -> Callable[[Solution, FloatArray], FloatArray]:

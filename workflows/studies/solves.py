@@ -19,7 +19,7 @@ from forward.model import FloatArray, SolveError
 from forward.words import number, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
-from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Prediction, Request
 from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # the order of ParaView
 
 
 @dataclass(frozen=True)
-class Touched:
+class Touched(FieldSum):
     """What each tool touches as rows (tools, U): of a node the pressure (Pa), and 1 if it is a vertex that may touch.
 
     Attributes
