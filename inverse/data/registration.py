@@ -94,6 +94,14 @@ class Given(_Motion):
         """Whether its errors are among those of the data."""
         return self.rotation_std > 0 or self.translation_std > 0
 
+    def registered(
+        self, places: FloatArray, unit: float, surface: Surface | None, extent: float, name: str
+    ) -> Registered:
+        """Return it, about the centre of the points; arguments as of `ToSurface.registered`."""
+        motion = self.at(unit)
+        std = [np.radians(self.rotation_std)] * 3 + [unit * self.translation_std] * 3
+        return Registered(motion, motion(places).mean(axis=0), np.diag(std), self.uncertain)
+
 
 class Landmarks(Settings):
     """The motion that takes landmarks of a file to known places of the body; lengths are in the unit of the file.
@@ -122,11 +130,52 @@ class Landmarks(Settings):
         n = len(self.points)
         if len(self.onto) != n:
             raise ValueError(f"{n} points onto {len(self.onto)} places, expected as many")
-        if isinstance(self.sigma, tuple) and len(self.sigma) != n:
-            raise ValueError(f"{len(self.sigma)} standard deviations of {n} points, expected as many, or one number")
+        sigma = np.asarray(self.sigma)
+        if sigma.shape not in {(), (n,)}:
+            raise ValueError(f"{sigma.size} standard deviations of {n} points, expected as many, or one number")
         if self.sigma is None and self.uncertain and n == 3:
             raise ValueError("three landmarks do not say how uncertain they are, expected sigma, or more landmarks")
         return self
+
+    def registered(
+        self, places: FloatArray, unit: float, surface: Surface | None, extent: float, name: str
+    ) -> Registered:
+        """Find it; arguments and errors as of `ToSurface.registered`."""
+        p, q = unit * np.array(self.points), unit * np.array(self.onto)
+        n = len(p)
+        sigma = unit * np.broadcast_to(np.asarray(1.0 if self.sigma is None else self.sigma, dtype=float), (n,))
+        w = sigma**-2 / (sigma**-2).sum()
+        middle, there = w @ p, w @ q
+        a, b = p - middle, q - there
+        for points, which in ((a, "points"), (b, "onto")):
+            if np.linalg.svd(points, compute_uv=False)[1] < COLLINEAR * np.linalg.norm(points):
+                raise DataError(
+                    f"{name}: registration.{which}: the landmarks lie on one line, expected three that do not"
+                )
+        U, sizes, Vt = np.linalg.svd((w[:, None] * a).T @ b)
+        sign = np.sign(np.linalg.det(Vt.T @ U.T))
+        rotation = Vt.T @ np.diag([1, 1, sign]) @ U.T
+        motion = Rigid(rotation, there - rotation @ middle)
+        gap = motion(p) - q
+        rms = float(np.sqrt((gap**2).sum(axis=1).mean()))
+        mirrored = a @ (Vt.T @ np.diag([1, 1, -sign]) @ U.T).T - b
+        if sizes[2] > COLLINEAR * sizes[0] and sign < 0 and (mirrored**2).sum() < (gap**2).sum() / 4:
+            less = np.sqrt((mirrored**2).sum(axis=1).mean())
+            raise DataError(
+                f"{name}: registration: the landmarks fit a mirror image ({told(less, 'm', 3)} against "
+                f"{told(rms, 'm', 3)}): is an axis reversed, or are two landmarks exchanged?"
+            )
+        if rms > FAR * extent:
+            raise DataError(
+                f"{name}: registration: the landmarks miss their places by {told(rms, 'm', 3)} (root mean square) in a "
+                f"body of {told(extent, 'm', 3)}: are they in the same order, and in the unit of the file?"
+            )
+        if self.sigma is None:
+            sigma = np.full(n, np.sqrt((gap**2).sum() / max(3 * n - 6, 1)))
+        centre = motion(p).mean(axis=0)
+        J = slopes(motion(p), centre) / np.maximum(sigma, 1e-12 * extent)[:, None, None]
+        root = _root(J.reshape(-1, 6), np.linalg.norm(motion(p) - centre) / np.sqrt(n), extent)[0]
+        return Registered(motion, centre, root, self.uncertain, self.kind, n, rms)
 
 
 class ToSurface(_Motion):
@@ -146,6 +195,44 @@ class ToSurface(_Motion):
     kind: Literal["to-surface"] = "to-surface"
     sigma: Positive | None = None
     uncertain: bool = False
+
+    def registered(
+        self, places: FloatArray, unit: float, surface: Surface | None, extent: float, name: str
+    ) -> Registered:
+        """Find it.
+
+        Parameters
+        ----------
+        places
+            Points (n, 3) of the file (m).
+        unit
+            m per unit of the file.
+        surface
+            Of the body; needed for points on it only.
+        extent
+            Size of the body (m).
+        name
+            Of the file, for messages.
+
+        Raises
+        ------
+        DataError
+            If that is not possible.
+        """
+        assert surface is not None
+        places = np.unique(places, axis=0)
+        if len(places) < LEAST:
+            raise DataError(
+                f"{name}: registration: {len(places)} points, expected at least {LEAST} to fit them to a surface"
+            )
+        start = self.at(unit)
+        starts = [start]
+        if not self.moves:
+            there = start(places)
+            shift = surface.middle - (there.min(axis=0) + there.max(axis=0)) / 2
+            starts.append(Rigid(start.rotation, start.shift + shift))
+        found = min((_fitted(one, places, unit, self, surface, extent) for one in starts), key=lambda one: one.rms)
+        return replace(found, uncertain=self.uncertain)
 
 
 Registration = Annotated[Given | Landmarks | ToSurface, Field(discriminator="kind")]
@@ -210,100 +297,6 @@ class Surface(Protocol):
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the nearest places (n, 3) to points (n, 3), and the normals (n, 3) there, of either sign."""
-
-
-def register(
-    how: Given | Landmarks | ToSurface,
-    places: FloatArray,
-    unit: float,
-    surface: Surface | None,
-    extent: float,
-    name: str,
-) -> Registered:
-    """Register a scan.
-
-    Parameters
-    ----------
-    how
-        What is known.
-    places
-        Points (n, 3) of the file (m).
-    unit
-        m per unit of the file.
-    surface
-        Of the body; needed for points on it only.
-    extent
-        Size of the body (m).
-    name
-        Of the file, for messages.
-
-    Raises
-    ------
-    DataError
-        If that is not possible.
-    """
-    if isinstance(how, Given):
-        motion = how.at(unit)
-        std = [np.radians(how.rotation_std)] * 3 + [unit * how.translation_std] * 3
-        return Registered(motion, motion(places).mean(axis=0), np.diag(std), how.uncertain)
-    if isinstance(how, Landmarks):
-        return _by_landmarks(how, unit, extent, name)
-    assert surface is not None
-    return _to_surface(how, places, unit, surface, extent, name)
-
-
-def _by_landmarks(how: Landmarks, unit: float, extent: float, name: str) -> Registered:
-    p, q = unit * np.array(how.points), unit * np.array(how.onto)
-    n = len(p)
-    sigma = unit * np.broadcast_to(np.asarray(1.0 if how.sigma is None else how.sigma, dtype=float), (n,))
-    w = sigma**-2 / (sigma**-2).sum()
-    middle, there = w @ p, w @ q
-    a, b = p - middle, q - there
-    for points, which in ((a, "points"), (b, "onto")):
-        if np.linalg.svd(points, compute_uv=False)[1] < COLLINEAR * np.linalg.norm(points):
-            raise DataError(f"{name}: registration.{which}: the landmarks lie on one line, expected three that do not")
-    U, sizes, Vt = np.linalg.svd((w[:, None] * a).T @ b)
-    sign = np.sign(np.linalg.det(Vt.T @ U.T))
-    rotation = Vt.T @ np.diag([1, 1, sign]) @ U.T
-    motion = Rigid(rotation, there - rotation @ middle)
-    gap = motion(p) - q
-    rms = float(np.sqrt((gap**2).sum(axis=1).mean()))
-    mirrored = a @ (Vt.T @ np.diag([1, 1, -sign]) @ U.T).T - b
-    if sizes[2] > COLLINEAR * sizes[0] and sign < 0 and (mirrored**2).sum() < (gap**2).sum() / 4:
-        less = np.sqrt((mirrored**2).sum(axis=1).mean())
-        raise DataError(
-            f"{name}: registration: the landmarks fit a mirror image ({told(less, 'm', 3)} against "
-            f"{told(rms, 'm', 3)}): is an axis reversed, or are two landmarks exchanged?"
-        )
-    if rms > FAR * extent:
-        raise DataError(
-            f"{name}: registration: the landmarks miss their places by {told(rms, 'm', 3)} (root mean square) in a "
-            f"body of {told(extent, 'm', 3)}: are they in the same order, and in the unit of the file?"
-        )
-    if how.sigma is None:
-        sigma = np.full(n, np.sqrt((gap**2).sum() / max(3 * n - 6, 1)))
-    centre = motion(p).mean(axis=0)
-    J = slopes(motion(p), centre) / np.maximum(sigma, 1e-12 * extent)[:, None, None]
-    root = _root(J.reshape(-1, 6), np.linalg.norm(motion(p) - centre) / np.sqrt(n), extent)[0]
-    return Registered(motion, centre, root, how.uncertain, how.kind, n, rms)
-
-
-def _to_surface(
-    how: ToSurface, places: FloatArray, unit: float, surface: Surface, extent: float, name: str
-) -> Registered:
-    places = np.unique(places, axis=0)
-    if len(places) < LEAST:
-        raise DataError(
-            f"{name}: registration: {len(places)} points, expected at least {LEAST} to fit them to a surface"
-        )
-    start = how.at(unit)
-    starts = [start]
-    if not how.moves:
-        there = start(places)
-        shift = surface.middle - (there.min(axis=0) + there.max(axis=0)) / 2
-        starts.append(Rigid(start.rotation, start.shift + shift))
-    found = min((_fitted(one, places, unit, how, surface, extent) for one in starts), key=lambda one: one.rms)
-    return replace(found, uncertain=how.uncertain)
 
 
 def _fitted(

@@ -25,7 +25,7 @@ from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
 from inverse.data.measurements import Measurements
-from inverse.data.registration import ToSurface, register
+from inverse.data.registration import ToSurface
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
@@ -293,7 +293,7 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     surface = Surface.of(body) if scan.surface or isinstance(scan.registration, ToSurface) else None
     if scan.registration is not None:
         points = found.places_of_points
-        found = found.moved_by(register(scan.registration, points, found.unit, surface, extent, path.name))
+        found = found.moved_by(scan.registration.registered(points, found.unit, surface, extent, path.name))
     allowed = tolerance(body) if scan.tolerance is None else scan.tolerance
     nearest_place = (lambda points: surface.nearest(points)[0]) if scan.surface and surface else body.nearest
     leave_out = scan.beyond == "leave-out"

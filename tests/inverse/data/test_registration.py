@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from forward.bodies.geometry import Box
 from forward.bodies.surface import Surface
-from inverse.data.registration import Given, Landmarks, ToSurface, register
+from inverse.data.registration import Given, Landmarks, ToSurface
 from inverse.data.rigid import Rigid, crosses, slopes, turned
 from inverse.data.table import DataError
 
@@ -66,10 +66,10 @@ def test_known_motions():
         Given(matrix=tuple(map(tuple, whole.tolist()))),
         Given(matrix=tuple(map(tuple, whole[:3].tolist()))),
     ):
-        found = register(how, points, 1e-3, None, 0.05, "scan")
+        found = how.registered(points, 1e-3, None, 0.05, "scan")
         np.testing.assert_allclose(found.motion(points), on_box(20), atol=1e-12)
         assert not found.uncertain
-    found = register(Given(rotation_std=1.0, translation_std=0.5), points, 1e-3, None, 0.05, "scan")
+    found = Given(rotation_std=1.0, translation_std=0.5).registered(points, 1e-3, None, 0.05, "scan")
     assert found.uncertain
     np.testing.assert_allclose(found.std, [np.radians(1.0)] * 3 + [5e-4] * 3)
 
@@ -84,7 +84,7 @@ def test_landmarks_are_those_of_scipy():
         how = Landmarks(
             points=tuple(map(tuple, 1e3 * seen)), onto=tuple(map(tuple, 1e3 * there)), sigma=tuple(1e3 * sigma)
         )
-        found = register(how, seen, 1e-3, None, 0.05, "scan")
+        found = how.registered(seen, 1e-3, None, 0.05, "scan")
         gaps.append(gap(found))
     w = sigma**-2 / (sigma**-2).sum()
     expected = Rotation.align_vectors(there - w @ there, seen - w @ seen, weights=w)[0]
@@ -96,14 +96,14 @@ def test_landmarks_are_those_of_scipy():
 
 def test_points_find_the_surface():
     """From 5° and 10 mm away, also among points of something else, and as uncertain as it says."""
-    exact = register(ToSurface(), back(on_box(200)), 1.0, BOX, 0.05, "scan")
+    exact = ToSurface().registered(back(on_box(200)), 1.0, BOX, 0.05, "scan")
     assert np.abs(gap(exact)).max() < 1e-8
     assert exact.unseen == ()
     rng, squares, noise = np.random.default_rng(4), [], 1e-4
     for trial in range(12):
         seen = back(on_box(150, trial) + noise * rng.normal(size=(150, 3)))
         seen[:5] += rng.uniform(-0.02, 0.02, size=(5, 3))
-        found = register(ToSurface(uncertain=True), seen, 1.0, BOX, 0.05, "scan")
+        found = ToSurface(uncertain=True).registered(seen, 1.0, BOX, 0.05, "scan")
         assert found.uncertain
         squares.append(gap(found) @ np.linalg.solve(found.root.T @ found.root, gap(found)))
     assert 3 < np.mean(squares) < 9, np.mean(squares)
@@ -118,14 +118,14 @@ def test_motions_that_cannot_be_found():
     ball = Surface(corners[ConvexHull(corners).simplices])
     points = 0.02 * np.random.default_rng(1).normal(size=(300, 3))
     points *= 0.02 / np.linalg.norm(points, axis=1, keepdims=True)
-    found = register(ToSurface(uncertain=True), points + np.array([0.001, 0, 0]), 1.0, ball, 0.04, "scan")
+    found = ToSurface(uncertain=True).registered(points + np.array([0.001, 0, 0]), 1.0, ball, 0.04, "scan")
     np.testing.assert_allclose(found.motion.shift, [-0.001, 0, 0], atol=3e-5)
     assert len(found.unseen) >= 1
     assert all("rotation" in one for one in found.unseen)
     assert found.std[:3].min() > 0.1
     face = on_box(300)
     face = face[face[:, 2] == SIZE[2]] + np.array([0, 0, 0.002])
-    found = register(ToSurface(), face, 1.0, BOX, 0.05, "scan")
+    found = ToSurface().registered(face, 1.0, BOX, 0.05, "scan")
     assert found.motion.shift[2] == pytest.approx(-0.002, abs=1e-6)
     assert set(found.unseen) == {"shift along x", "shift along y", "rotation about z"}
 
@@ -167,7 +167,7 @@ def test_what_cannot_be_registered():
     def told(seen, onto=there):
         how = Landmarks(points=tuple(map(tuple, seen)), onto=tuple(map(tuple, onto)))
         with pytest.raises(DataError) as caught:
-            register(how, seen, 1.0, None, 0.05, "scan")
+            how.registered(seen, 1.0, None, 0.05, "scan")
         assert len(caught.value.args) == 1
         return str(caught.value)
 
@@ -175,4 +175,4 @@ def test_what_cannot_be_registered():
     assert "the landmarks lie on one line" in told(np.outer(np.arange(3.0), [1, 2, 3]), there[:3])
     assert "in the same order, and in the unit of the file?" in told(1e3 * back(there))
     with pytest.raises(DataError, match="scan: registration: 5 points, expected at least 6 to fit them to a surface"):
-        register(ToSurface(), there[:5], 1.0, BOX, 0.05, "scan")
+        ToSurface().registered(there[:5], 1.0, BOX, 0.05, "scan")
