@@ -30,35 +30,32 @@ VANISHING = 1e-16  # density over the largest one
 
 
 @dataclass(frozen=True, eq=False)
-class InferredNoise:
-    """A posterior with the most probable size of its noise.
+class SolvedField:
+    """The mode of a posterior of a field, with the most probable size of its noise where that is inferred.
 
     Attributes
     ----------
+    mode, found
+        The mode, of the posterior with the standard deviations sσ, and the Gaussian there.
+    converged
+        Whether the mode was found, and s has converged.
     factor
         s.
     log_std
         Standard deviation of ln s.
-    posterior
-        That of the field, with the standard deviations sσ.
-    mode, found
-        Its mode and the Gaussian there.
     log_evidence
-        ln p(y) with s integrated out; exact for linear models, up to the neglected pairs.
+        ln p(y) with s integrated out; exact for linear models, up to the neglected pairs. None where s is known.
     rounds
         s of each round.
-    converged
-        Whether s has converged and the mode was found.
     """
 
-    factor: float
-    log_std: float
-    posterior: FieldPosterior
     mode: Mode
     found: LowRankPosterior
-    log_evidence: float
-    rounds: tuple[float, ...]
     converged: bool
+    factor: float = 1.0
+    log_std: float = 0.0
+    log_evidence: float | None = None
+    rounds: tuple[float, ...] = ()
 
 
 def infer_noise(
@@ -69,7 +66,7 @@ def infer_noise(
     tolerance: float = STANDS,
     cutoff: float = CUTOFF,
     rank: int | None = None,
-) -> InferredNoise:
+) -> SolvedField:
     """Find the most probable size of the noise, with the mode and the Gaussian of the field there.
 
     Parameters
@@ -107,9 +104,7 @@ def infer_noise(
         if stands:
             break
         factor, start = best, mode.point.whitened
-    return InferredNoise(
-        rounds[-1], log_std, scaled, mode, found, log_evidence, tuple(rounds), stands and mode.converged
-    )
+    return SolvedField(mode, found, stands and mode.converged, rounds[-1], log_std, log_evidence, tuple(rounds))
 
 
 @dataclass(frozen=True)

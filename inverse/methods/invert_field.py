@@ -23,9 +23,9 @@ from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode, find_mode
-from inverse.fields.noise import infer_noise
+from inverse.fields.noise import SolvedField, infer_noise
 from inverse.methods.invert import Invert
-from inverse.methods.mesh_correction import corrected_field, of_the_mean
+from inverse.methods.mesh_correction import corrected_field, told
 from inverse.methods.record import (
     COLUMNS,
     ENDS,
@@ -63,26 +63,12 @@ class Vertices:
     volumes: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """The mode of a posterior and the Gaussian there; its noise where that is inferred, and ln p(y) with it."""
-
-    mode: Mode
-    found: LowRankPosterior
-    converged: bool
-    factor: float = 1.0
-    log_std: float = 0.0
-    log_evidence: float | None = None
-
-
-def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) -> _Solved:
-    if method.noise is None:
-        mode = find_mode(posterior, start)
-        found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
-        return _Solved(mode, found, mode.converged)
-    inferred = infer_noise(posterior, method.noise, start=start, cutoff=method.cutoff, rank=method.rank)
-    size = (inferred.factor, inferred.log_std, inferred.log_evidence)
-    return _Solved(inferred.mode, inferred.found, inferred.converged, *size)
+def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) -> SolvedField:
+    if method.noise is not None:
+        return infer_noise(posterior, method.noise, start=start, cutoff=method.cutoff, rank=method.rank)
+    mode = find_mode(posterior, start)
+    found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
+    return SolvedField(mode, found, mode.converged)
 
 
 def invert_field(
@@ -109,7 +95,7 @@ def invert_field(
         begun = _solve(method, posterior, None).mode.point
         posterior, first = replace(posterior, shared=shared(begun.values)), begun.whitened
 
-    def solve(asked: FieldPosterior, start: FloatArray | None) -> _Solved:
+    def solve(asked: FieldPosterior, start: FloatArray | None) -> SolvedField:
         return _solve(method, asked, first if start is None else start)
 
     treatment = method.treatment or "report"
@@ -179,10 +165,9 @@ def _before(posterior: FieldPosterior, finer: Finer, say: Callable[[str], None])
     look, _ = finer.look(values)
     if look is None:
         return np.nan
-    error = posterior.weights * (look.outputs - posterior.model.solve(values).outputs)
-    size = float(np.sqrt((error**2).sum() / posterior.measured.sum()))
-    say(of_the_mean(size, float(np.abs(error).max())))
-    return size
+    return told(
+        posterior.weights * (look.outputs - posterior.model.solve(values).outputs), posterior.measured.sum(), say
+    )
 
 
 def _corrected(

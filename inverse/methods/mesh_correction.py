@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,24 +25,13 @@ from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior
-    from inverse.fields.low_rank import LowRankPosterior
-    from inverse.fields.newton_cg import Mode
+    from inverse.fields.noise import SolvedField
 
 
-class SolvedField(Protocol):
-    """The mode of a posterior of a field, and the Gaussian there."""
-
-    @property
-    def mode(self) -> Mode:
-        """The mode."""
-
-    @property
-    def found(self) -> LowRankPosterior:
-        """The Gaussian."""
-
-
-S = TypeVar("S", bound=SolvedField)
 Treatment = Literal["correct", "report"]
+S = TypeVar("S")
+# An error, None where nothing tells it; what it does; and how far it moves unknowns at most.
+Seen = tuple[ApproximationError | None, MeshFound, float]
 
 
 class MeshTreatment:
@@ -68,11 +57,13 @@ SETTLED = 0.1  # deviations of an unknown that are left when it is
 ROUNDS = 5
 
 
-def of_the_mean(size: float, largest: float) -> str:
-    """Say what the mesh does to data at the mean of the prior, in deviations of the noise, before the search."""
+def told(error: FloatArray, count: float, say: Callable[[str], None]) -> float:
+    """Say what the mesh does to `count` data at the mean of the prior, over the noise, before the search; its size."""
+    size, largest = float(np.sqrt((error**2).sum() / count)), float(np.abs(error).max())
     words = f"at the mean of the prior the error of the mesh is {size:.2g} standard deviations of the noise"
     done = "it will be looked at again at the mode, and corrected where it exceeds a fifth"
-    return f"{words} (root mean square; at most {largest:.2g}); {done}"
+    say(f"{words} (root mean square; at most {largest:.2g}); {done}")
+    return size
 
 
 def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -> float:
@@ -86,9 +77,7 @@ def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -
     if look is None or own.failures:
         return np.nan
     error = (look.outputs - own.outputs[0])[posterior.which] / posterior.sigma
-    size = float(np.sqrt((error**2).mean()))
-    say(of_the_mean(size, float(np.abs(error).max())))
-    return size
+    return told(error, error.size, say)
 
 
 def error_of(
@@ -108,6 +97,23 @@ def part(look: Look, which: NDArray[np.int64] | slice) -> Look:
     return Look(look.outputs[which], look.between[which], None if look.tangents is None else look.tangents[which])
 
 
+def _rounds(
+    here: S, looked: Callable[[S], Seen], again: Callable[[S, ApproximationError], S], treatment: Treatment
+) -> tuple[S, MeshFound]:
+    """Look at the error of the mesh where a search has ended, and search again with it, until it moves nothing more."""
+    known: MeshFound | None = None
+    while True:
+        error, found, largest = looked(here)
+        if error is None:
+            return here, found if known is None else replace(known, corrected=True, settled=False)
+        solves, corrected = 1 if known is None else known.solves + 1, known is not None
+        known = replace(found, corrected=corrected, settled=not corrected or largest <= SETTLED, solves=solves)
+        small = max(largest, float(np.abs(known.error).max())) <= EXCEEDS
+        if treatment == "report" or (known.settled if corrected else small) or solves == ROUNDS:
+            return here, known
+        here = again(here, error)
+
+
 def corrected_few(
     posterior: Posterior, gaussian: Laplace, finer: Finer, data: Measurements, treatment: Treatment
 ) -> tuple[Posterior, Laplace, MeshFound]:
@@ -118,16 +124,16 @@ def corrected_few(
     SolveError
         If the model has no answer at the mode.
     """
-    d, m = len(posterior.inputs.names), posterior.data.size
-    plain, known, left = gaussian.mode, None, np.zeros(d)
-    settled = False
-    for solves in range(1, ROUNDS + 1):
-        x = gaussian.mode[None]
+    d = len(posterior.inputs.names)
+
+    def looked(here: tuple[Posterior, Laplace]) -> Seen:
+        posterior, gaussian = here
+        x, mesh = gaussian.mode[None], posterior.mesh
         at = posterior.at(x, derivatives=True)
         point = at.parameters[0]
         look, why = finer.look(point, tangents=True)
         if look is None:
-            break
+            return None, MeshFound.unknown(why, posterior.data.size, d, 0 if finer.solve is None else 1), 0.0
         assert at.tangents is not None
         tangents = at.tangents[0, posterior.which]
         found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, data, tangents)
@@ -135,37 +141,31 @@ def corrected_few(
         root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
         deviations = np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T))
-        rest = found.error if posterior.mesh is None else found.error - posterior.mesh.at(point[None])[0]
+        rest = found.error if mesh is None else found.error - mesh.at(point[None])[0]
         shift = parameters_moved(posterior, gaussian, A, root * posterior.whitening(rest / scale)) / deviations
-        if posterior.mesh is not None:
+        factor = 1.0 if posterior.noise is None else posterior.physical(x)[0, -1]
+        largest, left = np.abs(shift).max(), np.zeros(d)
+        if mesh is not None:
             gain = slopes @ np.linalg.solve(gaussian.hessian[:d, :d], (root[:, None] * A).T)
-            left = _left(posterior.whitening(gain) / scale, posterior.mesh) / deviations
+            left = _left(posterior.whitening(gain) / scale, mesh) / deviations
+            # The size of the noise that the covariance was made for must be that of this mode too.
+            largest = max(largest, abs(np.log(factor / mesh.scale)))
         added = _evidence(posterior, at, found.error)
-        factor = posterior.physical(x)[0, -1] if posterior.noise is not None else 1.0
-        known = MeshFound(
-            "", found.error / (factor * posterior.sigma), shift, left, posterior.mesh is not None, True, added, solves
-        )
-        largest = np.abs(shift).max()
-        # The size of the noise that the covariance was made for must be that of this mode too.
-        if posterior.mesh is not None and max(largest, abs(np.log(factor / posterior.mesh.scale))) <= SETTLED:
-            settled = True
-            break
-        small = posterior.mesh is None and max(largest, np.abs(known.error).max()) <= EXCEEDS
-        if treatment == "report" or small or solves == ROUNDS:
-            settled = posterior.mesh is None
-            break
-        posterior = replace(posterior, mesh=replace(found, scale=float(factor)))
-        gaussian = laplace(posterior, starts=1, first=gaussian.mode, exact=False)
-    if known is None:
-        return posterior, gaussian, MeshFound.unknown(why, m, d, 0 if finer.solve is None else 1)
-    if posterior.mesh is not None:
-        final = laplace(posterior, starts=1, first=gaussian.mode)
-        slopes = posterior.inputs.from_normals(final.mode[None, :d])[1][0]
-        deviations = np.sqrt(np.diag(slopes @ final.covariance[:d, :d] @ slopes.T))
-        moved_by = posterior.physical(final.mode[None])[0] - posterior.physical(plain[None])[0]
-        known = replace(known, shift=moved_by[:d] / deviations, corrected=True)
-        gaussian = final
-    return posterior, gaussian, replace(known, settled=settled)
+        known = MeshFound("", found.error / (factor * posterior.sigma), shift, left, log_evidence=added)
+        return replace(found, scale=float(factor)), known, float(largest)
+
+    def again(here: tuple[Posterior, Laplace], mesh: ApproximationError) -> tuple[Posterior, Laplace]:
+        corrected = replace(here[0], mesh=mesh)
+        return corrected, laplace(corrected, starts=1, first=here[1].mode, exact=False)
+
+    (there, best), known = _rounds((posterior, gaussian), looked, again, treatment)
+    if known.corrected:
+        best = laplace(there, starts=1, first=best.mode)
+        slopes = there.inputs.from_normals(best.mode[None, :d])[1][0]
+        deviations = np.sqrt(np.diag(slopes @ best.covariance[:d, :d] @ slopes.T))
+        moved_by = there.physical(best.mode[None])[0] - there.physical(gaussian.mode[None])[0]
+        known = replace(known, shift=moved_by[:d] / deviations)
+    return there, best, known
 
 
 def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
@@ -180,12 +180,12 @@ def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
 
 def corrected_field(
     posterior: FieldPosterior,
-    solve: Callable[[FieldPosterior, FloatArray | None], S],
+    solve: Callable[[FieldPosterior, FloatArray | None], SolvedField],
     finer: Finer,
     data: Measurements,
     treatment: Treatment,
     weights: FloatArray,
-) -> tuple[S, FloatArray, MeshFound]:
+) -> tuple[SolvedField, FloatArray, MeshFound]:
     """Do the same for a field of N values: what was solved last, how far its mode moves (N,), and what was found.
 
     Parameters
@@ -199,42 +199,33 @@ def corrected_field(
     weights
         Of the vertices (N,) in the mean over the body.
     """
-    here = solve(posterior, None)
-    plain, images, known, mesh = here.found.mean, here.found.spectrum.images, None, None
-    settled, moved, left = False, np.full(len(weights), np.nan), np.zeros(1)
-    for solves in range(1, ROUNDS + 1):
-        point = here.mode.point
+    first = solve(posterior, None)
+    images, moved = first.found.spectrum.images, np.full(len(weights), np.nan)
+
+    def looked(here: SolvedField) -> Seen:
+        nonlocal moved
+        point, mesh = here.mode.point, here.mode.point.posterior.mesh
         look, why = finer.look(point.values)
         if look is None:
-            break
+            return None, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1), 0.0
         found = error_of(look, np.asarray(point.solution.outputs), point.values, data)
         found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.whitening)]))
         over = found.error * posterior.measured / point.posterior.sigma  # nothing is said of data that are not there
-        rest = found.error if mesh is None else found.error - mesh.error
-        moved = _moved(here, rest)
-        deviations = here.found.std
+        moved = _moved(here, found.error if mesh is None else found.error - mesh.error)
         width = here.found.marginal(weights)[1]
         shift = np.array([weights @ moved / width])
-        largest = max(abs(float(shift[0])), float(np.sqrt(((moved / deviations) ** 2).mean())))
-        if mesh is not None:
-            left = _left(_gain(here, weights)[None], mesh) / width
-        known = MeshFound("", over, shift, left, mesh is not None, solves=solves)
-        if mesh is not None and largest <= SETTLED:
-            settled = True
-            break
-        small = mesh is None and max(largest, float(np.abs(known.error).max())) <= EXCEEDS
-        if treatment == "report" or small or solves == ROUNDS:
-            settled = mesh is None
-            break
-        mesh = found
-        here = solve(replace(posterior, mesh=mesh), point.whitened)
-    if known is None:
-        return here, moved, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1)
-    if mesh is not None:
-        moved = here.found.mean - plain
-        width = here.found.marginal(weights)[1]
-        known = replace(known, shift=np.array([weights @ moved / width]), corrected=True)
-    return here, moved, replace(known, settled=settled)
+        largest = max(abs(float(shift[0])), float(np.sqrt(((moved / here.found.std) ** 2).mean())))
+        left = np.zeros(1) if mesh is None else _left(_gain(here, weights)[None], mesh) / width
+        return found, MeshFound("", over, shift, left), largest
+
+    def again(here: SolvedField, mesh: ApproximationError) -> SolvedField:
+        return solve(replace(posterior, mesh=mesh), here.mode.point.whitened)
+
+    here, known = _rounds(first, looked, again, treatment)
+    if known.corrected:
+        moved = here.found.mean - first.found.mean
+        known = replace(known, shift=np.array([weights @ moved / here.found.marginal(weights)[1]]))
+    return here, moved, known
 
 
 def _moved(here: SolvedField, error: FloatArray) -> FloatArray:

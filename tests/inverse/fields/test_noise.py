@@ -46,7 +46,7 @@ def test_linear_models(prior):
     log_s = np.log(np.maximum(prior.from_normal(x)[0], 1e-300))
     w /= w.sum()
     assert found.log_std == pytest.approx(np.sqrt(w @ (log_s - w @ log_s) ** 2), rel=1e-4)
-    np.testing.assert_allclose(found.posterior.sigma, found.factor * problem.sigma)
+    np.testing.assert_allclose(found.mode.point.posterior.sigma, found.factor * problem.sigma)
 
 
 @pytest.mark.unit
@@ -88,7 +88,7 @@ def test_models_that_are_not_linear():
     found = infer_noise(posterior, LogUniform(lower=0.1, upper=100.0))
     assert found.converged
     assert abs(np.log(found.factor * 0.01 / truth_sigma)) < 3 * found.log_std
-    again = find_mode(found.posterior, tolerance=1e-8).point.whitened
+    again = find_mode(found.mode.point.posterior, tolerance=1e-8).point.whitened
     np.testing.assert_allclose(found.mode.point.whitened, again, atol=0.02)
 
 
