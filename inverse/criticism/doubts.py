@@ -251,71 +251,15 @@ def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[F
 def of_mesh(
     one: xr.Dataset, error: FloatArray, *, settled: bool, counted: bool = True, from_file: bool = False
 ) -> list[Finding]:
-    """Say what the mesh does to a data set or group of data, by its results, and what of it is doubtful.
-
-    The `error` (n,) is what finer meshes add to the measured data, over the noise; others are as of `mesh_corrected`.
-    """
-    shifts, left = (
-        dict(zip(map(str, one.parameter.values), one[key].to_numpy().tolist(), strict=True))
-        for key in ("mesh_shift", "mesh_left")
-    )
-    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
-    if bool(one["mesh_corrected"]):
-        return mesh_corrected(error, shifts, left, nodes, settled=settled, counted=counted, from_file=from_file)
-    return mesh_too_coarse(bool(one["mesh_checked"]), str(one["mesh_why"].item()), error, shifts, nodes)
-
-
-def mesh_too_coarse(
-    looked: bool, why: str, error: FloatArray, shifts: Mapping[str, float], nodes: FloatArray
-) -> list[Finding]:
-    """Doubt the mesh, judging by a finer one.
+    """Say what the mesh does to a data set or group of data, and doubt it where that, or its correction, decides.
 
     Parameters
     ----------
-    looked
-        Whether there was a solve on a finer mesh, or else `why` not.
+    one
+        Results: whether finer meshes were looked at and the mesh is corrected; shifts of unknowns by that, and what is
+        uncertain of them, over their posterior deviations.
     error
-        What it adds to the predicted data (n,), over the noise.
-    shifts
-        The resulting shifts of unknowns, by name, over their posterior deviations.
-    nodes
-        The same for a field at the vertices (N,), or None.
-    """
-    if not looked:
-        return [Finding("mesh-not-checked", "warning", {"why": why})]
-    size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
-    listed, worst = _moves(shifts, nodes)
-    values = {"size": size, "most": most, "listed": listed, "worst": worst}
-    if worst <= BIASED:
-        return [Finding("mesh-moves-little", "note", values)]
-    return [Finding("mesh-too-coarse", "error" if worst > WRONG else "warning", values)]
-
-
-def not_estimable(names: Sequence[str]) -> list[Finding]:
-    """Doubt data of outputs, by name, whose error of the mesh nothing tells."""
-    if not names:
-        return []
-    return [Finding("mesh-not-estimable", "warning", {"names": ", ".join(names)})]
-
-
-def mesh_corrected(
-    error: FloatArray,
-    shifts: Mapping[str, float],
-    left: Mapping[str, float],
-    nodes: FloatArray,
-    *,
-    settled: bool,
-    counted: bool = True,
-    from_file: bool = False,
-) -> list[Finding]:
-    """Say what correcting the error of the mesh has done, and doubt it where it decides.
-
-    Parameters
-    ----------
-    error, shifts, nodes
-        As of `mesh_too_coarse`: what the correction has moved.
-    left
-        Standard deviations of what is uncertain of that, by name, over those of the posterior.
+        What finer meshes add to the measured data (n,), over the noise.
     settled
         Whether the error at the mode is the one that was corrected.
     counted
@@ -323,10 +267,20 @@ def mesh_corrected(
     from_file
         Whether the mesh is that of a file.
     """
+    corrected = bool(one["mesh_corrected"])
+    if not corrected and not bool(one["mesh_checked"]):
+        return [Finding("mesh-not-checked", "warning", {"why": str(one["mesh_why"].item())})]
+    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
     size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
-    listed, worst = _moves(shifts, nodes)
-    uncertain = max([value for value in left.values() if np.isfinite(value)], default=0.0)
-    values = {"size": size, "most": most, "listed": listed, "uncertain": uncertain}
+    listed, worst = _moves(dict(zip(map(str, one.parameter.values), one["mesh_shift"].to_numpy(), strict=True)), nodes)
+    values: dict[str, Any] = {"size": size, "most": most, "listed": listed}
+    if not corrected:
+        values["worst"] = worst
+        if worst <= BIASED:
+            return [Finding("mesh-moves-little", "note", values)]
+        return [Finding("mesh-too-coarse", "error" if worst > WRONG else "warning", values)]
+    left = one["mesh_left"].to_numpy()
+    values["uncertain"] = uncertain = float(left[np.isfinite(left)].max(initial=0.0))
     if not settled:
         bad = worst > WRONG and size > UNSETTLED
         return [Finding("mesh-correction-unsettled", "error" if bad else "warning", values)]
@@ -337,6 +291,13 @@ def mesh_corrected(
     if from_file and not len(nodes) and beyond_files(size):
         return [Finding("mesh-correction-of-file", "warning", values)]
     return [Finding("mesh-corrected", "note", values)]
+
+
+def not_estimable(names: Sequence[str]) -> list[Finding]:
+    """Doubt data of outputs, by name, whose error of the mesh nothing tells."""
+    if not names:
+        return []
+    return [Finding("mesh-not-estimable", "warning", {"names": ", ".join(names)})]
 
 
 def decides(shift: Any, left: Any) -> Any:
@@ -351,7 +312,7 @@ def beyond_files(size: Any) -> Any:
 
 def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
     """Shifts of unknowns in words, the largest first, and its size."""
-    moved = {name: shift for name, shift in shifts.items() if np.isfinite(shift)}
+    moved = {name: float(shift) for name, shift in shifts.items() if np.isfinite(shift)}
     everywhere = float(np.sqrt((nodes**2).mean())) if len(nodes) else 0.0
     worst = max([abs(shift) for shift in moved.values()] + [everywhere], default=0.0)
     ordered = sorted(moved.items(), key=lambda item: -abs(item[1]))

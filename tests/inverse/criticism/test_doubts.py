@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from inverse.criticism.doubts import (
     at_an_end,
     far_from_prior,
     little_seen,
-    mesh_corrected,
-    mesh_too_coarse,
     noise_far,
+    of_mesh,
     scores,
     strangers,
     too_large_errors,
@@ -115,42 +115,53 @@ def test_data_that_do_not_belong_are_listed():
     assert "line 3: +6.7" in doubt.text
 
 
+def moved(shifts, left=None, nodes=(), why=""):
+    """Results with shifts by a mesh, and what is left of its correction; without that it is not corrected."""
+    found = {"mesh_corrected": left is not None, "mesh_checked": not why, "mesh_why": why}
+    found["mesh_shift"] = ("parameter", list(shifts.values()))
+    found["mesh_left"] = ("parameter", [(left or {}).get(name, np.nan) for name in shifts])
+    if len(nodes):
+        found["stiffness_mesh_shift"] = ("node", nodes)
+    return xr.Dataset(found, {"parameter": list(shifts)})
+
+
 def test_the_mesh_is_doubted_by_what_it_does_to_the_unknowns():
     error = np.array([0.1, -0.3])
-    none = np.zeros(0)
-    (note,) = mesh_too_coarse(True, "", error, {"x": 0.1, "noise": np.nan}, none)
+    (note,) = of_mesh(moved({"x": 0.1, "noise": np.nan}), error, settled=True)
     assert note.severity == "note"
-    (doubt,) = mesh_too_coarse(True, "", error, {"x": 0.1, "radius": -0.9}, none)
+    (doubt,) = of_mesh(moved({"x": 0.1, "radius": -0.9}), error, settled=True)
     assert doubt.severity == "warning"
     assert "radius −0.9, x +0.1" in doubt.text
-    assert mesh_too_coarse(True, "", error, {"x": 2.5}, none)[0].severity == "error"
-    assert mesh_too_coarse(True, "", error, {"mean": 0.0}, np.full(9, 0.7))[0].severity == "warning"
-    (doubt,) = mesh_too_coarse(False, "method.mesh_check = false", np.full(2, np.nan), {"x": np.nan}, none)
+    assert of_mesh(moved({"x": 2.5}), error, settled=True)[0].severity == "error"
+    assert of_mesh(moved({"mean": 0.0}, nodes=np.full(9, 0.7)), error, settled=True)[0].severity == "warning"
+    (doubt,) = of_mesh(moved({"x": np.nan}, why="method.mesh_check = false"), np.full(2, np.nan), settled=True)
     assert doubt.text == "Not checked for the mesh: method.mesh_check = false."
     assert doubt.severity == "warning"
 
 
 def test_a_corrected_mesh_is_a_note_unless_it_decides():
-    error, shifts, none = np.array([0.4, -1.2]), {"x": 3.1, "y": -0.2, "noise": np.nan}, np.zeros(0)
-    (note,) = mesh_corrected(error, shifts, {"x": 0.3, "noise": np.nan}, none, settled=True)
+    error, shifts = np.array([0.4, -1.2]), {"x": 3.1, "y": -0.2, "noise": np.nan}
+    (note,) = of_mesh(moved(shifts, {"x": 0.3, "noise": np.nan}), error, settled=True)
     assert note.severity == "note"
     assert "was corrected" in note.text
     assert "x +3.1, y −0.2" in note.text
     assert "up to 0.3 of these deviations" in note.text
     for changed in ({"settled": False}, {"left": {"x": 0.9}}, {"shifts": {"x": -25.0}}, {"nodes": np.full(3, 30.0)}):
-        given = {"shifts": shifts, "left": {"x": 0.3}, "nodes": none, "settled": True} | changed
-        (doubt,) = mesh_corrected(error, **given)
+        given = {"shifts": shifts, "left": {"x": 0.3}, "settled": True} | changed
+        settled = given.pop("settled")
+        (doubt,) = of_mesh(moved(**given), error, settled=settled)
         assert doubt.severity == "warning"
         assert "take a finer one" in doubt.text
-    (doubt,) = mesh_corrected(10 * error, shifts, {"x": 0.3}, none, settled=False)
+    one = moved(shifts, {"x": 0.3})
+    (doubt,) = of_mesh(one, 10 * error, settled=False)
     assert doubt.severity == "error"
     for size, severity in ((1.5, "note"), (3.0, "warning")):  # as far as intervals of bodies from files hold
-        (doubt,) = mesh_corrected(np.full(9, size), shifts, {"x": 0.3}, none, settled=True, from_file=True)
+        (doubt,) = of_mesh(one, np.full(9, size), settled=True, from_file=True)
         assert doubt.severity == severity
     # Of a field, what the data determine best may be wrong where vertices are not.
+    one = moved({"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4))
     for size, counted, severity in ((3.5, True, "note"), (4.5, True, "warning"), (3.5, False, "warning")):
-        field = ({"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4))
-        (doubt,) = mesh_corrected(np.full(9, size), *field, settled=True, counted=counted)
+        (doubt,) = of_mesh(one, np.full(9, size), settled=True, counted=counted)
         assert doubt.severity == severity
         assert ("what the data determine best" in doubt.text) == (severity == "warning")
 
