@@ -143,7 +143,7 @@ def _run(
         case "pcn":
             # Fewer points say little about a covariance.
             enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
-            return chains_of_few(posterior, found if enough else gaussian, seed=seed)
+            return chains_of_few(posterior, gaussian, found if enough else None, seed=seed)
         case _:
             assert_never(kind)
 

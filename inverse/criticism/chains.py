@@ -234,28 +234,23 @@ def crank_nicolson(
 
 
 def chains_of_few(
-    posterior: Posterior,
-    around: Laplace | Evidence,
-    *,
-    lengths: Lengths = FEW,
-    seed: int = 0,
+    posterior: Posterior, gaussian: Laplace, points: Evidence | None = None, *, lengths: Lengths = FEW, seed: int = 0
 ) -> Chains:
     """Run chains for few parameters, kept in physical units.
 
     Parameters
     ----------
-    posterior
-        What is sampled.
-    around
-        Laplace's Gaussian, or weighted points, whose mean and (slightly widened) covariance are used: if the posterior
-        is curved, Laplace's is too narrow, and chains get stuck in its tails.
+    posterior, gaussian
+        What is sampled, and Laplace's Gaussian.
+    points
+        Weighted points, whose mean and (slightly widened) covariance are used in its place: if the posterior is curved,
+        Laplace's is too narrow, and chains get stuck in its tails.
     lengths, seed
         As in `crank_nicolson`.
     """
-    if isinstance(around, Laplace):
-        centre, root = around.mode, around.root
-    else:
-        w, x = around.weights, around.density.x
+    centre, root = gaussian.mode, gaussian.root
+    if points is not None:
+        w, x = points.weights, points.density.x
         centre = w @ x
         root = WIDER * np.linalg.cholesky((x - centre).T @ ((x - centre) * w[:, None]))
 

@@ -74,9 +74,10 @@ def as_rows(table: Table, name: str, steps: Steps) -> Table:
     before: tuple[int, int] | None = None  # step and line of the row before
     first: dict[tuple[int, str, str], int] = {}  # lines by what was measured
     for row, line in zip(table.rows, table.lines, strict=True):
-        at = _step(row, f"{name}: line {line}", where, places, scales)
-        if isinstance(at, str):
-            wrong.append(at)
+        try:
+            at = _step(row, where, places, scales)
+        except ValueError as error:
+            wrong.append(f"{name}: line {line}: {error}")
             continue
         if before is not None and at < before[0] and "step" not in table.columns:
             message = f"{where[0]} = {row[where[0]]} after that of line {before[1]}, which is farther along the path"
@@ -145,19 +146,15 @@ def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
 
 def _step(
     row: Mapping[str, str],
-    label: str,
     where: Sequence[str],
     places: Mapping[str, tuple[str, FloatArray]],
     scales: Mapping[str, float],
-) -> int | str:
-    """Return the step of a row, from 1, or what is wrong with its place."""
+) -> int:
+    """Return the step of a row, from 1; a ValueError for what is wrong with its place."""
     near = np.ones(len(places["step"][1]), dtype=bool)
     told = []
     for column in where:
-        try:
-            value = needed(row[column], column) * scales[column]
-        except ValueError as error:
-            return f"{label}: {error}"
+        value = needed(row[column], column) * scales[column]
         values = places[column][1]
         near &= np.abs(values - value) <= CLOSE * np.abs(values).max()
         told.append(f"{column} = {value:g}")
@@ -170,7 +167,7 @@ def _step(
         values, given = places[column][1], float(row[column])
         if places[column][0] == "m" and (np.abs(values - 1e-3 * given) <= CLOSE * np.abs(values).max()).any():
             hint = f" (in millimetres? then its head is '{column} [mm]', and all heads state units)"
-    return f"{label}: {', '.join(told)} is {ways}; its steps are {where[0]} = {known}{hint}"
+    raise ValueError(f"{', '.join(told)} is {ways}; its steps are {where[0]} = {known}{hint}")
 
 
 def _scaled(text: str, scale: float) -> str:

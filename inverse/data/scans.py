@@ -207,13 +207,12 @@ def _mesh(path: Path, named: str | None, cases: tuple[str, ...], unit: float) ->
             f"{path.name}: no displacements; expected data at its points, or a file in TOML with the undeformed "
             "surface as reference, and the deformed one, of the same numbering"
         )
-    motions, missing = [], []
+    motions, missing = list[FloatArray](), list[str]()
     for case in cases:
-        motion = _motion(found, path.name, named, case, alone=len(cases) == 1)
-        if isinstance(motion, str):
-            missing.append(motion)
-        else:
-            motions.append(motion)
+        try:
+            motions.append(_motion(found, path.name, named, case, alone=len(cases) == 1))
+        except DataError as error:
+            missing += error.args
     if missing:
         raise DataError(*missing)
     if any(np.isinf(motion).any() for motion in motions):
@@ -222,15 +221,15 @@ def _mesh(path: Path, named: str | None, cases: tuple[str, ...], unit: float) ->
     return _joined([(found.places, *pair) for pair in zip(motions, errors, strict=True)], path.name, cases, unit)
 
 
-def _motion(found: Points, name: str, named: str | None, case: str, *, alone: bool) -> FloatArray | str:
-    """Return displacements (n, 3) in a load case, or say why there are none."""
+def _motion(found: Points, name: str, named: str | None, case: str, *, alone: bool) -> FloatArray:
+    """Return displacements (n, 3) in a load case; a DataError if there are none."""
     n = len(found.places)
     usual = [f"displacement_{case}", *(["displacement"] if alone else [])]
     wanted = usual if named is None else [named.replace("{case}", case)]
     for array in (one for one in wanted if one in found.values):
         values = found.values[array]
         if values.shape != (n, 3):
-            return f"{name}: '{array}' has the shape {values.shape}, expected ({n}, 3)"
+            raise DataError(f"{name}: '{array}' has the shape {values.shape}, expected ({n}, 3)")
         return values
     single = [f"{axis}_{case}" for axis in MOTION]
     if alone and not any(array in found.values for array in single):
@@ -239,7 +238,7 @@ def _motion(found: Points, name: str, named: str | None, case: str, *, alone: bo
         nothing = np.full(n, np.nan)
         return np.column_stack([np.ravel(found.values.get(array, nothing)) for array in single])
     known = tuple(found.values) or ("none",)
-    return f"{name}: no point data '{wanted[-1] if alone else wanted[0]}'; {nearest(wanted[0], known)}"
+    raise DataError(f"{name}: no point data '{wanted[-1] if alone else wanted[0]}'; {nearest(wanted[0], known)}")
 
 
 def _errors(found: Points, name: str, case: str) -> FloatArray:

@@ -34,7 +34,7 @@ from forward.model import FloatArray, SolveError
 from inverse.criticism.weights import FEWEST, TRUSTED, normalised, quality, trustworthy
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.low_dimensional.proposals import Mixture, Proposal, about, first, joint
+from inverse.low_dimensional.proposals import Proposal, about, first, joint
 from inverse.low_dimensional.surrogate import SCRAMBLES, affordable, fit, sample, terms
 from uq.inputs.sampling import sobol_points
 
@@ -119,12 +119,12 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     if samples < LEAST:
         raise ValueError(f"{samples} samples, expected at least {LEAST}")
     quarter = samples // LEAST * SCRAMBLES
-    opening = first(gaussian)
+    wide, student, normal = about(gaussian)
+    opening = first(wide, student, normal)
     derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
     pilot = [_drawn(posterior, opening, seed, 0, quarter, derivatives=derivatives)]
     drawn = _weighted(pilot, "importance", "")
     share = f"the first {quarter} points are worth {drawn.ess:.0f}"
-    _, student, normal = about(gaussian)
     # Of the first points all must have an answer: where many have none, the Gaussian is not what the prior allows.
     if np.isfinite(drawn.density.log_posterior).all() and _is_gaussian(gaussian, drawn.density):
         pilot.append(_drawn(posterior, opening, seed, quarter, 2 * quarter, derivatives=False))
@@ -137,7 +137,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         return replace(whole, why=f"{share}: nearly Gaussian")
     expected = {one: _expected(drawn, opening, one) for one in (opening, student, normal)}
     best = max(expected, key=lambda one: expected[one])
-    if isinstance(opening, Mixture):
+    if opening is wide:
         # The others would see no more of what is far from the mode; polynomials do, and are right in few unknowns.
         if drawn.ess >= EVEN * quarter and drawn.pareto_k <= TRUSTED:
             return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights")

@@ -134,9 +134,8 @@ def about(gaussian: Laplace) -> tuple[Mixture, Elliptical, Elliptical]:
     return Mixture.of(gaussian), Elliptical(mode, root, float(len(mode))), Elliptical(mode, root)
 
 
-def first(gaussian: Laplace) -> Proposal:
-    """Return the widest proposal whose points would count if the posterior were Laplace's Gaussian."""
-    wide, student, normal = about(gaussian)
-    x = normal.draw(sobol_points(0, 0, 0, TRIED, len(gaussian.mode) + 1))
+def first(wide: Mixture, student: Elliptical, normal: Elliptical) -> Proposal:
+    """Return the widest of proposals about a mode whose points would count if the posterior were Laplace's Gaussian."""
+    x = normal.draw(sobol_points(0, 0, 0, TRIED, len(normal.centre) + 1))
     over = np.exp(normal.log_over_prior(x) - wide.log_over_prior(x))
     return wide if 1 / over.mean() >= WORTHWHILE else student

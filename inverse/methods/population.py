@@ -30,7 +30,8 @@ FEW = 4  # specimens, below which the prior decides how wide a population is
 PRIOR = 4096  # points that stand for the prior
 QUANTILES = (0.025, 0.5, 0.975)
 
-Again = Callable[[str, Inputs], "Draws | str"]  # name of a specimen, prior → its draws, or why there are none
+# Name of a specimen, prior → its draws, or None and why.
+Again = Callable[[str, Inputs], "tuple[Draws | None, str]"]
 
 
 class Population(Settings):
@@ -164,9 +165,9 @@ class Population(Settings):
                 break
             for i in low:
                 wider = scale.inputs(parameters, fit.predictive(self.seed, None if x is None else x[i]), hyperprior)
-                found = again(names[i], wider)
-                if isinstance(found, str):
-                    refused[names[i]] = found
+                found, why = again(names[i], wider)
+                if found is None:
+                    refused[names[i]] = why
                     continue
                 order = [found.names.index(name) for name in parameters]
                 specimens[i] = scale.specimen(replace(found, names=parameters, values=found.values[:, order]), wider)

@@ -49,6 +49,7 @@ _NUMBERS = """
     neglected information products
     prediction_solves prediction_why
 """
+_WORDS = {"why", "mesh_why", "prediction_why"}
 _ARRAYS = {
     "parameter": "mode mean std lower upper mesh_shift mesh_left laplace_std together_std reduced_shift",
     "parameter partner": "covariance",
@@ -111,13 +112,8 @@ def as_dataset(record: Record) -> xr.Dataset:
     """Return the results of an inversion, numbers and sentences, as a dataset."""
     import xarray as xr
 
-    held = {name: (DIMS[name], record[name]) for name in DIMS if name in record}
-    return xr.Dataset(
-        {
-            name: (dims, value if isinstance(value, str) else np.asarray(value, float))
-            for name, (dims, value) in held.items()
-        }
-    )
+    kinds = {name: str if name in _WORDS else float for name in DIMS if name in record}
+    return xr.Dataset({name: (DIMS[name], np.asarray(record[name], kind)) for name, kind in kinds.items()})
 
 
 def with_record(found: xr.Dataset, record: Record) -> xr.Dataset:

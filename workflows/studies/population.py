@@ -228,7 +228,7 @@ class PopulationJob(Job):
         """Fit on rank 0; collective over all ranks."""
         method, drawn = self.study.method, list[str]()
 
-        def again(specimen: str, prior: Inputs) -> Draws | str:
+        def again(specimen: str, prior: Inputs) -> tuple[Draws | None, str]:
             drawn.append(specimen)
             times = drawn.count(specimen)
             part = checkpoint.part(f"{specimen}, {times}")
@@ -237,18 +237,18 @@ class PopulationJob(Job):
                 job = ensemble.together(lambda: one.job(ensemble, self.name, self.directory, part))
                 found = job.run(ensemble, part, progress, blocks)
                 if found is None:
-                    return ""
+                    return None, ""
                 self._keep(job, f"{specimen}, {times}")
-                return draws_in(job.labelled(found), one.method.kind)
+                return draws_in(job.labelled(found), one.method.kind), ""
             except (ValueError, StudyError, SolveError) as error:
-                return "; ".join(map(str, error.args))
+                return None, "; ".join(map(str, error.args))
 
-        def task(asked: Callable[[tuple[str, Inputs]], Draws | str]) -> xr.Dataset:
+        def task(asked: Callable[[tuple[str, Inputs]], tuple[Draws | None, str]]) -> xr.Dataset:
             posteriors = self.study.posteriors
             prior = _prior(self.study, prior_names(posteriors))
             asking = 0.0
 
-            def timed(*one: Any) -> Draws | str:
+            def timed(*one: Any) -> tuple[Draws | None, str]:
                 nonlocal asking
                 begun = time.process_time()
                 found = asked(one)

@@ -70,7 +70,7 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
     if run is ensemble:
         found = ensemble(posterior, gaussian, Lengths(32, 200, 100, 8))
     else:
-        found = chains_of_few(posterior, points, lengths=replace(FEW, chains=8, draws=600, thin=2))
+        found = chains_of_few(posterior, gaussian, points, lengths=replace(FEW, chains=8, draws=600, thin=2))
         assert found.mixed
         # In Laplace's Gaussian, which is too narrow along the ridge, they have not mixed, and say so.
         assert not chains_of_few(posterior, gaussian, lengths=replace(FEW, chains=8, draws=600)).mixed
@@ -231,7 +231,7 @@ def test_verdicts_on_few_parameters():
     assert [enough(6, 64), enough(1.2, 64), enough(19, 40)] == [256, 1088, 160]
     short = chains_of_few(posterior, gaussian, lengths=replace(FEW, draws=10, burn=5))
     assert "have not mixed" in verdict_on_few(gaussian, uneven, test, short).why
-    long = chains_of_few(posterior, found, lengths=replace(FEW, draws=600, thin=2, chains=8))
+    long = chains_of_few(posterior, gaussian, found, lengths=replace(FEW, draws=600, thin=2, chains=8))
     assert "but chains agree" in verdict_on_few(gaussian, uneven, test, long).why
     agreeing = replace(test, agreement_probability=0.001)
     assert "residuals of neighbours" in verdict_on_few(gaussian, found, agreeing).why

@@ -17,7 +17,7 @@ from inverse.criticism.weights import distinct, effective_sample_size, fewest, q
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.proposals import Elliptical, Mixture, first
+from inverse.low_dimensional.proposals import Elliptical, Mixture, about, first
 from inverse.low_dimensional.surrogate import affordable
 from tests.problems import examine_few
 from uq.evaluation.evaluate import SerialEvaluate
@@ -176,8 +176,8 @@ def test_proposals_have_the_density_they_are_drawn_from(degrees):
 @pytest.mark.unit
 def test_what_is_tried_first_follows_from_what_its_points_would_be_worth():
     few, many = (laplace(bent(size, 0.0)[0], starts=1) for size in (3, 30))
-    assert isinstance(first(few), Mixture)
-    assert isinstance(first(many), Elliptical)
+    assert isinstance(first(*about(few)), Mixture)
+    assert isinstance(first(*about(many)), Elliptical)
     assert affordable(30)
     assert not affordable(31)
 

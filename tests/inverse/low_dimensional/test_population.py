@@ -62,7 +62,7 @@ def test_specimens_far_from_their_prior_are_drawn_again():
     population = Population(source="batch", distribution="normal", draws=1000)
 
     def again(name, under):
-        return of_normal(y[names.index(name)], sigma, under.marginals["a"], rng)
+        return of_normal(y[names.index(name)], sigma, under.marginals["a"], rng), ""
 
     once = population.run(first, Inputs({"a": prior}))
     assert float(once["location_mean"][0]) < mean - 2 * std
@@ -75,7 +75,9 @@ def test_specimens_far_from_their_prior_are_drawn_again():
     assert (found["specimen_effective"] >= LEAST).all()
     assert [one.severity for one in findings(found)] == ["note"]
     np.testing.assert_array_equal(found["own_mean"], once["own_mean"])  # by themselves they are what they were
-    text = "; ".join(one.text for one in findings(population.run(first, Inputs({"a": prior}), lambda *_: "no data")))
+    text = "; ".join(
+        one.text for one in findings(population.run(first, Inputs({"a": prior}), lambda *_: (None, "no data")))
+    )
     assert "They cannot be drawn again: no data." in text
 
 
