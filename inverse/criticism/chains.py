@@ -25,6 +25,7 @@ from forward.model import FloatArray, SolveError
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.optional import imported
 
 ACCEPTED = 0.3  # acceptance rate for which β is tuned during the burn-in
 FIRST_STEP = 0.5  # β at its start
@@ -153,12 +154,7 @@ class Chains:
 
 
 def _arviz() -> Any:
-    try:
-        import arviz
-    except ImportError:
-        message = "R̂ and effective sizes of chains need arviz, which is not installed: pip install arviz"
-        raise ImportError(message) from None
-    return arviz
+    return imported("R̂ and effective sizes of chains need", "arviz")
 
 
 def crank_nicolson(
@@ -166,7 +162,6 @@ def crank_nicolson(
     size: int,
     *,
     keep: Map = lambda x: x,
-    names: tuple[str, ...] | None = None,
     lengths: Lengths = FEW,
     seed: int = 0,
 ) -> Chains:
@@ -180,8 +175,6 @@ def crank_nicolson(
         c.
     keep
         Quantities (n, k) at x (n, c) that are kept.
-    names
-        Of these; by default their numbers.
     lengths
         Number of chains, and how long they are; β is adapted in the steps before the draws that are kept.
     seed
@@ -228,9 +221,8 @@ def crank_nicolson(
             kept.append(keep(x))
             levels.append(here)
     values = np.swapaxes(np.array(kept), 0, 1)
-    labels = tuple(map(str, range(values.shape[2]))) if names is None else names
-    share = accepted / (lengths.draws * thin)
-    return Chains(labels, values, np.array(levels).T, share, beta, lengths.evaluations)
+    share, names = accepted / (lengths.draws * thin), tuple(map(str, range(values.shape[2])))
+    return Chains(names, values, np.array(levels).T, share, beta, lengths.evaluations)
 
 
 def chains_of_few(
@@ -285,10 +277,7 @@ def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = 
     ImportError
         If emcee is not installed.
     """
-    try:
-        import emcee
-    except ImportError:
-        raise ImportError("an ensemble needs emcee, which is not installed: pip install emcee") from None
+    emcee = imported("an ensemble needs", "emcee")
     c = len(gaussian.mode)
     long = walkers(c) if lengths is None else lengths
     count = long.chains

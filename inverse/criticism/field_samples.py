@@ -147,7 +147,6 @@ def chains_of_field(
     found: LowRankPosterior,
     *,
     keep: Map | None = None,
-    names: tuple[str, ...] | None = None,
     lengths: Lengths = FIELD,
     seed: int = 0,
 ) -> Chains:
@@ -157,7 +156,6 @@ def chains_of_field(
         bent(mode, found),
         len(mode.whitened),
         keep=values if keep is None else lambda x: keep(values(x)),
-        names=names,
         lengths=lengths,
         seed=seed,
     )

@@ -22,6 +22,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.chains import SPREAD, Chains, Lengths, in_units
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.optional import imported
 
 DEPTH = 6  # doublings of a path
 GRADIENTS = Lengths(2, 300, 100, 1)
@@ -88,7 +89,7 @@ def gradient_chains(
     SolveError
         If there is no answer at the start of a chain.
     """
-    mici = _mici()
+    mici = imported("chains that follow gradients need", "mici")
     potential = _Potential(posterior, gaussian, model)
     rng = np.random.default_rng(seed)
 
@@ -213,11 +214,3 @@ def _start(potential: _Potential, z: FloatArray) -> FloatArray:
             return z
         z = z / 2
     raise SolveError("the model has no answer where a chain starts")
-
-
-def _mici() -> Any:
-    try:
-        import mici
-    except ImportError:
-        raise ImportError("chains that follow gradients need mici, which is not installed: pip install mici") from None
-    return mici

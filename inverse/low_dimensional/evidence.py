@@ -36,6 +36,7 @@ from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.proposals import Proposal, about, first, joint
 from inverse.low_dimensional.surrogate import SCRAMBLES, affordable, fit, sample, terms
+from inverse.optional import imported
 from uq.inputs.sampling import sobol_points
 
 EVEN = 0.6  # effective share of the first points from which the Gaussian is good enough for the others
@@ -278,11 +279,7 @@ def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[fl
     ImportError
         If dynesty is not installed.
     """
-    try:
-        import dynesty
-    except ImportError:
-        message = "method.check = 'dynesty' needs dynesty, which is not installed: pip install dynesty"
-        raise ImportError(message) from None
+    dynesty = imported("method.check = 'dynesty' needs", "dynesty")
     from scipy.special import ndtri
 
     def log_likelihood(x: FloatArray) -> float:

@@ -21,7 +21,8 @@ from inverse.criticism.weights import effective_sample_size, normalised
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.proposals import WIDER, Mixture
-from uq.evaluation.request import Evaluations, Failure, Request
+from uq.evaluation.evaluate import OfEvaluate
+from uq.evaluation.request import Evaluate, Evaluations, Failure, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
@@ -45,13 +46,11 @@ ENOUGH = 0.2  # effective share of a cloud from which no better proposal is need
 
 
 @dataclass(frozen=True)
-class Surrogate:
+class Surrogate(OfEvaluate):
     """A polynomial for the outputs of a model, as a cheap evaluation.
 
     Attributes
     ----------
-    parameters, outputs
-        Names.
     basis
         The P polynomials.
     coefficients
@@ -60,15 +59,11 @@ class Surrogate:
         The box (d,) beyond which there is no answer: far from its points a polynomial is meaningless.
     """
 
-    parameters: tuple[str, ...]
-    outputs: tuple[str, ...]
+    _evaluate: Evaluate
     basis: Basis
     coefficients: FloatArray
     lower: FloatArray
     upper: FloatArray
-    differentiable: bool = True
-    displacements: int = 0
-    node_volumes: FloatArray | None = None
 
     def on(self, model: str) -> Surrogate:
         """Return itself: there is one model."""
@@ -89,18 +84,8 @@ class Surrogate:
         failures = tuple(Failure(int(i), (), BEYOND) for i in np.flatnonzero(outside))
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals = np.where(outside, np.nan, 0.0)
-        return Evaluations(
-            points,
-            outputs,
-            tangents,
-            failures,
-            np.zeros(n),
-            work,
-            residuals,
-            ~outside,
-            np.zeros(n, dtype=np.int8),
-            np.zeros((0, 0)),
-        )
+        rows = (np.zeros(n), work, residuals, ~outside, np.zeros(n, dtype=np.int8))
+        return Evaluations(points, outputs, tangents, failures, *rows, np.zeros((0, 0)))
 
 
 def terms(size: int, degree: int) -> int:
@@ -139,10 +124,9 @@ def fit(posterior: Posterior, solved: Density) -> Posterior:
         )
     ]
     _, basis, coefficients, box, inputs = min(fits, key=lambda fitted: fitted[0])
-    evaluate = posterior.evaluate
     ends = np.array([box.min(axis=0), box.max(axis=0)])
     lower, upper = ends + MARGIN * np.ptp(ends, axis=0) * np.array([[-1.0], [1.0]])
-    surrogate = Surrogate(evaluate.parameters, evaluate.outputs, basis, coefficients, lower, upper)
+    surrogate = Surrogate(posterior.evaluate, basis, coefficients, lower, upper)
     return replace(posterior, inputs=inputs, evaluate=surrogate, start=None)
 
 
