@@ -70,33 +70,39 @@ def compared(
     )
 
 
-def with_values(found: xr.Dataset, values: Values, sigma: FloatArray, candidates: Candidates) -> xr.Dataset:
-    """Add what the values of the candidates are."""
-    return found.assign(
-        value_candidate=("value", candidates.which),
+def with_values(
+    found: xr.Dataset,
+    values: Values,
+    sigma: FloatArray,
+    candidates: Candidates,
+    mesh: FloatArray | None = None,
+    *,
+    noise: bool = False,
+) -> xr.Dataset:
+    """Add what the values of the candidates are, and say of which candidates errors of the mesh exceed the noise.
+
+    Parameters
+    ----------
+    found
+        The design.
+    values, sigma, candidates
+        All values, the standard deviations (m,) of their errors, and what is measured together.
+    mesh
+        What the mesh is said to take away from all values (m,), NaN where that is not known; None if it is of none.
+    noise
+        Whether this counts as noise already.
+    """
+    which, names = candidates.which, candidates.names
+    found = found.assign(
+        value_candidate=("value", which),
         value_sigma=("value", sigma),
         value_place=(("value", "axis"), values.places),
         value_case=("value", list(values.case)),
         value_part=("value", list(values.part)),
     ).assign_coords(value=list(values.names))
-
-
-def with_mesh_errors(found: xr.Dataset, mesh: FloatArray | None, *, noise: bool) -> xr.Dataset:
-    """Add estimated errors of the mesh to a design, and say of which candidates they exceed the noise.
-
-    Parameters
-    ----------
-    found
-        The design, with its values.
-    mesh
-        What the mesh takes away from all values (m,), NaN where that is not known; None if it is of none.
-    noise
-        Whether this counts as noise already.
-    """
     if mesh is None or not np.isfinite(mesh).any():
         return found
     found = found.assign(value_mesh_error=("value", mesh))
-    sigma, which, names = (found[name].to_numpy() for name in ("value_sigma", "value_candidate", "candidate"))
     measured = (which >= 0) & np.isfinite(mesh)
     own = np.sqrt(np.maximum(sigma**2 - mesh**2, 0)) if noise else sigma
     ratios = np.divide(mesh, own, out=np.zeros_like(mesh), where=measured & (own > 0))[measured]
@@ -106,7 +112,7 @@ def with_mesh_errors(found: xr.Dataset, mesh: FloatArray | None, *, noise: bool)
     if not off:
         return found
     worst = chosen[np.argmax(times[chosen])]
-    values = {
+    said = {
         "off": off,
         "size": size,
         "off_chosen": int((times[chosen] > 1).sum()),
@@ -114,5 +120,5 @@ def with_mesh_errors(found: xr.Dataset, mesh: FloatArray | None, *, noise: bool)
         "worst": names[worst],
         "times": times[worst],
     }
-    add(found, Finding("design-mesh-as-noise", "note", values) if noise else Finding("design-mesh", "warning", values))
+    add(found, Finding("design-mesh-as-noise", "note", said) if noise else Finding("design-mesh", "warning", said))
     return found

@@ -93,16 +93,8 @@ def conditioned(root: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(root - (root @ turned.T * (a**2 / (1 + a))) @ turned)
 
 
-class Information:
-    """D-optimality: the mean over draws of what observations tell (nat).
-
-    Parameters
-    ----------
-    candidates
-        Of each draw (c, k, r).
-    """
-
-    submodular: ClassVar[bool] = True
+class _Conditioned:
+    """Candidates (c, k, r) of each draw, and roots of the covariances that the taken ones leave."""
 
     def __init__(self, candidates: Sequence[FloatArray]) -> None:
         self._candidates = candidates
@@ -113,6 +105,23 @@ class Information:
         """Number of candidates."""
         return len(self._candidates[0])
 
+    def take(self, one: int) -> None:
+        """Add a candidate to the set."""
+        pairs = zip(self.roots, self._candidates, strict=True)
+        self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
+
+
+class Information(_Conditioned):
+    """D-optimality: the mean over draws of what observations tell (nat).
+
+    Parameters
+    ----------
+    candidates
+        Of each draw (c, k, r).
+    """
+
+    submodular: ClassVar[bool] = True
+
     def of_draws(self, which: IntArray) -> FloatArray:
         """Return what each of some candidates (w,) would add at each draw (draws, w)."""
         pairs = zip(self._candidates, self.roots, strict=True)
@@ -122,13 +131,8 @@ class Information:
         """Return what each of some candidates (w,) would add (w,)."""
         return np.asarray(self.of_draws(which).mean(axis=0))
 
-    def take(self, one: int) -> None:
-        """Add a candidate to the set."""
-        pairs = zip(self.roots, self._candidates, strict=True)
-        self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
 
-
-class Variance:
+class Variance(_Conditioned):
     """A-optimality: the mean over draws of the share of the variance of goals that observations take away.
 
     Parameters
@@ -142,13 +146,8 @@ class Variance:
     submodular: ClassVar[bool] = False
 
     def __init__(self, candidates: Sequence[FloatArray], goals: Sequence[FloatArray]) -> None:
-        self._candidates, self._goals = candidates, goals
-        self.roots = [np.eye(len(one)) for one in goals]
-
-    @property
-    def count(self) -> int:
-        """Number of candidates."""
-        return len(self._candidates[0])
+        super().__init__(candidates)
+        self._goals = goals
 
     @property
     def left(self) -> FloatArray:
@@ -166,11 +165,6 @@ class Variance:
             taken = np.linalg.solve(within, seen @ (root.T @ goal @ root) @ across)
             found += np.trace(taken, axis1=-2, axis2=-1)
         return found / len(self._goals)
-
-    def take(self, one: int) -> None:
-        """Add a candidate to the set."""
-        pairs = zip(self.roots, self._candidates, strict=True)
-        self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
 
 
 def along(criterion: Criterion, order: Sequence[int]) -> Iterator[float]:

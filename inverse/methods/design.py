@@ -14,7 +14,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.designs.candidates import Candidates, Each, Values
-from inverse.designs.compared import compared, with_mesh_errors, with_values
+from inverse.designs.compared import compared, with_values
 from inverse.designs.criteria import (
     Criterion,
     Information,
@@ -159,7 +159,7 @@ class Design(Settings):
             posterior_std=("parameter", np.mean(left, axis=0)),
             draw=(("draw_number", "parameter"), points[ok]),
         ).assign_coords(parameter=list(inputs.names))
-        return with_mesh_errors(with_values(result, values, sigma, candidates), mesh, noise=self.mesh_error == "noise")
+        return with_values(result, values, sigma, candidates, mesh, noise=self.mesh_error == "noise")
 
     def _mesh_errors(self, inputs: Inputs, of_mesh: Evaluate) -> FloatArray | None:
         """Estimate what the mesh takes away from all values (m,) at the medians; None where nothing tells."""
@@ -198,7 +198,7 @@ class Design(Settings):
         known = float(result["information"][-1])
         if missed > MISSED * known:
             add(result, Finding("design-rank", "warning", {"missed": missed, "rank": self.rank, "known": known}))
-        return with_mesh_errors(with_values(result, values, sigma, candidates), mesh, noise=self.mesh_error == "noise")
+        return with_values(result, values, sigma, candidates, mesh, noise=self.mesh_error == "noise")
 
     def whitened(self, number: int, size: int) -> FloatArray:
         """Draw `number` (size,) of standard normal numbers, for a field; a single one is at the median."""
