@@ -358,6 +358,29 @@ class Measurements:
             f"a column sigma_value or data.sigma_of.{name}"
         )
 
+    def check_signs(self, names: Sequence[str], negative: Sequence[bool]) -> None:
+        """Refuse outputs, by name (m,), that are mostly below 0 though they cannot be `negative`; a few may by errors.
+
+        A tool presses and never pulls, and many programs count forces that press as negative.
+
+        Raises
+        ------
+        DataError
+            With a line for each such output.
+        """
+        wrong = []
+        for name in dict.fromkeys(names):
+            mine = [k for k, one in enumerate(names) if one == name and not negative[k]]
+            below = [k for k in mine if self.values[k] < 0]
+            if 2 * len(below) > len(mine):
+                wrong.append(
+                    f"{self.labels[below[0]]}: '{name}' is {self.values[below[0]]:g}, and {len(below)} of {len(mine)} "
+                    "are below 0, which it cannot be: a force is positive where the tool presses on the body; expected "
+                    "the other sign"
+                )
+        if wrong:
+            raise DataError(*wrong)
+
     # --- mistakes ----------------------------------------------------------------------------------------------------
 
     def mistakes(self, name: str) -> list[str]:

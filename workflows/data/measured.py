@@ -21,7 +21,6 @@ from forward.combine import selected
 from forward.files import meshes
 from forward.settings import Settings, one_line
 from forward.spec import SPECIMEN, usual_kind
-from inverse.data import signs
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
 from inverse.data.measurements import Measurements
@@ -301,7 +300,7 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     forces = found.subset(found.points < 0)
     pairs = zip(forces.cases, forces.axes - len(AXES), strict=True)
     negative = [specimen.cases[case].outputs[which].negative for case, which in pairs]
-    signs.check(forces.names, forces.values, forces.labels, negative)
+    forces.check_signs(forces.names.tolist(), negative)
     truth = found.truth | {name: repr(value) for name, value in scan.truth.items()}
     return replace(found, between=scan.moved_between(found.unit), truth=truth)
 

@@ -15,7 +15,6 @@ from pydantic import Field, model_validator
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import ModelSpec
-from inverse.data import signs
 from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.measurements import Measurements
@@ -214,8 +213,7 @@ def _of_tables(
 
 
 def check_signs(found: Measurements, model: ModelSpec) -> None:
-    """Refuse measured outputs of a model whose sign cannot be right, over all steps of each, as `signs.check`."""
+    """Refuse measured outputs of a model whose sign cannot be right, over all steps of each."""
     outputs = [model.returned[axis] for axis in found.axes]
     _, of = model.axes_of_outputs.get("output_of", ("", [output.name for output in model.returned]))
-    names = [of[axis] for axis in found.axes]
-    signs.check(names, found.values, found.labels, [getattr(output, "negative", True) for output in outputs])
+    found.check_signs([of[axis] for axis in found.axes], [getattr(output, "negative", True) for output in outputs])
