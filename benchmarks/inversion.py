@@ -99,7 +99,7 @@ def cost(cells: int) -> Cost:
     inside = float((np.abs(found.mean - true) < 2 * found.std).mean())
     values, seconds = found.spectrum.values, tuple(np.diff(times).tolist())
     products = mode.products, found.spectrum.products
-    return Cost(posterior.size, mode.solves, *products, seconds, values, found.determined, inside)
+    return Cost(posterior.size, mode.solves, *products, seconds, values, found.spectrum.determined, inside)
 
 
 def main(cells: tuple[int, ...] = CELLS) -> None:

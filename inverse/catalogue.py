@@ -98,10 +98,7 @@ TABLE: dict[str, str | Words] = {
         short="the reduced model does not give the posterior of the body",
     ),
     "mesh-not-checked": Words("not checked for the mesh: {why}", short="not checked for the mesh"),
-    "mesh-moves-little": Words(
-        MOVES,
-        short="",
-    ),
+    "mesh-moves-little": Words(MOVES, short=""),
     "mesh-too-coarse": Words(
         MOVES + ". The mesh is too coarse for the noise: " + FINER,
         short="its mesh is too coarse: unknowns move by {worst:.2g} deviations",
@@ -111,10 +108,7 @@ TABLE: dict[str, str | Words] = {
         "single cells, and finer meshes show no limit of them; leave them out, or give them larger errors",
         short="the error of the mesh in {names} is not known",
     ),
-    "mesh-corrected": Words(
-        CORRECTED,
-        short="",
-    ),
+    "mesh-corrected": Words(CORRECTED, short=""),
     "mesh-correction-unsettled": Words(
         CORRECTED + ". The correction has not settled: " + FINER,
         short="its mesh error has not settled",

@@ -97,7 +97,7 @@ def examine_few(posterior, gaussian, neighbours=None):
     """Test the residuals of few parameters at the mode: a solve with derivatives."""
     at = posterior.at(gaussian.mode[None], derivatives=True)
     residual = posterior.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
-    return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)
+    return examine(residual, spectrum_of(posterior, at), neighbours)
 
 
 def few(seed=0, wave=0.0, noise=None):

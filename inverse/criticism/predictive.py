@@ -44,33 +44,28 @@ class ResidualTest:
     agreement_probability: float
 
 
-def examine(
-    residual: FloatArray, spectrum: Spectrum, measured: FloatArray, neighbours: Neighbours | None = None
-) -> ResidualTest:
+def examine(residual: FloatArray, spectrum: Spectrum, neighbours: Neighbours | None = None) -> ResidualTest:
     """Test residuals at a mode.
 
     Parameters
     ----------
     residual
-        r (n,), zero where nothing was measured.
+        r (n,).
     spectrum
         Eigenpairs of AᵀA; neglected ones count as λ = 0.
-    measured
-        Not zero (n,) where something was measured.
     neighbours
         Numbers of data that are expected to agree if the model is wrong, as in `inverse.data.neighbours`.
     """
     from scipy.special import chdtrc
 
-    seen = np.asarray(measured) != 0
-    n, values = int(seen.sum()), spectrum.values
+    n, values = len(residual), spectrum.values
     weights = np.concatenate([1 / (1 + values[:n]), np.ones(max(n - len(values), 0))])
     square, total = float(residual @ residual), float(weights.sum())
     scale = float((weights**2).sum()) / total
     probability = float(chdtrc(total / scale, square / scale))
     if neighbours is None or not len(neighbours[0]):
         return ResidualTest(square, total, probability, np.nan, np.nan)
-    drawn = np.random.default_rng(0).standard_normal((DRAWS, len(residual))) * seen
+    drawn = np.random.default_rng(0).standard_normal((DRAWS, n))
     # (I − S)^{1/2}: the images are the eigenvectors of S times √λ.
     share = np.divide((1 + values) ** -0.5 - 1, values, out=np.zeros_like(values), where=values > 0)
     drawn = drawn + (drawn @ spectrum.images.T * share) @ spectrum.images

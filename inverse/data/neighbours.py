@@ -19,7 +19,7 @@ DRAWS = 4000  # of independent errors, for the distribution of `agreement`
 SAME = 1e-9  # relative difference of distances that counts as rounding
 
 
-def neighbours(places: FloatArray, kinds: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
+def neighbours(places: FloatArray, kinds: NDArray[np.int64]) -> Neighbours:
     """Pair neighbouring data, each pair once.
 
     Parameters
@@ -28,13 +28,10 @@ def neighbours(places: FloatArray, kinds: NDArray[np.int64], measured: FloatArra
         (n, k).
     kinds
         Numbers (n,) of what can be compared: of tests and stresses, or of load cases and components.
-    measured
-        Not zero (n,) where something was measured; by default everywhere.
     """
-    seen = np.ones(len(places), dtype=bool) if measured is None else np.asarray(measured) != 0
     pairs: set[tuple[int, int]] = set()
-    for kind in np.unique(kinds[seen]):
-        members = np.flatnonzero(seen & (kinds == kind))
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
         pairs |= {(int(members[i]), int(members[j])) for i, j in _related(places[members])}
     ordered = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return ordered[:, 0], ordered[:, 1]

@@ -23,24 +23,9 @@ from inverse.data.table import DataError
 
 STL_HEAD, STL_FACET = 84, 50  # bytes
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-PLY_KINDS = {  # by the names of C, and by those that say their size
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float": "f4",
-    "double": "f8",
-    "float32": "f4",
-    "float64": "f8",
-}
+# By the names of C, and by those that say their size.
+PLY_NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
+PLY_KINDS = dict(zip(PLY_NAMES.split(), 2 * ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"], strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,11 @@ class Spectrum:
     residuals: FloatArray
     neglected: float
     products: int
+
+    @property
+    def determined(self) -> float:
+        """Number of directions that the data determine: the trace Σ λ/(1+λ) of S."""
+        return float((self.values / (1 + self.values)).sum())
 
     @property
     def resolution(self) -> FloatArray:
@@ -173,28 +179,10 @@ class LowRankPosterior:
     log_likelihood: float
 
     @classmethod
-    def at(
-        cls,
-        mode: Point,
-        *,
-        cutoff: float = CUTOFF,
-        rank: int | None = None,
-        accuracy: float = ACCURACY,
-        block: int = BLOCK,
-        seed: int = 0,
-    ) -> LowRankPosterior:
-        """Find the directions at a mode that the data constrain, as `leading_pairs` does."""
+    def at(cls, mode: Point, **settings: Any) -> LowRankPosterior:
+        """Find the directions at a mode that the data constrain, as `leading_pairs` does with the same settings."""
         posterior = mode.posterior
-        spectrum = leading_pairs(
-            mode.jvp,
-            mode.vjp,
-            posterior.size,
-            cutoff=cutoff,
-            rank=rank,
-            accuracy=accuracy,
-            block=block,
-            seed=seed,
-        )
+        spectrum = leading_pairs(mode.jvp, mode.vjp, posterior.size, **settings)
         weights, likelihood = mode.root * posterior.weights, mode.log_likelihood
         return cls(mode.values, mode.whitened, mode.residual, weights, posterior.prior, spectrum, likelihood)
 
@@ -249,9 +237,3 @@ class LowRankPosterior:
         values = self.spectrum.values
         spread = float((np.log1p(values) - values / (1 + values)).sum())
         return (spread + float(self.whitened @ self.whitened)) / 2
-
-    @property
-    def determined(self) -> float:
-        """Number of directions that the data determine: the trace Σ λ/(1+λ) of S."""
-        values = self.spectrum.values
-        return float((values / (1 + values)).sum())

@@ -29,7 +29,8 @@ HALVINGS = 20
 ROUNDING = 1e-12  # of the cost: smaller decreases cannot be expected
 CLOSE = 1e-2  # ‖g‖ at which the search ends
 FORCING = 0.1  # largest η: a solve costs as much as many products
-LONG = 20  # products at which a step ends, and pairs are computed
+STEPS = 50
+LONG, LONGEST = 20, 500  # products at which a step ends, and pairs are computed; and once there are pairs
 STRONG = 10.0  # λ of these pairs: with them as preconditioner a step takes few products
 ROUGH = 0.5  # their accuracy
 
@@ -92,14 +93,7 @@ class Mode:
         return 1 + sum(row.solves for row in self.iterations)
 
 
-def find_mode(
-    posterior: FieldPosterior,
-    start: FloatArray | None = None,
-    *,
-    tolerance: float = CLOSE,
-    steps: int = 50,
-    products: int = 500,
-) -> Mode:
+def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tolerance: float = CLOSE) -> Mode:
     """Find the mode.
 
     Parameters
@@ -110,10 +104,6 @@ def find_mode(
         ξ (N,) where the search starts; by default zero, the centre of the prior.
     tolerance
         Distance to the mode, in standard deviations of the posterior, at which the search ends.
-    steps
-        Largest number of steps.
-    products
-        Largest number of Hessian products of the conjugate gradients in one step, once there are pairs.
 
     Raises
     ------
@@ -124,7 +114,7 @@ def find_mode(
     pairs: Spectrum | None = None
     largest, used = 0.0, 0
     table: list[Iteration] = []
-    for number in range(steps + 1):
+    for number in range(STEPS + 1):
         spent = 0
         if pairs is None and used == LONG:
             pairs = leading_pairs(here.jvp, here.vjp, posterior.size, cutoff=STRONG, accuracy=ROUGH)
@@ -133,10 +123,10 @@ def find_mode(
         largest = max(largest, size)
         rank = 0 if pairs is None else len(pairs.values)
         row = Iteration(here.misfit, here.penalty, size, rank, spent, 0.0, 0)
-        if size <= tolerance or number == steps:
+        if size <= tolerance or number == STEPS:
             break
         forcing = min(FORCING, float(np.sqrt(size / largest)))
-        step, used = conjugate_gradients(here, pairs, forcing, LONG if pairs is None else products)
+        step, used = conjugate_gradients(here, pairs, forcing, LONG if pairs is None else LONGEST)
         row = replace(row, products=spent + used)
         there, length, solves = _search(here, step)
         row = replace(row, length=length, solves=solves)

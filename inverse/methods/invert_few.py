@@ -155,7 +155,7 @@ def invert_few(
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
-    test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
+    test = examine(residual, spectrum, data.neighbours())
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
     log_evidence, error = one.log_evidence

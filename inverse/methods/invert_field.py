@@ -47,6 +47,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+Weighted = tuple[FloatArray, FloatArray]  # values (n, N) of a field with weights (n,) of sum 1
+
+
 @dataclass(frozen=True)
 class Vertices:
     """Quantities that turn values at the vertices into a stiffness.
@@ -75,7 +78,7 @@ def invert_field(
     posterior: FieldPosterior,
     problem: Problem,
     vertices: Vertices,
-    predict: Callable[[LowRankPosterior, tuple[FloatArray, FloatArray] | None], Record] | None = None,
+    predict: Callable[[LowRankPosterior, Weighted | None], Record] | None = None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
 
@@ -105,7 +108,7 @@ def invert_field(
     spectrum = found.spectrum
     errors, root = posterior.errors, mode.point.root
     residual = errors.normal_scores(mode.point.gaps)
-    test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
+    test = examine(residual, spectrum, data.neighbours())
     samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
     chains = whole = None
@@ -121,12 +124,10 @@ def invert_field(
     scale = mode.point.posterior.whitening.sigma  # with the factor where that is inferred
     cases = int(data.cases.max()) + 1
     inferred_noise = (factor, solved.log_std) if method.noise is not None else None
-    values, weights = _corrected(verdict, weighed, chains, drawn)
+    corrected = _corrected(verdict, weighed, chains, drawn)
     predicted = mode.point.predicted_outputs
-    mean, stiffness = (
-        _of_mean(found, vertices, inferred_noise, values, weights),
-        _of_stiffness(found, vertices, method, values, weights),
-    )
+    mean = _of_mean(found, vertices, inferred_noise, corrected)
+    stiffness = _of_stiffness(found, vertices, method, corrected)
     record: Record = {
         **of_motions(spectrum, mode.point.posterior.whitening, posterior.shared, root),
         **of_data(data, predicted, residual, scale / root, spectrum),
@@ -155,7 +156,7 @@ def invert_field(
         "information": np.array(found.information),
     }
     if predict is not None:
-        record |= predict(found, None if values is None else (values, weights))
+        record |= predict(found, corrected)
     return as_dataset(record)
 
 
@@ -172,25 +173,24 @@ def _before(posterior: FieldPosterior, finer: Finer, say: Callable[[str], None])
 
 def _corrected(
     verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, drawn: FloatArray | None
-) -> tuple[FloatArray | None, FloatArray]:
-    """Values (n, N) of the field with weights (n,) that correct the Gaussian if it cannot be trusted."""
+) -> Weighted | None:
+    """Values of the field that correct the Gaussian if it cannot be trusted."""
     if verdict.trust != "corrected":
-        return None, np.zeros(0)
+        return None
     if chains is not None and drawn is not None and chains.mixed:
         return drawn, np.full(len(drawn), 1 / len(drawn))
     assert weighed is not None
     return weighed.values, weighed.weights
 
 
-def _of_stiffness(
-    found: LowRankPosterior, vertices: Vertices, method: Invert, values: FloatArray | None, weights: FloatArray
-) -> Record:
+def _of_stiffness(found: LowRankPosterior, vertices: Vertices, method: Invert, corrected: Weighted | None) -> Record:
     """Mean, standard deviation and draws of ln stiffness."""
     count = -(-method.draws // 10)
-    if values is None:
+    if corrected is None:
         whitened = np.random.default_rng(method.seed).standard_normal((count, len(found.mean)))
         mean, std, draws = found.mean, found.std, found.samples(whitened)
     else:
+        values, weights = corrected
         mean = weights @ values
         std = np.sqrt(weights @ (values - mean) ** 2)
         draws = values[resampled(weights, count, method.seed)]
@@ -208,11 +208,7 @@ def _steps(mode: Mode) -> FloatArray:
 
 
 def _of_mean(
-    found: LowRankPosterior,
-    vertices: Vertices,
-    noise: tuple[float, float] | None,
-    values: FloatArray | None,
-    weights: FloatArray,
+    found: LowRankPosterior, vertices: Vertices, noise: tuple[float, float] | None, corrected: Weighted | None
 ) -> Record:
     """Posterior of the mean of the logarithm over the body, and of the noise."""
     g = vertices.volumes / vertices.volumes.sum()
@@ -220,7 +216,8 @@ def _of_mean(
     at, std = found.marginal(g)
     mode, mean = np.array([at + offset]), np.array([at + offset])
     lower, upper = mode - 1.96 * std, mode + 1.96 * std
-    if values is not None:
+    if corrected is not None:
+        values, weights = corrected
         means = values @ g + offset
         mean = np.array([weights @ means])
         std = float(np.sqrt(weights @ (means - mean) ** 2))

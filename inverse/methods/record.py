@@ -175,7 +175,7 @@ def of_data(
         "misfit_degrees": np.array([(1 - resolution[rows]).sum() for rows in per_case]),
         "misfit_count": np.array([rows.sum() for rows in per_case]),
         "eigenvalue": values,
-        "determined": (values / (1 + values)).sum(),
+        "determined": np.array(spectrum.determined),
         "alone_eigenvalue": np.array(alone).reshape(cases, -1),
         "alone_determined": np.array([(found / (1 + found)).sum() for found in alone]),
     }

@@ -239,7 +239,7 @@ def test_verdicts_on_few_parameters():
 
 def test_verdicts_on_fields():
     mode, found = solved(Linear())
-    test = examine(mode.point.residual, found.spectrum, found.weights)
+    test = examine(mode.point.residual, found.spectrum)
     weights = weigh_field(mode.point, found, 64)
     assert verdict_on_field(mode, found, weights, test).trust == "laplace"
     assert "not checked" in verdict_on_field(mode, found, None, test).why

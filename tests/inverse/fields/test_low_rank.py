@@ -51,7 +51,7 @@ def test_predictions_and_resolution_are_those_of_the_exact_posterior():
     K = problem.G[7:]
     influence = K @ problem.covariance @ K.T / problem.sigma[7:] ** 2  # of each datum on its prediction
     np.testing.assert_allclose(found.spectrum.resolution[7:], np.diag(influence), rtol=1e-7)
-    assert found.determined == pytest.approx(np.trace(influence), rel=1e-8)
+    assert found.spectrum.determined == pytest.approx(np.trace(influence), rel=1e-8)
     g = np.random.default_rng(1).standard_normal(N)
     centre, width = found.marginal(g)
     assert centre == pytest.approx(g @ problem.mean, rel=1e-8)
