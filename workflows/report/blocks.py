@@ -37,6 +37,11 @@ class Block:
         """The name of what draws it in report.html.jinja: its own."""
         return type(self).__name__.lower()
 
+    @property
+    def lines(self) -> Sequence[str]:
+        """What a terminal shows of it."""
+        return ()
+
     def whole(self) -> Iterator[Block]:
         """Go through this block and all that it holds."""
         yield self
@@ -56,6 +61,11 @@ class Text(Block):
 
     text: str
     tone: Literal["", "lead", "warning", "error"] = ""
+
+    @property
+    def lines(self) -> Sequence[str]:
+        """Its text."""
+        return (self.text,)
 
 
 @dataclass(frozen=True)
@@ -180,6 +190,11 @@ class Card(Block):
     question: str
     answers: Sequence[Answer] = ()
     errors: Sequence[str] = ()
+
+    @property
+    def lines(self) -> Sequence[str]:
+        """A line for each answer."""
+        return ["; ".join([f"{one.name}: {one.value}", *one.lines]) for one in self.answers]
 
 
 @dataclass(frozen=True)

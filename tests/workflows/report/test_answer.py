@@ -162,7 +162,7 @@ def test_the_terminal_says_how_many_answers_it_leaves_to_the_report(monkeypatch)
     found = blocks.Card("How?", [blocks.Answer(f"a{k}", "1 m", ()) for k in range(answer.TILES + 3)])
     monkeypatch.setitem(answer.CARDS, "many", lambda results: found)
     monkeypatch.setattr(answer, "gravest", lambda results: None)
-    *listed, last = closing._answers(xr.Dataset({"many": 1.0}), {}, None)
+    *listed, last = closing.answers(xr.Dataset({"many": 1.0}), {}, None)
     assert listed == [f"a{k}: 1 m" for k in range(answer.TILES)]
     assert last == "The other 3 are in the tables of the report."
 

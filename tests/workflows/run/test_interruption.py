@@ -99,7 +99,8 @@ def test_results_are_printed_and_kept_before_the_report_is_drawn(study, tmp_path
     begun.kill()
     begun.wait()
     begun.stdout.close()
-    assert said[0].startswith("y: mean 0.51")
+    assert said[1] == "y\n"
+    assert said[2].split()[:2] == ["mean", "0.513"]
     assert not (out / "report.html").exists()
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["status"], summary["evaluations"]) == ("complete", 101)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from forward.readable import margin
+from forward.readable import SIZES, margin
 from forward.words import places
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from uq.findings import findings
@@ -132,7 +132,7 @@ def test_comparisons_with_one_finer_mesh_end_in_words(tmp_path, capsys):
     study = load(TINY, [f"method={method}", "model.body.cells=[2, 1, 1]", OFF])
     run_study(study, "tiny", tmp_path / "out", report=False)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  mean")][:1]
-    assert re.search(r"[+-]\d\S* +– +–", line), line
+    assert re.search(r"[+−]\d\S* +– +–", line), line
 
 
 @pytest.mark.fem
@@ -183,14 +183,20 @@ def test_the_summary_and_the_terminal_say_it(tmp_path):
     )
     assert of["std_corrected_error"] == pytest.approx(np.hypot(of["std_error"], of["std_mesh_error_doubt"]), rel=1e-6)
     lines = done.stdout.splitlines()
-    first = lines.index("uy_max (m)")
-    assert lines[first - 1].split() == ["value", "sampling", "mesh", "in", "all", "corrected"]
-    name, value, sampling, mesh, whole, corrected, sign, its = lines[first + 1].split()
-    assert (name, sign) == ("mean", "±")
-    printed = [float(x) for x in (value, sampling, mesh, whole, corrected, its)]
-    keys = ("mean", "mean_error", "mesh_error", "total_error", "mean_corrected", "mean_corrected_error")
-    errors = ("mean_error", "mean_error", "mesh_error_doubt", "total_error", "mean_corrected_error")
-    for number, key, error in zip(printed, keys, (*errors, errors[-1]), strict=True):
+    (first,) = (k for k, line in enumerate(lines) if line.startswith("uy_max ("))
+    assert lines[first - 1].split() == ["value", "±", "sampling", "mesh", "in", "all", "corrected"]
+    one = next(one for one, unit in SIZES["m"] if lines[first] == f"uy_max ({unit})")
+    printed = [one * float(x) for x in re.findall(r"[+-]?\d\S*", lines[first + 1])]
+    keys = (
+        "mean",
+        "mean_error",
+        "mesh_error",
+        "mesh_error_doubt",
+        "total_error",
+        "mean_corrected",
+        "mean_corrected_error",
+    )
+    for number, key, error in zip(printed, keys, [keys[i] for i in (1, 1, 3, 3, 4, 6, 6)], strict=True):
         assert abs(number - of[key]) < 0.501 * 10.0 ** -places(of[error])  # to the place of its error
     assert max(map(len, lines[first - 1 : first + 6])) <= 80
     of_first = summary["quantiles"]["uy_max"]["0.05"]
@@ -215,7 +221,7 @@ def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path):
         None, TISSUQ, "run", TINY, *(word for one in small for word in ("--set", one)), "--out", tmp_path / "out"
     )
     assert done.returncode == 0, done.stderr
-    assert "uz (m): zero but for rounding" in done.stdout
+    assert re.search(r"^uz \(\S+\): zero but for rounding$", done.stdout, re.MULTILINE)
     said = json.loads((tmp_path / "out" / "summary.json").read_text())["findings"]
     assert any(one["text"].startswith("uz is zero but for rounding") for one in said)
     assert not any(" uz" in one["text"] for one in said)
@@ -300,9 +306,10 @@ def test_estimates_that_were_planned_and_failed_are_an_error(tmp_path):
     lines = printed.splitlines()
     assert lines[0] == f"error: {first['text']}"
     for output in ("uy_max", "ux_max"):
-        line = next(line for line in lines if line.startswith(f"{output}: "))
+        at = next(k for k, line in enumerate(lines) if line.startswith(f"{output} ("))
+        line = lines[at + 1]
         assert "mesh not known" in line
-        value = re.search(r"mean (\S+) ±", line)[1]
+        value = re.search(r"mean +(\S+) ±", line)[1]
         assert len(value.replace(".", "").strip("-0")) <= 2, line  # digits
     assert main(["report", str(tmp_path / "D")]) == 0
     page = (tmp_path / "D" / "report.html").read_text()
@@ -318,7 +325,7 @@ def test_estimates_that_were_planned_and_failed_are_an_error(tmp_path):
 def test_no_error_stands_alone_where_that_of_the_mesh_was_not_asked_for(method, tmp_path):
     code, printed, summary = of_run(tmp_path / "D", OFF, f"method={method}", SMALL[0])
     assert code == 0
-    assert all("mesh not known" in line for line in printed.splitlines() if "±" in line)
+    assert all("mesh not known" in line for line in printed.splitlines() if re.search(r"\d ±", line))
     assert not [one for one in summary["findings"] if one["severity"] == "error"]
 
 
