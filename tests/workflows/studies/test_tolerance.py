@@ -285,7 +285,7 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
             assert of["error"] <= 0.05 * of["relative_to"]
     assert set(summary["accuracy_seconds"]) == {"sampling", "mesh"}
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "What each error takes of the tolerance." in page
+    assert "value ± 95 %" in page
     assert "The mesh was refined" in page
 
 

@@ -12,13 +12,11 @@ from workflows.report.plots import posterior as posterior
 from workflows.report.plots import selection as selection
 from workflows.report.plots.accuracy import error_budget as error_budget
 from workflows.report.plots.accuracy import errors as errors
-from workflows.report.plots.accuracy import levels as levels
 from workflows.report.plots.accuracy import mesh_cost as mesh_cost
 from workflows.report.plots.accuracy import mesh_mean as mesh_mean
 from workflows.report.plots.accuracy import mesh_samples as mesh_samples
 from workflows.report.plots.accuracy import mesh_variance as mesh_variance
 from workflows.report.plots.accuracy import refinement as refinement
-from workflows.report.plots.accuracy import tolerance_bars as tolerance_bars
 from workflows.report.plots.figure import COLOURS as COLOURS
 from workflows.report.plots.figure import CONTROLLED as CONTROLLED
 from workflows.report.plots.figure import DARK as DARK
@@ -39,6 +37,4 @@ from workflows.report.plots.outputs import index_bars as index_bars
 from workflows.report.plots.outputs import index_convergence as index_convergence
 from workflows.report.plots.outputs import index_shares as index_shares
 from workflows.report.plots.outputs import running_estimates as running_estimates
-from workflows.report.plots.outputs import spectrum as spectrum
-from workflows.report.plots.outputs import standard_error as standard_error
 from workflows.report.plots.outputs import tornado as tornado

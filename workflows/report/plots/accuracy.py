@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from workflows.report.plots.figure import (
     finished,
     quantity,
     rows,
-    stacked,
     text_of,
 )
 from workflows.report.plots.outputs import WORDS, Estimated
@@ -75,55 +74,9 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
     return finished(ax, f"error of the {of}, relative to it", above=len(parts))
 
 
-SOURCES = ("mesh", "sampling", "solver")
-
-
 def _beside(ax: Axes, text: str, x: float, y: float, colour: str = DARK) -> None:
     """Write the number of a bar at its end."""
     ax.annotate(text, (x, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8, color=colour)
-
-
-def tolerance_bars(told: Mapping[str, Any], ax: Axes | None = None) -> Axes:
-    """Draw a bar for each estimate of each output: as long as its error is of the tolerance, divided by source.
-
-    Errors add up in squares, and so the parts of a bar are as their squares.
-
-    Parameters
-    ----------
-    told
-        `accuracy` of summary.json.
-    """
-    found = {
-        f"{name}, {WORDS[estimate]}": parts
-        for name, of in list(told["outputs"].items())[:SHOWN]
-        for estimate, parts in of.items()
-    }
-    ax = ax or axes(height=1.4 + 0.3 * len(found))
-    squares = np.array([[parts[source] ** 2 for parts in found.values()] for source in SOURCES])
-    whole = np.array([parts["total"] for parts in found.values()])
-    shares = whole * squares / np.maximum(squares.sum(axis=0), 1e-300)
-    ends = stacked(ax, list(found), dict(zip(SOURCES, shares, strict=True)), [PART_COLOURS[one] for one in SOURCES])
-    for place, end in zip(ax.get_yticks(), ends, strict=True):
-        _beside(ax, f"{100 * end:.0f} %", end, place)
-    ax.axvline(1.0, color=DARK, linewidth=1)
-    ax.set_xlim(0, 1.12 * max(1.0, *ends))
-    return finished(ax, f"share of the tolerance, {told['tolerance']:g}", above=len(SOURCES))
-
-
-def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw the residuals of the samples and the change of the moments, level by level."""
-    ax = ax or axes()
-    places = dataset["level"].to_numpy()
-    for name, label, colour, dash in (
-        ("level_residual", "largest residual", CONTROLLED, "-"),
-        ("level_residual_median", "median residual", CONTROLLED, ":"),
-        ("level_change", "change of the moments", HIGH, "-"),
-    ):
-        values = dataset[name].to_numpy()
-        ax.plot(places, np.where(values > 0, values, np.nan), dash, color=colour, marker="o", markersize=4, label=label)
-    ax.set_xticks(places)
-    some = bool((dataset["level_residual"] > 0).any() | (dataset["level_change"] > 0).any())
-    return finished(ax, "level", "relative residual, relative change", log="y" if some else "")
 
 
 def mesh_variance(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:

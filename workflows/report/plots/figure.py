@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import SIZES, is_path, scale, spoken
-from forward.words import named, number, power_of_ten
+from forward.words import named, power_of_ten
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -85,21 +85,20 @@ def in_fitting_units(figure: Any) -> None:
 
     Axes stay in SI units, so that lines can be added; only what is written beside them changes.
     """
-    from matplotlib.ticker import FixedLocator, LogFormatterSciNotation, StrMethodFormatter
+    from matplotlib.ticker import FixedLocator, LogFormatterSciNotation
 
     for axis in (one for ax in figure.axes for one in (ax.xaxis, ax.yaxis)):
         if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatterSciNotation):
             axis.set_major_formatter(_of_powers())
             axis.set_minor_formatter(_of_powers())
         found = re.search(r"\(([^()]+)\)$", axis.get_label_text())
-        plain = isinstance(axis.get_major_formatter(), StrMethodFormatter)  # of a logarithmic axis, without powers
-        if found is None or found[1] not in SIZES or (axis.get_scale() != "linear" and not plain):
+        if found is None or found[1] not in SIZES or axis.get_scale() != "linear":
             continue
         one, name = scale(float(np.abs(axis.get_view_interval()).max()), found[1])
         if isinstance(axis.get_major_locator(), FixedLocator):
             continue
         axis.set_label_text(axis.get_label_text()[: found.start()] + f"({name})")
-        axis.set_major_formatter(_plain(one) if plain else _ticks(one))
+        axis.set_major_formatter(_ticks(one))
         other = axis.axes.yaxis
         if axis is axis.axes.xaxis and other.get_label_text().endswith(f"(1/{found[1]})"):  # a density over it
             other.set_label_text(other.get_label_text().removesuffix(f"(1/{found[1]})") + f"(1/{name})")
@@ -121,13 +120,6 @@ def _of_powers() -> Any:
             return power_of_ten(power) if first == 1 else f"{first:g} × {power_of_ten(power)}"
 
     return Powers()
-
-
-def _plain(one: float) -> Any:
-    """Return a formatter of logarithmic ticks in a unit, as numbers."""
-    from matplotlib.ticker import FuncFormatter
-
-    return FuncFormatter(lambda x, _: number(x / one))
 
 
 def _ticks(one: float) -> Any:

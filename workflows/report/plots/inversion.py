@@ -23,7 +23,6 @@ from workflows.report.plots.figure import (
     figure_of,
     finished,
     grid,
-    rows,
     span,
     text_of,
 )
@@ -329,21 +328,6 @@ def node_marginals(one: xr.Dataset) -> Axes:
 
 def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:
     return np.asarray(np.exp(-(((x - mean) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi)))
-
-
-def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw errors of the parameters whose true values are known, over their standard deviations."""
-    names = [str(name) for name in one.parameter.values if np.isfinite(one["true"].sel(parameter=name))]
-    ax = ax or axes(height=1.2 + 0.35 * len(names))
-    places = rows(ax, names)
-    known = one.sel(parameter=names)
-    z = ((known["mean"] - known["true"]) / known["std"]).to_numpy()
-    ax.axvspan(-1.96, 1.96, color=DARK, alpha=0.08, linewidth=0)
-    ax.errorbar(z, places, xerr=1, fmt="o", color=CONTROLLED, capsize=4)
-    ax.axvline(0, color=HIGH, linewidth=1)
-    farthest = max(3.0, 1.05 * float(np.abs(z).max()) + 1.3)
-    ax.set_xlim(-farthest, farthest)
-    return finished(ax, "(mean − truth)/standard deviation")
 
 
 def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:

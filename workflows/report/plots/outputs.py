@@ -93,25 +93,6 @@ def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axe
     return finished(ax, y=f"running mean of {quantity(dataset, output)}", title="mean, 95 % band")
 
 
-def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the standard error of the mean of an output against the number of samples, plain and controlled."""
-    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
-
-    ax = ax or axes()
-    series = _series(dataset, output)
-    for label, colour, counts, _, error in series:
-        ax.plot(counts, error, color=colour, label=label)
-        ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
-    ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
-    count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
-    if any((error > 0).any() for *_, error in series):  # zero for an output that does not vary
-        ax.set_yscale("log")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
-        ax.yaxis.set_minor_locator(NullLocator())
-    return finished(ax, y=f"standard error of {quantity(dataset, output)}")
-
-
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the density of an output, from its expansion or its samples, with its mean and quantiles."""
     ax = ax or axes()
@@ -384,17 +365,3 @@ def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
         along, dataset["values"].sel(output=output).to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0
     )
     return finished(ax, "leading direction (standard deviations)", quantity(dataset, output))
-
-
-def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the eigenvalues of the active subspace of an output with their 95 % ranges."""
-    ax = ax or axes()
-    of_output = dataset.sel(output=output)
-    values, lower, upper = (of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper"))
-    reach = np.abs([np.minimum(lower - values, 0), np.maximum(upper - values, 0)])
-    places = np.arange(1, len(values) + 1)
-    ax.errorbar(places, values, yerr=reach, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
-    if (values > 0).any():
-        ax.set_yscale("log")
-    ax.locator_params(axis="x", integer=True)
-    return finished(ax, "number", f"eigenvalue for {text_of(output)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,36 +150,22 @@ def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
 
 
 SHOWN = 12  # outputs that have bars
-PARTS = ("within", "between")
-
-
-def within_and_between(predictions: Mapping[str, xr.Dataset], ax: Axes | None = None) -> Axes:
-    """Draw a bar for each averaged prediction: the shares of its variance within the models and between them."""
-    names = list(predictions)[:SHOWN]
-    of = {part: np.array([float(predictions[name][f"average_{part}"]) for name in names]) for part in PARTS}
-    return _bars(names, {"within the models": of["within"]}, "between them", of["between"], ax)
 
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw a bar for each output: the share of its variance within each candidate, and that between them."""
     outputs = [str(name) for name in dataset["output"].values][:SHOWN]
-    some = dataset.sel(output=outputs)
-    within = {}
+    some, parts = dataset.sel(output=outputs), {}
     for name in dataset["candidate"].values:
         one = some.sel(candidate=name)
-        share = float(one["candidate_probability"]) * one["candidate_std"] ** 2
-        within[f"within {text_of(str(name))}"] = share.to_numpy()
-    return _bars(outputs, within, "between", some["between"].to_numpy(), ax)
-
-
-def _bars(
-    names: Sequence[str], within: Mapping[str, FloatArray], label: str, between: FloatArray, ax: Axes | None
-) -> Axes:
-    """Draw a bar for each of some names: shares of parts (n,) within candidates, and of that between them."""
-    ax = ax or axes(height=1.3 + 0.35 * len(names), width=7.0)
-    parts = {**within, label: between}
-    whole = sum(parts.values(), np.zeros(len(names)))
-    shares = {said: np.divide(part, whole, out=np.zeros(len(names)), where=whole > 0) for said, part in parts.items()}
-    stacked(ax, names, shares, [*(COLOURS[i % len(COLOURS)] for i in range(len(within))), DARK])
+        parts[f"within {text_of(str(name))}"] = (
+            float(one["candidate_probability"]) * one["candidate_std"] ** 2
+        ).to_numpy()
+    colours_ = [*(COLOURS[i % len(COLOURS)] for i in range(len(parts))), DARK]
+    parts["between"] = some["between"].to_numpy()
+    whole = sum(parts.values(), np.zeros(len(outputs)))
+    shares = {said: np.divide(part, whole, out=np.zeros(len(outputs)), where=whole > 0) for said, part in parts.items()}
+    ax = ax or axes(height=1.3 + 0.35 * len(outputs), width=7.0)
+    stacked(ax, outputs, shares, colours_)
     ax.set_xlim(0, 1)
     return finished(ax, "share of the variance", above=3)

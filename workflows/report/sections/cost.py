@@ -190,8 +190,6 @@ def levels(results: Results) -> Iterator[Block]:
             **{word: partial(_work, name=name) for name, word in work.items()},
         },
     )
-    caption = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
-    yield Pictures.of((plots.levels(results.dataset), caption))
     yield Text(
         "Moments from the samples of the last level, with the expansion of the previous level, which does not "
         "depend on them, as control variate; the distance between these and the moments of the expansion is part "

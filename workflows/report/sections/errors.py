@@ -143,7 +143,6 @@ def tolerance(results: Results) -> Iterator[Block]:
         )
     if told["mesh"] is not None and not told["mesh"]["estimated"]:
         yield Text("The error of the mesh is not known, and not counted.", tone="warning")
-    yield Pictures.of((plots.tolerance_bars(told), "What each error takes of the tolerance."))
     seconds = results.summary.get("accuracy_seconds", {})
     costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
     yield Pairs([("why", told["reasons"]), *([("what it took", costs)] if costs else [])])

@@ -81,7 +81,6 @@ def distribution(results: Results) -> Iterator[Block]:
         yield Pictures.of(
             (plots.histogram(dataset, output), f"Samples of {output}: density, mean and quantiles."),
             (plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
-            (plots.standard_error(dataset, output), f"Standard error of the mean of {output}."),
             small=True,
         )
 
@@ -275,13 +274,8 @@ def derivative_based(results: Results) -> Iterator[Block]:
             for i, (value, lower, upper) in enumerate(values, start=1)
         ]
         yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), spectrum)
-        yield Pictures.of(
-            (
-                plots.active_summary(dataset, output),
-                f"{output} against its leading direction: a curve if only that direction matters.",
-            ),
-            (plots.spectrum(dataset, output), f"Eigenvalues of the active subspace of {output} with 95 % ranges."),
-        )
+        caption = f"{output} against its leading direction: a curve if only that direction matters."
+        yield Pictures.of((plots.active_summary(dataset, output), caption))
 
 
 def bounds(results: Results, output: str) -> Table:

@@ -307,8 +307,6 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
         known = " and the truth" if np.isfinite(one["true"]).any() else ""
         yield plots.correlations(one, units), f"{words}{known}."
     yield of_misfits(one)
-    if np.isfinite(one["true"]).any():
-        yield plots.errors(one), "Mean minus truth over the posterior standard deviation; 95 % lie in the grey band."
 
 
 @section("alone_stiffness_std")

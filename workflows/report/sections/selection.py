@@ -122,26 +122,23 @@ def averages(results: Results) -> Iterator[Block]:
     """Predictions averaged over the models."""
     yield Text("At the end of each test, or where the largest displacement was measured, without measurement errors.")
     dataset = results.dataset
-    quantity, last = str(dataset.attrs["quantity"]), last_of_tests(dataset)
+    quantity = str(dataset.attrs["quantity"])
     study: Comparison = results.study
     units = {output.name: output.unit for spec in [*study.of_candidates.values()][:1] for output in spec.returned}
     rows = []
-    for one in last.values():
+    for one in last_of_tests(dataset):
         unit = UNITS.get(quantity) or units.get(str(one["output_test"].item()), "1")
         means = (size(float(one[name]), unit, 4) for name in ("measured", "average_mean"))
-        stds = (size(np.sqrt(float(one[f"average_{part}"])), unit, 3) for part in plots.PARTS)
+        stds = (size(np.sqrt(float(one[f"average_{part}"])), unit, 3) for part in ("within", "between"))
         at = number(float(one["output_at"]))
         rows.append((str(one["output_group"].item()), str(one["output_test"].item()), at, *means, *stds))
     place = "at" if quantity == "stress" else "datum"
     head = ("group", "test", place, "measured", "averaged prediction", "spread within models", "spread between models")
     yield Table(head, rows, text={0, 1})
-    caption = "Parts of the variance: within the models, and between them: what it matters which of them is right."
-    yield Pictures.of((plots.within_and_between(last), caption))
 
 
-def last_of_tests(dataset: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the last datum of each test, or the largest displacement, by group and test."""
-    found = {}
+def last_of_tests(dataset: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Go through the last datum of each test of a group, or its largest displacement."""
     tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
@@ -149,8 +146,7 @@ def last_of_tests(dataset: xr.Dataset) -> dict[str, xr.Dataset]:
         # Displacement data have only numbers: take the largest displacement.
         stress = dataset.attrs["quantity"] == "stress"
         far = np.abs(at - at[0]) if stress else np.abs(dataset["measured"].values[members])
-        found[f"{group}, {test}"] = dataset.isel(output=members[int(np.argmax(far))])
-    return found
+        yield dataset.isel(output=members[int(np.argmax(far))])
 
 
 @section("candidate_mean", heading="Averaged over candidates")
