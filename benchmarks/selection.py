@@ -17,12 +17,12 @@ from benchmarks.beams import CONFIG
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
 from inverse.criticism.comparison import Candidate
-from inverse.criticism.selected import conflicts, ranking
 from inverse.data.measurements import Measurements
 from inverse.methods.selection import Noise, Select
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
+from workflows.results.comparison import conflicts, ranking
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 TESTS = [MaterialTest(mode=mode, at=STRETCHES) for mode in ("uniaxial", "equibiaxial", "pure-shear")]

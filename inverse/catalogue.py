@@ -172,21 +172,5 @@ TABLE: dict[str, str | Words] = {
         "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
         short="",
     ),
-    "only-candidate": "{best} is the only candidate.",
-    "best-of-bad": "Best of bad models: the residuals of {best} {wrong}.",
-    "left-out-predicted": "Left-out data are predicted best by {other}.",
-    "whole-tests-predicted": "Whole tests are predicted best, from the others, by {other}.",
-    "specimens-disagree": "Specimens disagree: of {specimens}, {many} are rather {most} and {few} rather {fewer} "
-    "({listed}); ln of the Bayes factor over one material for all: {factor}. Probabilities of the candidates are for "
-    "one material of all specimens: compare them apart, or in two studies.",
-    "evidence-untrusted": "Evidences not to be trusted: {where} ({verdict}).",
-    "constants-of-laplace": "Constants are Laplace's, and not to be trusted: {where} ({verdict}).",
-    "evidence-untrusted-for-meshes": "Evidences not to be trusted for what meshes do to them: {models}.",
-    "order-depends": "With {variant}, {best} stays first but the order changes: {order}.",
-    "winner-depends": "It depends: the most probable is {changed}.",
-    "most-probable": "{best} is the most probable of the candidates, with {probability}; ln of the Bayes factor over "
-    "{second}: {factor}, {grade}.",
-    "mixture-predicted": "Left-out data are predicted best by a mixture (stacking): {parts}. Probabilities say which "
-    'candidate is true, if one is; model = "stacked" of `from` predicts with the mixture.',
 }
 register(TABLE)

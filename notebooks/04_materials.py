@@ -23,9 +23,9 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from inverse.criticism.selected import findings
 from workflows.config.study import parse
 from workflows.report import plots
+from workflows.results.comparison import findings
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, TypeAdapter
 
 from forward.settings import Settings
 from uq.evaluation.request import BLOCKS
@@ -83,6 +84,30 @@ class Report(Settings):
     def modules(self) -> Iterator[str]:
         """The modules of the sections."""
         return (name.rpartition(".")[0] for name in self.sections)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What stands in a study, and the type that it is of."""
+
+    of: Any
+    value: Any
+
+
+def decided(blocks: Any, **types: Any) -> Any:
+    """Return the blocks of a study in which some are of types that others decide on: fields with `AS_DECIDED`."""
+    match blocks:
+        case {**found}:
+            return found | {name: _Given(of, found[name]) for name, of in types.items() if name in found}
+        case _:
+            return blocks
+
+
+def _as_decided(block: Any) -> Any:
+    return TypeAdapter(block.of).validate_python(block.value) if isinstance(block, _Given) else block
+
+
+AS_DECIDED = BeforeValidator(_as_decided)
 
 
 def located(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:

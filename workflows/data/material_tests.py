@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
 from inverse.data.reader import AnyReader, table_of
 from inverse.data.table import DataError, Table, needed
+from workflows.config.mistakes import StudyError, lines
+from workflows.config.tables import at
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
@@ -239,6 +241,22 @@ class MeasuredTests(Settings):
     def data_groups(self) -> tuple[str, ...]:
         """Names of the groups."""
         return tuple(dict.fromkeys(test.group for test in self.tests))
+
+    def of(self, group: str) -> list[MeasuredTest]:
+        """Return the tests of a group."""
+        return [test for test in self.tests if test.group == group]
+
+
+def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a document whose table of tests, if it names one, has been read; a StudyError if that cannot be done."""
+    if at(document, "data", "file") is None:
+        return dict(document)
+    try:
+        return {**document, "data": DataFile.model_validate(dict(document["data"])).read(folder)}
+    except ValidationError as error:
+        raise StudyError(*lines(error, "data")) from None
+    except DataError as error:
+        raise StudyError(*error.args) from None
 
 
 def _refuse_repeats(table: Table, path: Path) -> None:

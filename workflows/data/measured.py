@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -20,7 +20,6 @@ from forward.bodies.surface import Surface
 from forward.combine import selected
 from forward.files import meshes
 from forward.settings import Settings, one_line
-from forward.spec import SPECIMEN, usual_kind
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
 from inverse.data.measurements import Measurements
@@ -28,7 +27,6 @@ from inverse.data.registration import ToSurface
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.tables import at
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
@@ -61,28 +59,6 @@ class DataSet(Settings):
     file: str
     digest: str = ""
     refused: str = ""
-
-
-@dataclass(frozen=True)
-class _Given:
-    """What stands in a study as data, and the block that it is of."""
-
-    block: type[Settings]
-    table: Any
-
-
-def data_as(blocks: Any, of_specimen: type[Settings], of_outputs: type[Settings]) -> Any:
-    """Return the blocks of a study whose `data`, if it is a table, is of the block that the model decides on."""
-    data = at(blocks, "data")
-    if data is None or isinstance(data, Settings):
-        return blocks
-    block = of_specimen if usual_kind(blocks.get("model")) == SPECIMEN else of_outputs
-    return {**blocks, "data": _Given(block, data)}
-
-
-def as_block(data: Any) -> Any:
-    """Return the block of data that `data_as` has chosen; others are returned as they are."""
-    return data.block.model_validate(data.table) if isinstance(data, _Given) else data
 
 
 def _one_alone(given: Any) -> Any:

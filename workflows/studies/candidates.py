@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,8 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from forward.material_tests import TestedMaterial
 from forward.materials.admissible import Materials
+from forward.materials.material import units
+from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MEASURED, ModelSpec
@@ -39,6 +42,14 @@ class CandidateBlock(Settings):
         """The random parameters."""
         return inputs_of(self.parameters, self.correlations)
 
+    def restricted(self, spec: ModelSpec | None) -> Inputs:
+        """The random parameters, restricted to those that make materials, where there are some."""
+        return self.inputs
+
+    @abstractmethod
+    def units(self, spec: ModelSpec | None) -> dict[str, str]:
+        """SI units of its numbers, of which some are parameters."""
+
 
 class CandidateModel(TestedMaterial, CandidateBlock):
     """A candidate material with its prior.
@@ -60,6 +71,14 @@ class CandidateModel(TestedMaterial, CandidateBlock):
     def materials(self) -> Materials:
         """The material as a function of the random constants."""
         return Materials(self.energy, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
+
+    def units(self, spec: ModelSpec | None) -> dict[str, str]:
+        """SI units of the constants."""
+        return units(self.energy)
+
+    def tested(self, tests: Sequence[MaterialTest]) -> HomogeneousModel:
+        """Make the model of the stresses of tests."""
+        return HomogeneousModel(self.energy, self.fixed, tests, tuple(self.parameters), self.fibres)
 
     @model_validator(mode="after")
     def _check(self) -> CandidateModel:
@@ -87,10 +106,14 @@ class ModelCandidate(CandidateBlock):
 
     model: dict[str, Any] = Field(default={})
 
-    def restricted(self, spec: ModelSpec) -> Inputs:
+    def restricted(self, spec: ModelSpec | None) -> Inputs:
         """The random parameters, restricted to those that make materials, where there are some."""
-        materials = spec.materials(self.inputs.names)
+        materials = None if spec is None else spec.materials(self.inputs.names)
         return self.inputs if materials is None else self.inputs.within(materials)
+
+    def units(self, spec: ModelSpec | None) -> dict[str, str]:
+        """SI units of the numbers of the model."""
+        return {} if spec is None else {path: number.unit for path, number in spec.scalars.items()}
 
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of the priors does not fit the model."""
@@ -103,7 +126,7 @@ class ModelCandidate(CandidateBlock):
 
 
 class OfCandidates(Settings):
-    """A study of candidates that each change one model.
+    """A study of candidates that each change one model, or are materials without one.
 
     Parameters
     ----------
@@ -113,19 +136,26 @@ class OfCandidates(Settings):
         Models by name.
     """
 
-    model: dict[str, Any]
-    candidates: dict[str, ModelCandidate] = Field(min_length=1)
+    model: dict[str, Any] | None = None
+    candidates: Mapping[str, Any]
+
+    @property
+    def changes(self) -> Mapping[str, dict[str, Any]]:
+        """The block of the model of each candidate; none of materials."""
+        if self.model is None:
+            return {}
+        return {name: changed(self.model, one.model) for name, one in self.candidates.items()}
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """The model of each candidate, in the form that suits all values of its parameters."""
-        given = {name: spec_of(changed(self.model, one.model)) for name, one in self.candidates.items()}
+        """The model of each candidate, in the form that suits all values of its parameters; none of materials."""
+        given = {name: spec_of(block) for name, block in self.changes.items()}
         return {name: spec.over(ranges(self.candidates[name].parameters)) for name, spec in given.items()}
 
     @property
     def priors(self) -> dict[str, Inputs]:
         """The unknowns of each candidate, restricted to those for which there is a material."""
-        return {name: one.restricted(self.of_candidates[name]) for name, one in self.candidates.items()}
+        return {name: one.restricted(self.of_candidates.get(name)) for name, one in self.candidates.items()}
 
     @property
     def findings_of_models(self) -> Iterator[Finding]:
@@ -135,18 +165,22 @@ class OfCandidates(Settings):
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the unknowns of a candidate."""
-        return self.candidates[label.partition("/")[0]].inputs.names
+        name, _, _ = label.partition("/")
+        found: tuple[str, ...] = self.candidates[name].inputs.names
+        return found
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the numbers of a candidate's model."""
-        return {path: number.unit for path, number in self.of_candidates[label.partition("/")[0]].scalars.items()}
+        name, _, _ = label.partition("/")
+        found: dict[str, str] = self.candidates[name].units(self.of_candidates.get(name))
+        return found
 
     def models_and_mistakes(self) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
         """Find the place of each candidate, its model (None if it is none), and what is wrong with it."""
-        for name, candidate in self.candidates.items():
-            place = ("candidates", name)
+        for name, block in self.changes.items():
+            place, candidate = ("candidates", name), self.candidates[name]
             try:
-                spec = spec_of(changed(self.model, candidate.model))
+                spec = spec_of(block)
             except ValidationError as error:
                 lines = error.errors(include_url=False)
                 yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]

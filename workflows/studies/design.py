@@ -151,6 +151,7 @@ class DesignOfModels(OfCandidates, FromPython, StudyKind):
     stopped: ClassVar[str] = "a design"
     explains: ClassVar[bool] = False
 
+    model: dict[str, Any]
     candidates: dict[str, ModelCandidate] = Field(min_length=2)
     method: Design
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
 from forward.model import ModelError
 from forward.settings import Settings
-from forward.spec import MEASURED
+from forward.spec import MEASURED, SPECIMEN, usual_kind
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Parallel
+from workflows.config.blocks import AS_DECIDED, Parallel, decided
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
-from workflows.data.measured import DataFiles, as_block, data_as
+from workflows.config.tables import at
+from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import never_estimable
 
@@ -71,7 +72,7 @@ class InversionBlocks(OneModel):
     restricted: ClassVar[bool] = True
 
     model: Annotated[Any, MEASURED]
-    data: Annotated[DataFiles | MeasuredOutputs, BeforeValidator(as_block)]
+    data: Annotated[DataFiles | MeasuredOutputs, AS_DECIDED]
     method: Invert = Invert()
     predict: Predict | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
@@ -215,7 +216,7 @@ class InversionBlocks(OneModel):
     @classmethod
     def _data_of_model(cls, blocks: Any) -> Any:
         """Choose the block of the data by the model."""
-        return data_as(blocks, DataFiles, MeasuredOutputs)
+        return decided(blocks, data=DataFiles if usual_kind(at(blocks, "model")) == SPECIMEN else MeasuredOutputs)
 
 
 def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:

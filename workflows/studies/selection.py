@@ -1,60 +1,37 @@
-"""A study that compares material models: tests with their data, candidates, and the method."""
+"""A study that compares models by data: materials in homogeneous tests, or models of which something was measured."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
-from functools import cache, cached_property, partial
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
-
-import numpy as np
-from pydantic import Field
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from forward.findings import Finding
-from forward.materials.material import units
-from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
-from forward.model import ForwardModel
+from forward.materials.material_point import unfit
 from forward.scalars import Mistake
-from forward.settings import Settings, nearest
-from inverse.criticism import selected as results
+from forward.settings import Settings, nearest, shown
+from forward.spec import ModelSpec
 from inverse.criticism.assessment import NEEDED, own_seconds
-from inverse.criticism.comparison import Candidate
-from inverse.criticism.finer import Finer
-from inverse.data.measurements import Measurements
-from inverse.methods.selection import Noise, Select
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.request import Evaluate
-from uq.findings import add
-from workflows.config.mistakes import not_installed
+from inverse.criticism.doubts import not_estimable
+from inverse.data.measurements import AXES
+from inverse.data.table import DataError
+from inverse.methods.selection import Noise
+from workflows.config.mistakes import StudyError, not_installed, refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
-from workflows.data.material_tests import DataFile, MeasuredTest, MeasuredTests
+from workflows.data.material_tests import DataFile, expanded
+from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
-from workflows.studies.candidates import CandidateModel
-from workflows.studies.job import MOVED, MethodJob
-from workflows.studies.predictions import (
-    FINER,
-    NOT_ASKED,
-    duration,
-    has_mesh,
-    mesh_check,
-    of_file,
-    once_on_finer_meshes,
-)
-from workflows.studies.solves import of_answers
-from workflows.studies.study import StudyKind
+from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
+from workflows.studies.selection_blocks import SelectionBlocks
+from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
-    import xarray as xr
-
-    from forward.spec import ModelSpec
-    from inverse.data.shared_motion import SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.job import MethodJob
 
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
-
-
+SECONDS = 1e-3  # of a solve about which nothing is known
 # What data of a quantity are called, and what they are of.
 DATA = {
     "stress": ("stresses", "tests"),
@@ -63,91 +40,79 @@ DATA = {
 }
 
 
-class Comparison(FromPython, StudyKind):
-    """What studies that compare models have in common: candidates by name, groups of data, the method."""
+class Selection(SelectionBlocks, FromPython, StudyKind):
+    """What to compare: candidates that change one model, and are observed in the same way; or materials.
+
+    Parameters
+    ----------
+    model
+        The model, as far as the candidates have it in common; without one, the stresses of materials are compared.
+    data
+        What was measured: a file, or tests of materials.
+    candidates
+        Models by name.
+    predict
+        Tests of materials that are predicted besides the measured ones, in every group.
+    method
+        How the candidates are compared.
+    """
 
     stopped: ClassVar[str] = "all evidences found"
-    costly: ClassVar[bool]  # whether solves are worth a file
-    data: Any
-    candidates: Mapping[str, Any]
-    method: Select
+    data_in_file: ClassVar[tuple[type[Settings], ...]] = (DataFile,)
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
+        """Check the blocks of a comparison, and read its data: those of a model by that of the first candidate."""
+        match blocks:
+            case {"model": {}}:
+                pass
+            case {"model": other}:
+                raise StudyError(f"model: expected a table, {{ key = value }}; given {shown(other)}")
+            case _:
+                blocks = expanded(blocks, folder)
+        return cls.model_validate(blocks).with_data(folder)
 
     @property
-    def seconds_of_solves(self) -> float:
-        """Processor time of all solves and their derivatives, roughly."""
-        raise NotImplementedError
+    def recorded(self) -> bool:
+        """As in every study: its file is named, and not read."""
+        return self.model is not None and self.measurements is None
+
+    def with_data(self, folder: Path) -> Self:
+        """Return the same with its data, read by the model of the first candidate; a StudyError for what is wrong."""
+        data: Any = self.data
+        if self.model is None or data.digest:
+            return self
+        try:
+            found = data.read(folder, next(iter(self.of_candidates.values())))
+        except DataError as error:
+            raise StudyError(*(f"data: {line}" for line in error.args)) from None
+        source = (*found.source, *(f"truth: {name} = {value}" for name, value in found.truth.items()))
+        digest = digest_of(folder / data.file) if data.file else ""
+        data = data.model_copy(update={"digest": digest, "source": source})
+        study = self.model_copy(update={"data": data, "measurements": found})
+        refused(type(self).__name__, [*study._unobserved(), *study.mistakes_of_data()])
+        return study
+
+    # --- what it costs -----------------------------------------------------------------------------------------------
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings about the study before anything is solved."""
-        of_all = ([found.of(name) for found in findings_of_materials(one.inputs)] for name, one in self.models.items())
-        return tuple(finding for found in of_all for finding in found)
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The models of all candidates, and the finer meshes that they are looked at on."""
+        return *self.of_candidates.values(), *(fine for several in self.finer_meshes for fine in several)
 
     @property
-    def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
-        return {}
+    def memory(self) -> float:
+        """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
+        return bytes_of(self.of_candidates.values()) + max(
+            (bytes_of(several) for several in self.finer_meshes), default=0.0
+        )
 
     @property
-    def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """Models of the candidates; none of materials."""
-        return {}
-
-    @property
-    def mesh_checks(self) -> list[tuple[float, str]]:
-        """Processor time (s) of solves on finer meshes of each candidate that has a mesh, and what is solved."""
-        return [mesh_check(spec) for spec in self.of_candidates.values() if has_mesh(spec)]
-
-    def described(self, name: str) -> str:
-        """Describe a candidate."""
-        raise NotImplementedError
-
-    def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
-        """Make the model of a candidate in a group on a communicator; collective."""
-        raise NotImplementedError
-
-    def build_finer(self, name: str, make: Callable[[], ForwardModel]) -> ForwardModel:
-        """Make a candidate's model, which `make` returns, on a finer mesh, if it is checked there; collective."""
-        return once_on_finer_meshes(make, self.models[name].inputs.mean)
-
-    def shared(self, name: str, group: str) -> SharedMotion | None:
-        """Return the errors that the data share, as a candidate sees them; None if they are independent."""
-        return None
-
-    def contradictions(self, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
-        """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
-        spec = self.of_candidates.get(name)
-        if spec is None or spec.shareable:
-            return []
-        return [one.of(f"Candidate '{name}'") for one in of_answers(make(), self.candidates[name].inputs)]
-
-    @property
-    def data_groups(self) -> dict[str, Measurements]:
-        """Data by group."""
-        raise NotImplementedError
-
-    @property
-    def group_names(self) -> tuple[str, ...]:
-        """Names of the groups."""
-        return tuple(self.data_groups)
-
-    def tests(self, group: str) -> tuple[str, ...]:
-        """Names of the tests that were measured in a group."""
-        return self.data_groups[group].measured_tests
-
-    def measured_in(self, test: str) -> str:
-        """Say what was measured in a test, with its unit."""
-        raise NotImplementedError
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Candidates and groups, in the order of the models."""
-        return [(name, group) for name in self.candidates for group in self.group_names]
-
-    @property
-    def models(self) -> dict[str, Candidate]:
-        """The candidates as the method needs them."""
-        return {name: Candidate(candidate.inputs, candidate.weight) for name, candidate in self.candidates.items()}
+    def evidences(self) -> int:
+        """Number of evidences that are found."""
+        counts = [len(self.tests(group)) for group in self.data_groups]
+        held_out = sum(count for count in counts if count > 1) if self.method.held_out else 0
+        return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
 
     @property
     def planned(self) -> int:
@@ -162,16 +127,24 @@ class Comparison(FromPython, StudyKind):
         return 10 * self.method.starts + 2 * len(self.candidates[name].parameters)
 
     @property
-    def evidences(self) -> int:
-        """Number of evidences that are found."""
-        counts = [len(self.tests(group)) for group in self.group_names]
-        held_out = sum(count for count in counts if count > 1) if self.method.held_out else 0
-        return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
+    def seconds_of_solves(self) -> float:
+        """Processor time of all solves and their derivatives, roughly: searches for modes have no reference."""
+        if self.model is None:
+            return SECONDS_PER_STRESS * self.planned
+        seconds = 0.0
+        for name, spec in self.of_candidates.items():
+            cost, solves = spec.cost(), self.searches(name) + self.method.samples
+            if cost is None:
+                seconds += SECONDS * solves
+                continue
+            derivatives = cost.tangents_of_sample(len(self.candidates[name].parameters))
+            seconds += self.searches(name) * (cost.textbook if spec.placed else cost.sample)
+            seconds += self.method.samples * cost.sample + solves * derivatives
+        return seconds * self.evidences / len(self.of_candidates)
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""
-        method = self.method
-        evidences = self.evidences
+        method, evidences = self.method, self.evidences
         sizes = {group: len(one.seen()) for group, one in self.data_groups.items()}
         own = sum(
             own_seconds(len(self.candidates[name].parameters), sizes[group], method.samples)
@@ -180,12 +153,12 @@ class Comparison(FromPython, StudyKind):
         seconds = self.seconds_of_solves + own * evidences / len(self.pairs)
         if method.chains == "hmc":
             seconds += len(self.pairs) * own_seconds(0, 0, 0, "hmc")
-        meshes = self.mesh_checks
+        meshes = [mesh_check(spec) for spec in self.of_candidates.values() if has_mesh(spec)]
         if self.unchecked and method.treatment is None:
             meshes = [(0.0, NOT_ASKED)]
         seconds += sum(once for once, _ in meshes)
         check = " and nested sampling, which takes minutes" if method.check else ""
-        tests = sum(len(self.tests(group)) for group in self.group_names)
+        tests = sum(len(self.tests(group)) for group in self.data_groups)
         among = f" in {len(sizes)} groups" if len(sizes) > 1 else ""
         kind, parts = DATA[self.data.quantity]
         count = f"{sum(sizes.values())} {kind} of {tests} {parts}"
@@ -201,74 +174,62 @@ class Comparison(FromPython, StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
         """Make the candidates, each for each group of data; collective."""
-        makers = {pair: cache(partial(self.build, *pair, ensemble.group)) for pair in self.pairs}
-        recorders: dict[str, Recorder] = {}
-        why = self.unchecked
-        checked = [pair for pair in self.pairs if not why.get(pair[0], "none")]
+        from workflows.studies.selection_job import job
 
-        motions = {pair: found for pair in self.pairs if (found := self.shared(*pair)) is not None}
+        return job(self, ensemble)
 
-        def task(evaluate: Evaluate) -> xr.Dataset:
-            moved = {pair: evaluate.on(f"{'/'.join(pair)}/{MOVED}") for pair in motions}
-            shared = {pair: motion.errors_by(moved[pair]) for pair, motion in motions.items()}
+    # --- what is said ------------------------------------------------------------------------------------------------
 
-            def recorded(name: str, group: str) -> Evaluate:
-                recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
-                return recorders[f"{name}/{group}"]
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about the models before anything is solved, each once."""
+        of_all = [found.of(name) for name, inputs in self.priors.items() for found in findings_of_materials(inputs)]
+        return tuple(dict.fromkeys([*self.findings_of_models, *of_all, *self._of_outputs()]))
 
-            def free(name: str, group: str) -> Evaluate:
-                # What nested sampling solves is too much, and too cheap, to keep.
-                return SerialEvaluate(self.build(name, group), ensemble.count)
+    def _of_outputs(self) -> Iterator[Finding]:
+        """Say of which measured outputs nothing tells the error of the mesh."""
+        known = self.measurements is not None and self.measurements.some
+        measured = self.measurements.names.tolist() if known else ()
+        never = (never_estimable(spec, measured) for spec in self.of_candidates.values())
+        names = tuple(dict.fromkeys(name for several in never for name in several))
+        yield from not_estimable(names) if names and self.unchecked else ()
 
-            def finer(name: str, group: str) -> Finer:
-                if (name, group) not in checked:
-                    return Finer(None, why[name])
-                return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what cannot be asked together."""
+        yield from self._of_tests() if self.model is None else self._of_models()
 
-            look = finer if why else None
+    def _of_tests(self) -> Iterator[Mistake]:
+        data: Any = self.data
+        for group in data.data_groups:
+            labels = [test.label for test in self.tests_in(group)]
+            twice = next((label for label in labels if labels.count(label) > 1), None)
+            if twice is not None:
+                yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
+                return
+        candidate: Any
+        for name, candidate in self.candidates.items():
+            tests = (*data.tests, *(self.predict or ()))
+            objections = (unfit(candidate.energy, test.mode, candidate.fibres) for test in tests)
+            objection = next(filter(None, objections), None)
+            if objection is not None:
+                yield ("candidates", name, "material"), objection, candidate.material
+        yield from self._of_method()
+        yield from self.mistakes_of_data()
 
-            def itself(name: str, group: str) -> ForwardModel:
-                return makers[name, group]()
+    def _of_models(self) -> Iterator[Mistake]:
+        if self.predict is not None:
+            yield ("predict",), "tests of materials are predicted, expected none with a model", list(self.predict)
+        if self.data.quantity == DisplacementFile.quantity and self.method.check is not None:
+            message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
+            yield ("method", "check"), message, self.method.check
+        for _, spec, mistakes in self.models_and_mistakes():
+            yield from mistakes
+            if spec is not None:
+                yield from self.mistakes_of_ranks(spec)
+        yield from self._of_method()
 
-            method = self.method
-            return method.run(self.models, self.data_groups, recorded, free, look, ensemble.say, shared or None, itself)
-
-        def labelled(found: xr.Dataset) -> xr.Dataset:
-            found = found.assign_attrs(quantity=self.data.quantity)
-            if "mesh_checked" in found:
-                of_files = [of_file(self.of_candidates[str(name)]) for name in found.model.values]
-                found = found.assign(mesh_of_file=("model", of_files))
-            candidates = {name: candidate.inputs for name, candidate in self.candidates.items()}
-            units = {name: self.units_of(name) for name in candidates}
-            doubts = results.doubts_of_selection(found, candidates, self.method.noise.factor, units)
-            wrong = {name: self.contradictions(name, make) for (name, _), make in makers.items()}
-            of_wrong = [name for name, several in wrong.items() if several]
-            judged = results.trusted_on_meshes(results.with_right_derivatives(found, of_wrong))
-            add(judged, *results.findings(found), *results.untrusted(found, judged, of_wrong), *doubts)
-            add(judged, *(one for several in wrong.values() for one in several))
-            return judged
-
-        others: dict[str, Callable[[], ForwardModel]] = {"/".join(pair): make for pair, make in makers.items()}
-        finer_ones = {f"{n}/{g}/{FINER}": partial(self.build_finer, n, makers[n, g]) for n, g in checked}
-        moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
-        first = makers[self.pairs[0]]()
-        return MethodJob(
-            first,
-            others | finer_ones | moved_ones,
-            task,
-            recorders,
-            labelled=labelled,
-            arviz_groups=partial(results.arviz_groups, self.models, self.method.noise.factor, self.method.seed),
-            costly=self.costly,
-            passing=frozenset(finer_ones),
-        )
-
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the parameters of a candidate."""
-        return tuple(self.candidates[label.partition("/")[0]].parameters)
-
-    def mistakes_of_method(self) -> Iterator[Mistake]:
-        """Find what does not fit the candidates and the data."""
+    def _of_method(self) -> Iterator[Mistake]:
+        """Find what of the method does not fit the candidates."""
         if self.method.check is not None:
             yield from not_installed("check", self.method.check, (self.method.check,))
         if self.method.chains is not None:
@@ -291,7 +252,7 @@ class Comparison(FromPython, StudyKind):
 
     def mistakes_of_data(self) -> Iterator[Mistake]:
         """Find what of the method does not fit the data."""
-        known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
+        known = tuple(dict.fromkeys(test for group in self.data_groups for test in self.tests(group)))
         for name, tests in self.method.subsets.items():
             for test in tests:
                 if test not in known:
@@ -304,93 +265,25 @@ class Comparison(FromPython, StudyKind):
                     yield ("method", *place), str(error), noise.model_dump(exclude_none=True)
                     break
 
-
-def _moved(make: Callable[[], Any], motion: SharedMotion) -> ForwardModel:
-    """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
-    found: ForwardModel = make().observing(*motion.observed)
-    return found
-
-
-class Selection(Comparison):
-    """What to compare.
-
-    Parameters
-    ----------
-    data
-        Tests and what was measured.
-    candidates
-        Models by name.
-    predict
-        Tests that are predicted besides the measured ones, in every group.
-    method
-        How the candidates are compared.
-    """
-
-    data: MeasuredTests
-    candidates: dict[str, CandidateModel] = Field(min_length=1)
-    predict: tuple[MaterialTest, ...] = ()
-    method: Select
-
-    data_in_file: ClassVar[tuple[type[Settings], ...]] = (DataFile,)
-    costly: ClassVar[bool] = False
-
-    @property
-    def seconds_of_solves(self) -> float:
-        """Processor time of the stresses and their derivatives, roughly."""
-        return SECONDS_PER_STRESS * self.planned
-
-    def described(self, name: str) -> str:
-        """Material of a candidate."""
-        return self.candidates[name].energy
-
-    @cached_property
-    def data_groups(self) -> dict[str, Measurements]:
-        """Data by group."""
-        found, predicted = {}, [(math.nan,) * len(test.at) for test in self.predict]
-        for group in self.data.data_groups:
-            measured, tests = self._measured(group), self._tests(group)
-            sigma = [test.sigma or (math.nan,) * len(test.at) for test in measured]
-            found[group] = Measurements.of_tests(
-                np.concatenate([*(test.measured for test in measured), *predicted]),
-                np.concatenate([*sigma, *predicted]),
-                [test.label for test in tests for _ in test.at],
-                np.concatenate([test.at for test in tests]),
-                np.array([(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]),
-            )
-        return found
-
-    def build(self, name: str, group: str, comm: Any = None) -> HomogeneousModel:
-        """Make the model of a candidate in a group."""
-        candidate = self.candidates[name]
-        names = tuple(candidate.parameters)
-        return HomogeneousModel(candidate.energy, candidate.fixed, self._tests(group), names, candidate.fibres)
-
-    def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the constants of a candidate."""
-        return units(self.candidates[label.partition("/")[0]].energy)
-
-    @property
-    def _all_tests(self) -> tuple[MaterialTest, ...]:
-        return (*self.data.tests, *self.predict)
-
-    def _measured(self, group: str) -> list[MeasuredTest]:
-        return [test for test in self.data.tests if test.group == group]
-
-    def _tests(self, group: str) -> list[MaterialTest]:
-        return [*self._measured(group), *self.predict]
-
-    def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
-        for group in self.data.data_groups:
-            labels = [test.label for test in self._tests(group)]
-            twice = next((label for label in labels if labels.count(label) > 1), None)
-            if twice is not None:
-                yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
-                return
-        for name, candidate in self.candidates.items():
-            objections = (unfit(candidate.energy, test.mode, candidate.fibres) for test in self._all_tests)
-            objection = next(filter(None, objections), None)
-            if objection is not None:
-                yield ("candidates", name, "material"), objection, candidate.material
-        yield from self.mistakes_of_method()
-        yield from self.mistakes_of_data()
+    def _unobserved(self) -> Iterator[Mistake]:
+        """Find what candidates do not have of what was measured."""
+        found = self.measurements
+        spec: Any
+        for name, spec in self.of_candidates.items():
+            place = ("candidates", name, "model")
+            if found.some:
+                known = [output.name for output in spec.returned]
+                lost = next((output for output in found.names.tolist() if output not in known), None)
+                if lost is not None:
+                    yield (*place, "outputs"), f"no output '{lost}', of which there are data", known
+            elif spec.placed:
+                has = spec.observable
+                pairs = dict.fromkeys(zip(found.tests.tolist(), found.names.tolist(), strict=True))
+                case, what = next(((one, what) for one, what in pairs if what not in has.get(one, ())), ("", ""))
+                if case and case not in has:
+                    yield (*place, "cases"), f"no load case '{case}', of which there are data", list(has)
+                elif case:
+                    message = f"load case '{case}' has no output '{what}', of which there are data"
+                    yield (*place, "cases"), message, list(has[case][len(AXES) :])
+            else:
+                yield (*place, "kind"), "displacements were measured, expected 'specimen'", spec.kind

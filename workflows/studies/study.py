@@ -215,7 +215,7 @@ STUDIES = Kinds(
     {
         SAMPLING: "workflows.studies.sampling:Study",
         AVERAGED: "workflows.studies.averaged:AveragedStudy",
-        "select": "workflows.studies.model_selection:ModelSelection",
+        "select": "workflows.studies.selection:Selection",
         "invert": "workflows.studies.inversion:Inversion",
         "synthesize": "workflows.studies.synthesis:Synthesis",
         "population": "workflows.studies.population:PopulationStudy",

@@ -13,7 +13,6 @@ from scipy.stats import multivariate_normal
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from inverse.criticism.assessment import weighted
 from inverse.criticism.comparison import Candidate, criticise, probabilities
-from inverse.criticism.selected import doubts_of_selection, findings, grade, untrusted
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.evidence import evidence
@@ -33,6 +32,7 @@ from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.data.material_tests import MeasuredTest
+from workflows.results.comparison import doubts_of_selection, findings, grade, untrusted
 from workflows.run.plan import plan
 from workflows.starter import starter
 

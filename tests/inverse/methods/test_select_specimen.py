@@ -20,7 +20,6 @@ import forward.fem.finer
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
-from inverse.criticism.selected import doubts_of_selection, trusted_on_meshes
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import SerialEvaluate
@@ -30,9 +29,10 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.report.section import Results
 from workflows.report.sections.errors import finer_meshes
+from workflows.results.comparison import doubts_of_selection, trusted_on_meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
-from workflows.studies.model_selection import ModelSelection
+from workflows.studies import selection_job
 from workflows.studies.predictions import meshes_of, of_file
 
 pytestmark = pytest.mark.fem
@@ -276,7 +276,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
 def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatch):
     """And what they correct is said."""
     alive, made, before = weakref.WeakSet(), [], []
-    mesh, build = OtherMesh._mesh.fget, ModelSelection.build_finer
+    mesh, build = OtherMesh._mesh.fget, selection_job.build_finer
 
     def remembered(self):
         found = mesh(self)
@@ -285,12 +285,12 @@ def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatc
             alive.add(found)
         return found
 
-    def built(self, *given):
+    def built(*given):
         before.append(len(alive))
-        return build(self, *given)
+        return build(*given)
 
     monkeypatch.setattr(OtherMesh, "_mesh", property(remembered))
-    monkeypatch.setattr(ModelSelection, "build_finer", built)
+    monkeypatch.setattr(selection_job, "build_finer", built)
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
     main(["run", str(study), "--out", str(study.parent / "once"), "--quiet"])
     assert made == [(2, 2, 2), (1, 1, 1)] * 2

@@ -10,7 +10,6 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import percent
 from forward.words import named, with_error
-from inverse.criticism.selected import by_probability, ranking
 from workflows.report.plots.figure import (
     COLOURS,
     CONTROLLED,
@@ -22,6 +21,7 @@ from workflows.report.plots.figure import (
     text_of,
 )
 from workflows.report.plots.posterior import pairs
+from workflows.results.comparison import by_probability, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

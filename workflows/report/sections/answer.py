@@ -10,7 +10,6 @@ import numpy as np
 
 from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
 from forward.words import duration, number, power_of_ten, with_error
-from inverse.criticism.selected import bayes_factor, by_probability, grade
 from uq.estimators.estimate import single
 from uq.findings import NOT_KNOWN
 from workflows.report.blocks import CURVE, Answer, Block, Card, Text, curve_of, smooth
@@ -20,6 +19,7 @@ from workflows.report.sections.errors import counting, parts_of
 from workflows.report.sections.frame import gravest
 from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
+from workflows.results.comparison import bayes_factor, by_probability, grade
 from workflows.studies.findings_inversion import NEITHER
 
 if TYPE_CHECKING:

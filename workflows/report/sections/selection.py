@@ -10,18 +10,18 @@ import numpy as np
 
 from forward.readable import percent, size
 from forward.words import NONE, named, number, settings, with_error
-from inverse.criticism.selected import bayes_factor, by_probability, chance, conflicts, grade, ranking
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
 from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
+from workflows.results.comparison import bayes_factor, by_probability, chance, conflicts, grade, ranking
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from workflows.studies.selection import Comparison
+    from workflows.studies.selection import Selection
 
 
 @section("probability")
@@ -123,7 +123,7 @@ def averages(results: Results) -> Iterator[Block]:
     yield Text("At the end of each test, or where the largest displacement was measured, without measurement errors.")
     dataset = results.dataset
     quantity = str(dataset.attrs["quantity"])
-    study: Comparison = results.study
+    study: Selection = results.study
     units = {output.name: output.unit for spec in [*study.of_candidates.values()][:1] for output in spec.returned}
     rows = []
     for one in last_of_tests(dataset):
@@ -216,7 +216,7 @@ def posteriors(results: Results) -> Table:
 
 def _priors(results: Results) -> Table:
     """The candidates with the priors of their constants."""
-    study: Comparison = results.study
+    study: Selection = results.study
     rows = []
     for name, candidate in study.candidates.items():
         for constant, distribution in candidate.parameters.items():
@@ -299,7 +299,7 @@ def _paths(results: Results, tests: list[str]) -> Iterator[tuple[str, tuple[dict
     """Go through outputs that were measured along a path: by name, where each of their tests is, and both axes."""
     from inverse.data.curves import steps_of
 
-    study: Comparison = results.study
+    study: Selection = results.study
     steps = next(map(steps_of, study.of_candidates.values()), None)
     if steps is None:
         return

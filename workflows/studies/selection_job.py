@@ -1,0 +1,116 @@
+"""The job of a comparison: the candidates, each for each group of data, and what is said of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any
+
+from forward.findings import Finding
+from forward.model import ForwardModel
+from inverse.criticism.finer import Finer
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.request import Evaluate
+from uq.findings import add
+from workflows.results import comparison
+from workflows.studies.job import MOVED, MethodJob
+from workflows.studies.predictions import FINER, of_file, once_on_finer_meshes
+from workflows.studies.solves import of_answers
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.selection_blocks import SelectionBlocks
+
+Make = Callable[[], Any]
+
+
+def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
+    """Make the candidates, each for each group of data; collective."""
+    method, why = study.method, study.unchecked
+    makers: dict[tuple[str, str], Make] = {
+        pair: cache(partial(study.build, *pair, ensemble.group)) for pair in study.pairs
+    }
+    recorders: dict[str, Recorder] = {}
+    checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
+    motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        moved = {pair: evaluate.on(f"{'/'.join(pair)}/{MOVED}") for pair in motions}
+        shared = {pair: motion.errors_by(moved[pair]) for pair, motion in motions.items()}
+
+        def recorded(name: str, group: str) -> Evaluate:
+            recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
+            return recorders[f"{name}/{group}"]
+
+        def free(name: str, group: str) -> Evaluate:
+            # What nested sampling solves is too much, and too cheap, to keep.
+            return SerialEvaluate(study.build(name, group), ensemble.count)
+
+        def look(name: str, group: str) -> Finer:
+            if (name, group) not in checked:
+                return Finer(None, why[name])
+            return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
+
+        def itself(name: str, group: str) -> ForwardModel:
+            found: ForwardModel = makers[name, group]()
+            return found
+
+        return method.run(
+            study.models,
+            study.data_groups,
+            recorded,
+            free,
+            look if why else None,
+            ensemble.say,
+            shared or None,
+            itself,
+        )
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = found.assign_attrs(quantity=study.data.quantity)
+        if "mesh_checked" in found:
+            of_files = [of_file(study.of_candidates[str(name)]) for name in found.model.values]
+            found = found.assign(mesh_of_file=("model", of_files))
+        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
+        units = {name: study.units_of(name) for name in candidates}
+        doubts = comparison.doubts_of_selection(found, candidates, method.noise.factor, units)
+        wrong = {name: _contradictions(study, name, make) for (name, _), make in makers.items()}
+        of_wrong = [name for name, several in wrong.items() if several]
+        judged = comparison.trusted_on_meshes(comparison.with_right_derivatives(found, of_wrong))
+        add(judged, *comparison.findings(found), *comparison.untrusted(found, judged, of_wrong), *doubts)
+        add(judged, *(one for several in wrong.values() for one in several))
+        return judged
+
+    finer_ones = {f"{n}/{g}/{FINER}": partial(build_finer, study, n, makers[n, g]) for n, g in checked}
+    moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
+    return MethodJob(
+        makers[study.pairs[0]](),
+        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones,
+        task,
+        recorders,
+        labelled=labelled,
+        arviz_groups=partial(comparison.arviz_groups, study.models, method.noise.factor, method.seed),
+        costly=study.model is not None,
+        passing=frozenset(finer_ones),
+    )
+
+
+def build_finer(study: SelectionBlocks, name: str, make: Make) -> ForwardModel:
+    """Make a candidate's model, which `make` returns, on a finer mesh; collective."""
+    return once_on_finer_meshes(make, study.models[name].inputs.mean)
+
+
+def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:
+    """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
+    spec = study.of_candidates.get(name)
+    if spec is None or spec.shareable:
+        return []
+    return [one.of(f"Candidate '{name}'") for one in of_answers(make(), study.candidates[name].inputs)]
+
+
+def _moved(make: Make, motion: Any) -> ForwardModel:
+    """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
+    found: ForwardModel = make().observing(*motion.observed)
+    return found
