@@ -14,6 +14,8 @@ from forward.observables.observable import Equations
 class Linear:
     """ψ = ⟨g, u⟩ with a fixed g (U_local,)."""
 
+    reduced_as = "linear"
+
     def __init__(self, equations: Equations, g: FloatArray) -> None:
         self._equations = equations
         self._g = g
@@ -33,6 +35,8 @@ class Linear:
 
 class Integral:
     """ψ = 1/size ∫ density(u, ω), over the body or, by its measure, over a boundary."""
+
+    reduced_as = "integral"
 
     def __init__(self, equations: Equations, density: Any, size: float = 1.0, measure: Any | None = None) -> None:
         self._equations = equations

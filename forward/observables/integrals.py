@@ -90,6 +90,8 @@ class Reaction(Observable):
 class _Reaction:
     """ψ = wᵀ r(u, ω), with r the imbalance of all unknowns and w = 1 on a component of a boundary's nodes."""
 
+    reduced_as = "work"
+
     def __init__(self, equations: Equations, w: FloatArray) -> None:
         self._equations = equations
         self.w = w

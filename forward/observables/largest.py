@@ -84,6 +84,8 @@ def _first(equations: Equations, here: NDArray[np.intp]) -> bool:
 class _MaxDisplacement:
     """ψ = max over the nodes of |u_c|, or of |u|; of tied nodes, the first in canonical order counts."""
 
+    reduced_as = "largest"
+
     def __init__(self, equations: Equations, axis: int | None) -> None:
         self._equations = equations
         self._axis = axis
@@ -132,6 +134,8 @@ class _MaxVonMises:
     The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
     so that its derivatives are those of an integral.
     """
+
+    reduced_as = "peak"
 
     def __init__(self, equations: Equations) -> None:
         import ufl

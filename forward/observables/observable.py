@@ -33,7 +33,8 @@ class Functional(Protocol):
     """An output ψ(u, ω) of a discretised body, at the state and the parameters that its equations are set to.
 
     All methods are collective over the ranks of the equations. Forces, which friction is part of, have a
-    `gradient_before` too: ∂ψ/∂u by the state at the end of the increment before.
+    `gradient_before` too: ∂ψ/∂u by the state at the end of the increment before. What a reduced model can have says as
+    what it is an output there (`reduced_as`, a kind of `forward.reduced.data.Output`).
     """
 
     def value(self) -> float:

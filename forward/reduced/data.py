@@ -195,16 +195,13 @@ def load(path: Path) -> ReducedData:
     try:
         with np.load(path, allow_pickle=False) as file:
             table = json.loads(str(file["table"]))
-            if table["format"] != FORMAT:
-                message = f"{path}: made by another version, expected format {FORMAT}; run `tissuq reduce` again"
-                raise ModelError(message)
-            found: ReducedData = _unpacked(table["model"], file)
+            found: ReducedData | None = _unpacked(table["model"], file) if table["format"] == FORMAT else None
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror or 'it is not a reduced model'}") from None
-    except (KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
-        if isinstance(error, ModelError):
-            raise
+    except (KeyError, ValueError, TypeError, zipfile.BadZipFile):
         raise ModelError(f"{path}: is not a reduced model, expected a file that `tissuq reduce` has made") from None
+    if found is None:
+        raise ModelError(f"{path}: made by another version, expected format {FORMAT}; run `tissuq reduce` again")
     return found
 
 
@@ -213,37 +210,40 @@ _CLASSES = (Points, Written, Output, LevelData, ReducedData)
 
 def _packed(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return a value as a table; arrays go to `arrays`, by their place."""
-    if isinstance(value, np.ndarray):
-        arrays[name] = value
-        return {"array": name}
-    if isinstance(value, Tape):
-        return {"tape": {key: _packed(one, f"{name}.{key}", arrays) for key, one in to_arrays(value).items()}}
-    if isinstance(value, _CLASSES):
-        parts = {key: _packed(one, f"{name}.{key}", arrays) for key, one in vars(value).items()}
-        return {"class": type(value).__name__, "parts": parts}
-    if isinstance(value, tuple):
-        return {"tuple": [_packed(one, f"{name}.{i}", arrays) for i, one in enumerate(value)]}
-    if isinstance(value, dict):
-        return {"table": value}
-    return value.item() if isinstance(value, np.generic) else value
+    match value:
+        case np.ndarray():
+            arrays[name] = value
+            return {"array": name}
+        case Tape():
+            return {"tape": {key: _packed(one, f"{name}.{key}", arrays) for key, one in to_arrays(value).items()}}
+        case Points() | Written() | Output() | LevelData() | ReducedData():
+            parts = {key: _packed(one, f"{name}.{key}", arrays) for key, one in vars(value).items()}
+            return {"class": type(value).__name__, "parts": parts}
+        case tuple():
+            return {"tuple": [_packed(one, f"{name}.{i}", arrays) for i, one in enumerate(value)]}
+        case dict():
+            return {"table": value}
+        case np.generic():
+            return value.item()
+        case _:
+            return value
 
 
 def _unpacked(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    if not isinstance(value, dict):
-        return value
-    (kind, *_) = value
-    match kind:
-        case "array":
-            return arrays[value["array"]]
-        case "tape":
-            return from_arrays({key: _unpacked(one, arrays) for key, one in value["tape"].items()})
-        case "class":
-            (made,) = (one for one in _CLASSES if one.__name__ == value["class"])
-            return made(**{key: _unpacked(one, arrays) for key, one in value["parts"].items()})
-        case "tuple":
-            return tuple(_unpacked(one, arrays) for one in value["tuple"])
+    match value:
+        case {"array": name}:
+            return arrays[name]
+        case {"tape": parts}:
+            return from_arrays({key: _unpacked(one, arrays) for key, one in parts.items()})
+        case {"class": kind, "parts": parts}:
+            (made,) = (one for one in _CLASSES if one.__name__ == kind)
+            return made(**{key: _unpacked(one, arrays) for key, one in parts.items()})
+        case {"tuple": items}:
+            return tuple(_unpacked(one, arrays) for one in items)
+        case {"table": table}:
+            return table
         case _:
-            return value["table"]
+            return value
 
 
 class ReducedSpace:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,7 @@ from numpy.typing import NDArray
 
 from forward.fem.model import HyperelasticModel
 from forward.model import FloatArray, ModelError
-from forward.observables.functionals import Integral, Linear
-from forward.observables.integrals import Reaction
-from forward.observables.largest import MaxDisplacement, MaxVonMises
+from forward.observables.functionals import Integral
 from forward.reduced.data import Output
 from forward.reduced.integrands import Sampler, of_density
 from forward.reduced.kernels import Kernel
@@ -47,18 +46,21 @@ class Outputs:
         self._of_output: dict[str, Sampler] = {}  # those that are not integrated by the rule of the body
         tests = []
         for one, functional in self._pairs:
-            if isinstance(one, Reaction):
-                tests.append(functional.w)
-            elif isinstance(one, MaxVonMises):
-                self._of_output[one.name] = self._sampler(functional.stress, self._equations.dx)
-            elif isinstance(functional, Integral):
-                sampler = self._sampler(functional.density, functional.measure)
-                if sampler.integrand.boundary is None:
-                    self.densities.append((sampler, functional))
-                else:
-                    self._of_output[one.name] = sampler
-            elif not isinstance(one, MaxDisplacement) and not isinstance(functional, Linear):
-                raise ModelError(f"the output '{one.name}' cannot be reduced")
+            match getattr(functional, "reduced_as", None):
+                case "work":
+                    tests.append(functional.w)
+                case "peak":
+                    self._of_output[one.name] = self._sampler(functional.stress, self._equations.dx)
+                case "integral":
+                    sampler = self._sampler(functional.density, functional.measure)
+                    if sampler.integrand.boundary is None:
+                        self.densities.append((sampler, functional))
+                    else:
+                        self._of_output[one.name] = sampler
+                case "largest" | "linear":
+                    pass
+                case _:
+                    raise ModelError(f"the output '{one.name}' cannot be reduced")
         self.tests = np.array(tests).reshape(-1, self._equations.size)
 
     @property
@@ -85,27 +87,26 @@ class Outputs:
         found: list[Output] = []
         tests = integrals = 0
         for one, functional in self._pairs:
-            name, unit = one.name, one.unit
-            if isinstance(one, Reaction):
-                found.append(Output(name, unit, "work", which=tests))
+            name, kind = one.name, functional.reduced_as
+            output = partial(Output, name, one.unit, kind)
+            if kind == "work":
+                found.append(output(which=tests))
                 tests += 1
-            elif isinstance(one, MaxDisplacement):
-                axis = LENGTH if one.component == "magnitude" else "xyz".index(one.component)
-                found.append(Output(name, unit, "largest", which=axis))
-            elif isinstance(one, MaxVonMises):
+            elif kind == "largest":
+                found.append(output(which=LENGTH if one.component == "magnitude" else "xyz".index(one.component)))
+            elif kind == "peak":
                 sampler = self._of_output[name]
                 near = self._near_peak(sampler, states, parameters, kept)
-                density, points = sampler.integrand.written, sampler.points(rows, near)
-                found.append(Output(name, unit, "peak", density=density, points=points))
-            elif isinstance(functional, Linear):
-                found.append(Output(name, unit, "linear", row=rows @ functional.gradient()))
+                found.append(output(density=sampler.integrand.written, points=sampler.points(rows, near)))
+            elif kind == "linear":
+                found.append(output(row=rows @ functional.gradient()))
             elif name in self._of_output:
                 sampler = self._of_output[name]
                 density, points = sampler.integrand.written, sampler.points(rows)
-                found.append(Output(name, unit, "integral", size=functional.size, density=density, points=points))
+                found.append(output(size=functional.size, density=density, points=points))
             else:
                 density = self.densities[integrals][0].integrand.written
-                found.append(Output(name, unit, "integral", which=integrals, size=functional.size, density=density))
+                found.append(output(which=integrals, size=functional.size, density=density))
                 integrals += 1
         return tuple(found)
 
@@ -123,8 +124,8 @@ class Outputs:
         equations.set_state(state)
         return np.array(
             [
-                functional.place() if isinstance(one, MaxDisplacement | MaxVonMises) else -1
-                for one, functional in self._pairs
+                functional.place() if functional.reduced_as in {"largest", "peak"} else -1
+                for _, functional in self._pairs
             ]
         )
 

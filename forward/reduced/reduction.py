@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from mpi4py import MPI
@@ -369,6 +369,6 @@ def enriched(data: ReducedData, points: FloatArray, cubature: float = 1e-3) -> R
     SolveError
         Where the full model has no answer.
     """
-    model = cast("HyperelasticModel", Hyperelastic.model_validate(data.spec).build(MPI.COMM_SELF, data.parameters))
+    model: HyperelasticModel = Hyperelastic.model_validate(data.spec).build(MPI.COMM_SELF, data.parameters)
     answers = solved(model, points, data.spread)
     return Reduction(model, data.nominal, data.spread).enriched(data, answers, Sizes(cubature=cubature))

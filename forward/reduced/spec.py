@@ -299,13 +299,12 @@ class Reduced(ModelSpec):
 def _shape(body: Hyperelastic, numbers: set[str]) -> dict[str, Any]:
     """Return the blocks of a body on which a reduced model depends, without numbers that can be parameters."""
 
-    def bare(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {k: bare(v) for k, v in value.items() if k not in numbers or isinstance(v, dict | list)}
-        return [bare(one) for one in value] if isinstance(value, list) else value
+    def bare(table: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in table.items() if key not in numbers or isinstance(value, dict | list)}
 
-    whole = body.model_dump(mode="json", exclude_none=True)
-    return {name: block if name == "body" else bare(block) for name, block in whole.items() if name not in _APART}
+    whole = body.model_dump(mode="json", exclude_none=True, exclude={*_APART})
+    found: dict[str, Any] = json.loads(json.dumps(whole), object_hook=bare)
+    return found | {"body": whole["body"]}
 
 
 def without_answer(told: Mapping[str, Any]) -> Iterator[Finding]:
