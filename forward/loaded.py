@@ -82,7 +82,7 @@ class LoadedBody(Refinable):
     @property
     def linear(self) -> Linear:
         """What its linear systems are solved with."""
-        if self.mixed or self.body.degree < 2 or self.remembers:
+        if self.mixed or self.body.degree < 2 or self.unestimated_with:
             return Linear.FACTOR
         if self.solver.linear != "auto":
             return Linear(self.solver.linear)
@@ -110,7 +110,7 @@ class LoadedBody(Refinable):
         return {f"loads.{label}.friction": why for label in smooth}
 
     @property
-    def remembers(self) -> str:
+    def unestimated_with(self) -> str:
         """With what no error of its mesh is estimated: friction, and loads that are no forms; empty without."""
         rubbing = ["friction"] if any(load.contact and load.remembers for load in self.loads) else []
         return " and ".join((*rubbing, *(f"'{load.label}'" for load in self.loads if not load.written)))
@@ -340,9 +340,10 @@ class LoadedBody(Refinable):
         support = Support(self.body, self.clamp, self.displacements, self.loads)
         yield from support.contradictions()
         yield from self.mistakes_of_adapt()
-        if self.adapt is not None and self.remembers:
-            expected = "friction = 0" if self.remembers == "friction" else "neither"
-            yield ("adapt",), f"errors of the mesh are not estimated with {self.remembers}, expected {expected}", True
+        what = self.unestimated_with
+        if self.adapt is not None and what:
+            expected = "friction = 0" if what == "friction" else "neither"
+            yield ("adapt",), f"errors of the mesh are not estimated with {what}, expected {expected}", True
         yield from support.mistakes(complete=not unknown)
 
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
@@ -370,8 +371,8 @@ class LoadedBody(Refinable):
             objection = "multigrid needs cells of degree 2, between which and linear ones it goes to and fro"
         elif self.formulation == "mixed":
             objection = "multigrid solves for displacements only, and the form is mixed"
-        elif self.remembers:
-            objection = f"multigrid is not available with {self.remembers}"
+        elif self.unestimated_with:
+            objection = f"multigrid is not available with {self.unestimated_with}"
         elif self.solver.kind == "newton":
             objection = "the textbook solver has a factor for every step"
         if objection:

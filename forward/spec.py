@@ -166,7 +166,7 @@ class ModelSpec(Settings):
         return {}
 
     @property
-    def remembers(self) -> str:
+    def unestimated_with(self) -> str:
         """With what errors of its mesh are not estimated: what remembers, or is no form; empty if none."""
         return ""
 

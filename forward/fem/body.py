@@ -88,8 +88,8 @@ class DiscreteBody(Generic[S]):
         SolveError
             If something acts on it that has no place there.
         """
-        if self.spec.remembers:
-            raise not_estimated(self.spec.remembers)
+        if self.spec.unestimated_with:
+            raise not_estimated(self.spec.unestimated_with)
         if 1 not in self._richer:
             self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
         return self._richer[1]

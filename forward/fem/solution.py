@@ -316,8 +316,8 @@ class FiniteElementSolution:
         if self._model.rows is not None:
             return self._by_degrees()
         spec = self._model.spec
-        if spec.remembers:
-            raise not_estimated(spec.remembers)
+        if spec.unestimated_with:
+            raise not_estimated(spec.unestimated_with)
         with suppress(SolveError):
             found: Saturation | None = (finer or self._model.finer_mesh(spare)).calibrated(self)
             if found is not None:

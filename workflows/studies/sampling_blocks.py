@@ -78,7 +78,7 @@ class SamplingBlocks(Sourced):
     def estimating(self) -> bool:
         """Whether the error of the mesh is estimated, if there is memory for that."""
         theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
-        return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.remembers
+        return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.unestimated_with
 
     @cached_property
     def too_large(self) -> float | None:

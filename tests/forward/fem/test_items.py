@@ -200,7 +200,7 @@ def test_ranks_share_a_body_with_an_item(ranks, item):
 @pytest.mark.fem
 def test_what_an_item_cannot_have():
     spec = cube(CABLE)
-    assert spec.remembers == "'cable'"
+    assert spec.unestimated_with == "'cable'"
     assert not spec.path_dependent
     _, _, found = solved(spec)
     for ask in (found.mesh_error, found.saturation, lambda: found.mesh_indicators(np.eye(3))):
