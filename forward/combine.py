@@ -75,6 +75,11 @@ def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
     return Rows(model, picked(which, len(model.outputs)), numbered)
 
 
+def sums_of(model: ForwardModel) -> tuple[ForwardModel, csr_matrix]:
+    """Return of which model's outputs (m,) those of a model (n,) are sums, and their weights (n, m): its own, or S."""
+    return (model.model, model.S) if isinstance(model, Rows) else (model, eye(len(model.outputs), format="csr"))
+
+
 class Affine(Protocol):
     """An affine map p = A q + b of parameters q (d,) to parameters p (D,)."""
 

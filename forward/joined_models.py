@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
-from forward.combine import Joined, Mapped, Rows, Sparse, picked
+from forward.combine import Joined, Mapped, Rows, Sparse, picked, sums_of
 from forward.fem.cost import Times, sum_of
 from forward.findings import Finding
 from forward.materials.admissible import Materials
@@ -129,8 +129,8 @@ class JoinedModels(ModelSpec):
                 continue
             energy = found.energy
             for place, values in found.constants.items():
-                renamed = {k: self.path_of(name, v) if isinstance(v, str) else v for k, v in values.items()}
-                places[f"models.{name}.{place}"] = renamed
+                renamed = {constant: self.path_of(name, path) for constant, path in found.varied[place].items()}
+                places[f"models.{name}.{place}"] = {**values, **renamed}
         return Materials(energy, places) if places else None
 
     def over(self, ranges: Ranges) -> JoinedModels:
@@ -211,7 +211,8 @@ class JoinedMeshes:
 
     def of(self, observed: Any) -> ForwardModel:
         """Return the model of what all outputs tend to, and of the gaps between the meshes (`forward.fem.finer`)."""
-        joined: Any = observed.model if isinstance(observed, Rows) else observed
+        joined: Any
+        joined, sums = sums_of(observed)
         found = []
         for meshes, part in zip(self.parts, joined.models, strict=True):
             model, count = part.model, len(part.outputs)
@@ -222,7 +223,6 @@ class JoinedMeshes:
         # Of each part both in turn, and so of all.
         sizes = [len(part.outputs) for part in joined.models]
         S = vstack([block_diag([kron(half, identity(n)) for n in sizes]) for half in ([1, 0], [0, 1])], format="csr")
-        if isinstance(observed, Rows):
-            S = block_diag([observed.S] * 2, format="csr") @ S
+        S = block_diag([sums] * 2, format="csr") @ S
         gaps = (f"{name} (between the meshes)" for name in observed.outputs)
         return Rows(whole, S, (*observed.outputs, *gaps))

@@ -228,19 +228,21 @@ def reason_to_stop(error: BaseException, needed: float | None = None) -> str | N
     needed
         Memory (bytes) that this process was expected to need in all.
     """
-    if isinstance(error, StopError):
-        return str(error)
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED
-    if isinstance(error, SystemExit):
-        return f"the code of the model ended the process (SystemExit: {error.code})"
-    room = out_of_room(error)
-    if room is not None:
-        return f"{room}; the same command continues once there is room"
-    if not out_of_memory(error):
-        return missing(error)
-    wants = "" if needed is None else f"about {needed / MIB:,.0f} MiB are needed in all, "
-    return f"memory ran out: {wants}{headroom()} now; the same command continues where there is more"
+    match error:
+        case StopError():
+            return str(error)
+        case KeyboardInterrupt():
+            return INTERRUPTED
+        case SystemExit(code=code):
+            return f"the code of the model ended the process (SystemExit: {code})"
+        case _:
+            room = out_of_room(error)
+            if room is not None:
+                return f"{room}; the same command continues once there is room"
+            if not out_of_memory(error):
+                return missing(error)
+            wants = "" if needed is None else f"about {needed / MIB:,.0f} MiB are needed in all, "
+            return f"memory ran out: {wants}{headroom()} now; the same command continues where there is more"
 
 
 def missing(error: BaseException) -> str | None:

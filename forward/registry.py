@@ -94,11 +94,13 @@ class Kinds:
     def _imported(self, kind: str, module: str, name: str) -> Any:
         from forward.external.own_modules import imported
 
+        refused = f"the {self.family} '{kind}' cannot be imported"
         try:
             loaded = imported(module) if "." in kind else importlib.import_module(module)
+        except ImportError as error:
+            raise KindError(f"{refused}: {error}") from error
         except (Exception, SystemExit) as error:
-            said = f"{'' if isinstance(error, ImportError) else f'{type(error).__name__}: '}{error}"
-            raise KindError(f"the {self.family} '{kind}' cannot be imported: {said}") from error
+            raise KindError(f"{refused}: {type(error).__name__}: {error}") from error
         try:
             found = getattr(loaded, name)
         except AttributeError:

@@ -44,14 +44,17 @@ class Scalar(NamedTuple):
     @property
     def unit(self) -> str:
         """SI unit from the annotation of the field; "1" without."""
-        return next((item.unit for item in self.block.model_fields[self.field].metadata if isinstance(item, Unit)), "1")
+        return unit_of(self.block.model_fields[self.field].metadata) or "1"
 
 
 def numbers(block: type[Settings]) -> tuple[str, ...]:
     """Return the fields of a block that are annotated with a unit: these can be parameters."""
-    return tuple(
-        name for name, field in block.model_fields.items() if any(isinstance(item, Unit) for item in field.metadata)
-    )
+    return tuple(name for name, field in block.model_fields.items() if unit_of(field.metadata))
+
+
+def unit_of(annotations: Iterable[Any]) -> str | None:
+    """Return the SI unit among what a number is annotated with; None if none is."""
+    return next((item.unit for item in annotations if isinstance(item, Unit)), None)
 
 
 @cache

@@ -7,7 +7,7 @@ import re
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 UNKNOWN_KIND = "unknown_kind"  # type of a mistake, whose context holds the `known` kinds
@@ -88,6 +88,11 @@ def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
         return f"did you mean '{cut(close[0], LONGEST)}'?"
     more = f" and {len(known) - LISTED} others" if len(known) > LISTED else ""
     return f"expected one of: {', '.join(cut(one, LONGEST) for one in known[:LISTED])}{more}"
+
+
+def usually(kind: str) -> BeforeValidator:
+    """Return the annotation of a field whose blocks are of a kind unless they say another one."""
+    return BeforeValidator(lambda value: {"kind": kind} | value if isinstance(value, dict) else value)
 
 
 def _freeze(value: Any) -> Any:

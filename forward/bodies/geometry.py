@@ -8,18 +8,18 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from forward.bodies.mesh import default_quadrature
 from forward.bodies.mesh_file import MeshFile
 from forward.findings import Finding
 from forward.model import FloatArray
 from forward.readable import told
-from forward.settings import Settings
+from forward.settings import Settings, usually
 
 Axis = Literal["x", "y", "z"]
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
@@ -67,6 +67,7 @@ class _SixSided(Settings):
         there, since stresses change fast beside the rim of a clamp.
     """
 
+    structured: ClassVar[bool] = True  # whether cells lie along edges of the body, and any number of them
     kind: str
     cells: tuple[Count, Count, Count]
     cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
@@ -401,11 +402,7 @@ class Block(_SixSided):
         return self
 
 
-def _box_by_default(value: Any) -> Any:
-    return {"kind": "box"} | value if isinstance(value, dict) else value
-
-
-Body = Annotated[Box | Block | MeshFile, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+Body = Annotated[Box | Block | MeshFile, Field(discriminator="kind"), usually("box")]
 
 
 def tolerance(body: Body) -> float:

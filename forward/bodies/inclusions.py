@@ -13,13 +13,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Gt, Unit
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from forward.bodies.geometry import Body, Length
 from forward.findings import Finding
 from forward.model import FloatArray
 from forward.readable import told
-from forward.settings import Named
+from forward.settings import Named, usually
 
 TINY = 1e-12  # of the squared radius: keeps distances from the centre, and angles, differentiable at zero
 BLEND = 0.1  # squared distance from the centre, over that of the surface, up to which an ellipsoid counts as a ball
@@ -128,11 +128,7 @@ def _turned(ops: Any, v: Any, t: Any) -> tuple[Any, Any, Any]:
     return x, y, z
 
 
-def _sphere_by_default(value: Any) -> Any:
-    return {"kind": "sphere"} | value if isinstance(value, dict) else value
-
-
-Inclusion = Annotated[Sphere | Ellipsoid, Field(discriminator="kind"), BeforeValidator(_sphere_by_default)]
+Inclusion = Annotated[Sphere | Ellipsoid, Field(discriminator="kind"), usually("sphere")]
 INDICATORS: dict[str, Callable[..., Any]] = {"sphere": _sphere, "ellipsoid": _ellipsoid}
 RADII = {"sphere": ("radius", "radius", "radius"), "ellipsoid": ("a", "b", "c")}
 OPS = SimpleNamespace(ln=np.log, exp=np.exp, sqrt=np.sqrt, tanh=np.tanh, sin=np.sin, cos=np.cos)

@@ -13,7 +13,7 @@ import operator
 from collections.abc import Iterator, Mapping
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
@@ -93,6 +93,7 @@ class MeshFile(Settings):
     """
 
     kind: Literal["mesh"] = "mesh"
+    structured: ClassVar[bool] = False  # whether cells lie along edges of the body, and any number of them
     file: str
     unit: Annotated[float, Gt(0)] = 1.0
     degree: Literal[1, 2] = 2

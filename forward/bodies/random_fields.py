@@ -125,6 +125,10 @@ class Expansion(Protocol):
     def kept(self) -> float:
         """Fraction of the variance of the field, averaged over the body, that the coefficients represent."""
 
+    @property
+    def modes(self) -> FloatArray | None:
+        """Modes (N, k) of which it consists; None if it is none of these."""
+
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Return the linear part (N,) at coefficients (k,)."""
 
@@ -157,6 +161,7 @@ class WhiteNoise:
     matern: Matern
     std: float
     kept: float = 1.0
+    modes: None = None
 
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Return the field (N,) of independent standard normal numbers."""
@@ -173,6 +178,7 @@ class Nodal:
 
     offset: FloatArray
     kept: float = 1.0
+    modes: None = None
 
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Return the coefficients."""

@@ -68,7 +68,7 @@ class EnrichedEquations:
         self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
         cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
         self.way, self._alone = cost.way, cost.alone
-        self._blocks: tuple[ReferenceSolution | Linearised, Preconditioner | None] | None = None
+        self._blocks: tuple[ReferenceSolution, Preconditioner | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
         """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
@@ -184,8 +184,8 @@ class EnrichedEquations:
 
     def _preconditioner(self, solution: Linearised) -> Preconditioner | None:
         """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
-        at = solution.reference or solution
-        if self._blocks is None or not _same(self._blocks[0], at):
+        at = solution.reference or ReferenceSolution(solution.parameters, solution.state)
+        if self._blocks is None or not self._blocks[0].same(at):
             equations = self.equations
             kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
             equations.set_parameters(at.parameters)
@@ -234,9 +234,3 @@ class EnrichedEquations:
                 self._reference.release()
             equations.factorise(self.up(solution.state) if at is None else at)
             equations.linearisation_point.factorised = equations.linearisation_point.solution = key
-
-
-def _same(one: ReferenceSolution | Linearised, other: ReferenceSolution | Linearised) -> bool:
-    if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
-        return one.same(other)
-    return one is other

@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, identity, kron
 
 from forward.bodies.location import locate, shapes
-from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
-from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows
+from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows, sums_of
 from forward.joined_models import JoinedMeshes
 from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError
 from forward.pointwise import OfOne, OneByOne
@@ -53,7 +52,7 @@ HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that
 # Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
 ITERATIONS, LOAD_STEP = 12, 1 / 16
 FEWEST = 6  # cells along an edge of finer meshes of fields
-Begun = tuple[tuple[FloatArray, FloatArray], ...]
+Begun = tuple[tuple[tuple[FloatArray, FloatArray], ...], SolveError | None]  # states with derivatives, or why none
 # Where all cells are halved, errors at held faces fall slowly, whatever the degree: 1/(2^1.6 − 1).
 HALVED = 0.5
 TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
@@ -73,7 +72,7 @@ def finer(spec: AnyBody) -> Any:
 
 def graded(spec: AnyBody) -> Any | None:
     """Return a body on a mesh that is graded as the finer one; None where it is graded so, or is not graded."""
-    if isinstance(spec.body, MeshFile) or (spec.fields and _touched(spec)):
+    if not spec.body.structured or (spec.fields and _touched(spec)):
         return None
     if spec.fields and _parts(spec.body) == 1 and not _layers(spec):
         return None
@@ -83,7 +82,7 @@ def graded(spec: AnyBody) -> Any | None:
 
 def share(spec: AnyBody) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
-    if isinstance(spec.body, MeshFile):
+    if not spec.body.structured:
         return OF_LINEAR if spec.body.degree == 1 else HALVED
     if spec.fields and not _touched(spec):
         layers = _layers(spec)
@@ -107,12 +106,12 @@ def held(spec: AnyBody) -> tuple[str, ...]:
 def counted(spec: Any) -> bool:
     """Whether it was counted how often intervals of fields of such a body hold: quadratic hexahedra, no tools."""
     body = spec.body
-    return not isinstance(body, MeshFile) and (body.cell, body.degree) == ("hexahedron", 2) and not _touched(spec)
+    return body.structured and (body.cell, body.degree) == ("hexahedron", 2) and not _touched(spec)
 
 
 def _thin(fine: Any, own: Any) -> bool:
     """Whether cells of a finer mesh of a box or block are thinner at some faces than its own are."""
-    return isinstance(fine, MeshFile) or fine.grading != own.grading
+    return not fine.structured or fine.grading != own.grading
 
 
 def _parts(body: Any) -> int:
@@ -138,10 +137,11 @@ def _cases(spec: Any) -> tuple[Any, ...]:
 def _on(spec: AnyBody, times: float, *, thin: bool = True) -> Any:
     if not hasattr(spec, "body"):
         raise ModelError(f"a model of kind '{spec.kind}' has no body that could be meshed again")
-    body, linear = spec.body, spec.body.degree == 1
-    if isinstance(body, MeshFile) and linear:
+    body: Any = spec.body
+    linear = body.degree == 1
+    if not body.structured and linear:
         body = body.model_validate(body.model_dump(exclude={"contents"}) | QUADRATIC)
-    elif isinstance(body, MeshFile):
+    elif not body.structured:
         body = body.finer(times, held(spec), HELD, BESIDE)
     elif spec.fields and (_touched(spec) or not thin):
         body = body.with_cells(2.0) if times > 1 else body
@@ -189,7 +189,7 @@ def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | J
     spec = model.spec
     fine, beside = finer(spec), graded(spec)
     otherwise = None
-    if not isinstance(spec.body, MeshFile) and _thin(fine.body, spec.body):
+    if spec.body.structured and _thin(fine.body, spec.body):
         equal, less = (_hurried(_on(spec, times, thin=False), spec.solver.minimum_load_step) for times in (TIMES, 1.0))
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)
@@ -264,15 +264,15 @@ class FromStart(OfOne):
     start
         Parameters (d,) that are solved for first; None: every solve begins at rest.
     begun
-        States there, and their derivatives, once they are known, or why there are none; models of the same meshes share
-        it.
+        States there, and their derivatives, once they are known, and why there are none; models of the same meshes
+        share it.
     needed
         Whether there is no answer anywhere without one at the start: then searches end at once, which may take minutes.
     """
 
     model: Joined
     start: FloatArray | None = None
-    begun: list[Begun | SolveError] = field(default_factory=list)
+    begun: list[Begun] = field(default_factory=list)
     needed: bool = False
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
@@ -290,19 +290,19 @@ class FromStart(OfOne):
             try:
                 here = self._begin(self.start)
             except SolveError as error:
-                self.begun.append(error)
+                self.begun.append(((), error))
                 if at_start:
                     raise
             else:
                 if at_start:
                     return here
-        begun = self.begun[0]
-        if not isinstance(begun, SolveError):
+        begun, unanswered = self.begun[0]
+        if unanswered is None:
             step = parameters - self.start
             guesses = [Guess(state + step @ slopes if slopes.size else state) for state, slopes in begun]
             return self.model.solve_each(parameters, guesses)
         if self.needed:
-            raise begun
+            raise unanswered
         return self.model.solve(parameters)
 
     def _begin(self, start: FloatArray) -> JoinedSolution:
@@ -310,7 +310,7 @@ class FromStart(OfOne):
         d, found = len(start), self.model.solve(start)
         few = d <= TANGENTS and self.differentiable
         kept = ((one.state, one.state_tangent(np.eye(d)) if few else np.zeros((d, 0))) for one in found.solutions)
-        self.begun.append(tuple(kept))
+        self.begun.append((tuple(kept), None))
         return found
 
 
@@ -333,7 +333,7 @@ class FinerMeshes:
     share: float
     start: FloatArray | None = None
     otherwise: FinerMeshes | None = None
-    begun: list[Begun | SolveError] = field(default_factory=list)
+    begun: list[Begun] = field(default_factory=list)
 
     def of(self, observed: ForwardModel) -> ForwardModel:
         """Return the model of what a model of the body has as outputs; collective when it is first solved.
@@ -343,12 +343,10 @@ class FinerMeshes:
         observed
             The body itself, what is observed of a specimen, or `Rows` of either.
         """
-        rows = observed if isinstance(observed, Rows) else None
-        body = observed if rows is None else rows.model
+        body, weights = sums_of(observed)
         fine, coarse = (body if mesh is None else mesh.of(body) for mesh in (self.fine, self.coarse))
         both = Joined((fine, coarse), (*body.outputs, *(f"{name} (coarse)" for name in body.outputs)))
         begun = FromStart(both, self.start, self.begun, self.otherwise is not None)
-        weights = csr_matrix(identity(len(body.outputs))) if rows is None else rows.S
         found = limit(begun, weights, observed.outputs, self.share)
         return found if self.otherwise is None else Otherwise(found, self.otherwise.of(observed))
 

@@ -11,7 +11,6 @@ import ufl
 from numpy.typing import NDArray
 
 from forward.bodies.inclusions import stiffness_factor
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
@@ -112,7 +111,7 @@ class Forms:
     @cached_property
     def _regions(self) -> dict[str, Any]:
         """Indicators of the regions that have their own numbers."""
-        if not self.spec.regions or not isinstance(self.spec.body, MeshFile):
+        if not self.spec.regions or self.spec.body.kind != "mesh":
             return {}
         found = spaces.region_indicators(self.comm, self.spec.body, self.mesh)
         return {name: found[name] for name in self.spec.regions}
@@ -226,8 +225,7 @@ class Forms:
 
     def boundary_of(self, integral: Any) -> str:
         """Return the name of the boundary that an integral of a form is over."""
-        number = integral.subdomain_id()
-        tag = number[0] if isinstance(number, tuple) else number
+        tag = np.ravel(integral.subdomain_id())[0]  # a tuple in newer versions
         return next(name for name, one in self._tags.items() if one == tag)
 
     @property

@@ -92,7 +92,7 @@ class Invariants:
         else:
             found = {name: kinematics.measure(OPS, name, at, fibres) for name in names}
             self.measures = self._variables = {
-                name: tuple(map(ufl.variable, value)) if isinstance(value, tuple) else ufl.variable(value)
+                name: tuple(map(ufl.variable, value)) if name == "i4" else ufl.variable(value)
                 for name, value in found.items()
             }
 

@@ -75,9 +75,9 @@ def ratios(materials: Materials, ranges: Ranges) -> tuple[float, float]:
     Corners that are of no material are left out; where μ vanishes between them the ratio has no bound.
     """
     found, unbounded = [], False
-    for own in materials.constants.values():
-        varied = [name for name, value in own.items() if isinstance(value, str)]
-        ends = [ranges[str(own[name])] for name in varied]
+    for place, own in materials.constants.items():
+        varied = materials.varied[place]
+        ends = [ranges[path] for path in varied.values()]
         for corner in itertools.product(*ends):
             values = {**own, **dict(zip(varied, corner, strict=True))}
             mu, kappa = moduli(materials.energy, values)

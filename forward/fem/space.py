@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import tolerance
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
 from forward.model import FloatArray
@@ -28,7 +27,7 @@ class BodySpace:
     def regions(self) -> NDArray[np.int64] | None:
         """Return the number of the region of each cell, in the order of `cells`; None without regions; collective."""
         equations = self._equations
-        if not isinstance(equations.spec.body, MeshFile):
+        if equations.spec.body.kind != "mesh":
             return None
         numbers = self._layout.by_cell(meshes.region_numbers(equations.comm, equations.spec.body, equations.mesh))
         return np.asarray(numbers, dtype=np.int64)

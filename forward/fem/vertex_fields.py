@@ -8,7 +8,7 @@ import numpy as np
 import ufl
 
 from forward.bodies.geometry import Body
-from forward.bodies.random_fields import Expansion, Modes, RandomField
+from forward.bodies.random_fields import Expansion, RandomField
 from forward.fem import ranks
 from forward.fem.dolfinx import spaces
 from forward.fem.layout import sorted_by_place
@@ -52,18 +52,9 @@ class VertexField:
         self._count = len(numbers)
         self.positions = np.array([i for i, path in enumerate(parameters) if path in numbers], dtype=np.int64)
         self._numbers = np.array([numbers[parameters[i]] for i in self.positions], dtype=np.int64)
-        self._expansion: Expansion | None = (
-            field.on(body) if comm.rank == 0 else None
-        )  # on the other ranks too, for modes
-        offset, self.kept, modes = comm.bcast(
-            None
-            if self._expansion is None
-            else (
-                self._expansion.offset,
-                self._expansion.kept,
-                self._expansion.modes if isinstance(self._expansion, Modes) else None,
-            )
-        )
+        self._expansion: Expansion | None = field.on(body) if comm.rank == 0 else None
+        on_first = self._expansion
+        offset, self.kept, modes = comm.bcast(on_first and (on_first.offset, on_first.kept, on_first.modes))
         self._offset = offset[self._vertices]
         self._modes = None if modes is None else np.ascontiguousarray(modes[self._vertices])
         if self._modes is not None:

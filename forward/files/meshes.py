@@ -50,12 +50,12 @@ def read(path: Path) -> meshio.Mesh:
             return OWN.get(path.suffix, meshio.read)(path)
     except ImportError:
         raise
-    except (Exception, SystemExit) as error:  # files may be anything, and their readers fail in many ways
+    except SystemExit:
+        reason = " ".join(said.getvalue().partition("Error: Couldn't read")[0].split())
+    except Exception as error:  # files may be anything, and their readers fail in many ways
         if out_of_memory(error):
             raise
-        last = isinstance(error, SystemExit)
-        reason = " ".join((said.getvalue().partition("Error: Couldn't read")[0] if last else str(error)).split())
-        reason = reason or ("" if last else type(error).__name__)
+        reason = " ".join(str(error).split()) or type(error).__name__
     if path.suffix in OF_VTK:
         try:
             return vtk.read(path)

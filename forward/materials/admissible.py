@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -111,13 +111,17 @@ class _Limit(NamedTuple):
 
 @cache
 def _limits(energy: Energy) -> tuple[_Limit, ...]:
-    hints = constants(energy)
-    return tuple(
-        _Limit(name, float(str(limit.gt if isinstance(limit, Gt) else limit.ge)), isinstance(limit, Ge))
-        for name, hint in hints.items()
-        for limit in get_args(hint)
-        if isinstance(limit, Gt | Ge)
-    )
+    found = []
+    for name, hint in constants(energy).items():
+        for limit in get_args(hint):
+            match limit:
+                case Gt(gt=least):
+                    found.append(_Limit(name, float(str(least)), reached=False))
+                case Ge(ge=least):
+                    found.append(_Limit(name, float(str(least)), reached=True))
+                case _:  # a unit
+                    pass
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -138,8 +142,15 @@ class Materials:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that are material constants."""
-        found = (value for of in self.constants.values() for value in of.values() if isinstance(value, str))
-        return tuple(dict.fromkeys(found))
+        return tuple(dict.fromkeys(name for of in self.varied.values() for name in of.values()))
+
+    @cached_property
+    def varied(self) -> dict[str, dict[str, str]]:
+        """For each place the constants that are parameters, with the names of these."""
+        return {
+            place: {constant: name for constant, name in own.items() if isinstance(name, str)}
+            for place, own in self.constants.items()
+        }
 
     def objection(self, values: Mapping[str, float]) -> str | None:
         """Say where and why parameters are inadmissible; None if they are admissible."""
@@ -159,7 +170,7 @@ class Materials:
 
     def _at(self, values: Values) -> Iterator[tuple[str, dict[str, Any]]]:
         for place, own in self.constants.items():
-            yield place, {name: values[value] if isinstance(value, str) else value for name, value in own.items()}
+            yield place, {**own, **{constant: values[name] for constant, name in self.varied[place].items()}}
 
 
 class Admission:

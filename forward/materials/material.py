@@ -17,10 +17,9 @@ from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
 
-from annotated_types import Unit
-
 from forward.materials.kinematics import dilation_of, expm1_of, log1p_of, of_stretches
 from forward.registry import Kinds
+from forward.scalars import unit_of
 
 Energy = Callable[..., Any]
 KNOWN = ("i1", "i2", "j", "l1", "l2", "l3", "i4", "trace", "square")  # measures of a deformation
@@ -71,6 +70,11 @@ def with_volume(volume: Energy) -> Callable[[Energy], Energy]:
     return decorated
 
 
+def _parts(energy: Energy) -> tuple[Energy, Energy | None]:
+    """The isochoric part of an energy and the volumetric one; one that is not stated in parts, and None."""
+    return (energy.shape, energy.volume) if isinstance(energy, Split) else (energy, None)
+
+
 def measures(energy: str | Energy) -> tuple[str, ...]:
     """Return the names of the measures on which an energy, or that of a kind of material, depends, in order."""
     return _measures(energy_of(energy))
@@ -78,10 +82,9 @@ def measures(energy: str | Energy) -> tuple[str, ...]:
 
 @cache
 def _measures(energy: Energy) -> tuple[str, ...]:
-    if isinstance(energy, Split):
-        return (*_measures(energy.shape), "j")
-    _, *names = (name for name, p in inspect.signature(energy).parameters.items() if p.kind is not p.KEYWORD_ONLY)
-    return tuple(names)
+    shape, volume = _parts(energy)
+    _, *names = (name for name, p in inspect.signature(shape).parameters.items() if p.kind is not p.KEYWORD_ONLY)
+    return tuple(names) if volume is None else (*names, "j")
 
 
 def measured(
@@ -99,19 +102,17 @@ def constants(energy: str | Energy) -> dict[str, Any]:
 
 @cache
 def _constants(energy: Energy) -> dict[str, Any]:
-    if isinstance(energy, Split):
-        return _constants(energy.shape) | _constants(energy.volume)
-    hints = get_type_hints(energy, include_extras=True)
-    parameters = inspect.signature(energy).parameters.items()
-    return {name: hints.get(name, Any) for name, p in parameters if p.kind is p.KEYWORD_ONLY}
+    found: dict[str, Any] = {}
+    for part in filter(None, _parts(energy)):
+        hints = get_type_hints(part, include_extras=True)
+        parameters = inspect.signature(part).parameters.items()
+        found |= {name: hints.get(name, Any) for name, p in parameters if p.kind is p.KEYWORD_ONLY}
+    return found
 
 
 def units(energy: str | Energy) -> dict[str, str]:
     """Return the names of the constants of an energy, each with its SI unit ("1" for ratios)."""
-    return {
-        name: next((item.unit for item in get_args(hint) if isinstance(item, Unit)), "1")
-        for name, hint in constants(energy).items()
-    }
+    return {name: unit_of(get_args(hint)) or "1" for name, hint in constants(energy).items()}
 
 
 def _quadratic(ops: Any, j: Any, *, D1: Any) -> Any:
@@ -120,20 +121,18 @@ def _quadratic(ops: Any, j: Any, *, D1: Any) -> Any:
 
 def volumetric(energy: str | Energy) -> Energy | None:
     """Return the volumetric part of an energy, or None if it has none."""
-    energy = energy_of(energy)
-    if isinstance(energy, Split):
-        return energy.volume
-    return _quadratic if QUADRATIC in constants(energy) else None
+    _, volume = _parts(energy_of(energy))
+    return _quadratic if volume is None and QUADRATIC in constants(energy) else volume
 
 
 def isochoric(energy: str | Energy) -> Energy:
     """Return an energy without its volumetric part, as a function of all its measures and constants."""
-    energy = energy_of(energy)
-    return partial(_of_shape, energy) if isinstance(energy, Split) else partial(_without_volume, energy)
+    shape, volume = _parts(energy_of(energy))
+    return partial(_without_volume if volume is None else _of_shape, shape)
 
 
-def _of_shape(energy: Split, ops: Any, *measures: Any, **values: Any) -> Any:
-    return energy.shape(ops, *measures[:-1], **{name: values[name] for name in constants(energy.shape)})
+def _of_shape(shape: Energy, ops: Any, *measures: Any, **values: Any) -> Any:
+    return shape(ops, *measures[:-1], **{name: values[name] for name in constants(shape)})
 
 
 def _without_volume(energy: Energy, ops: Any, *measures: Any, **values: Any) -> Any:
@@ -253,8 +252,9 @@ def _arrays() -> SimpleNamespace:
 
 def _objection(found: Any) -> str | None:
     """Say why something is not an energy, or None if it is one."""
-    if isinstance(found, Split):
-        return _objection(found.shape) or _objection(found.volume)
+    shape, volume = _parts(found)
+    if volume is not None:
+        return _objection(shape) or _objection(volume)
     if not inspect.isfunction(found):
         return "expected a function"
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -74,20 +75,14 @@ def failed(error: SolveError) -> Steps[T]:
     yield  # a generator
 
 
-@dataclass(frozen=True, eq=False)
-class _Done(Generic[T]):
-    """What a solver returns."""
-
-    result: T
-
-
-def _moved(task: Task[T], answer: FloatArray | None) -> FloatArray | _Done[T]:
-    """Begin, or go on with an answer: return what is asked for next, or the result."""
+def _moved(task: Task[T], answer: FloatArray | None, end: Callable[[T], None]) -> FloatArray | None:
+    """Begin, or go on with an answer: return what is asked for next, or hand the result to `end` and return None."""
     task.resume(0 if answer is None else 1 if answer.ndim == 1 else len(answer))
     try:
         return next(task.steps) if answer is None else task.steps.send(answer)
     except StopIteration as stop:
-        return _Done(stop.value)
+        end(stop.value)
+        return None
 
 
 def abreast(tasks: Sequence[Task[T]]) -> Steps[list[T]]:
@@ -100,10 +95,8 @@ def abreast(tasks: Sequence[Task[T]]) -> Steps[list[T]]:
     while answers:
         waiting: dict[int, FloatArray] = {}
         for i, answer in answers.items():
-            found = _moved(tasks[i], answer)
-            if isinstance(found, _Done):
-                results[i] = found.result
-            else:
+            found = _moved(tasks[i], answer, partial(results.__setitem__, i))
+            if found is not None:
                 waiting[i] = found
         answers = dict(zip(waiting, (yield np.array(list(waiting.values()))), strict=True)) if waiting else {}
     return [results[i] for i in range(len(tasks))]
@@ -131,13 +124,11 @@ def finish_all(
 
     def moved(i: int, task: Task[T], answer: FloatArray | None) -> None:
         try:
-            found = _moved(task, answer)
+            found = _moved(task, answer, partial(results.__setitem__, i))
         except SolveError as error:
             results[i] = error
             return
-        if isinstance(found, _Done):
-            results[i] = found.result
-        else:
+        if found is not None:
             waiting.append((i, task, found))
 
     while waiting or more:

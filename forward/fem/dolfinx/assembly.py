@@ -42,7 +42,7 @@ class VectorAssembler:
         if cells is not None and all(one.subdomain_id() == "everywhere" for one in cells.integrals()):
             space = self._forms[0].function_spaces[0]
             nodes, size, values = version.numbers_of(space)
-            self._lanes = _kernel(names[0], self._forms[0], space.mesh, Numbers(nodes, size, values), comm)
+            self._lanes = _kernel(names[0], self._forms[0], space.mesh, comm, Numbers(nodes, size, values))
         self._of_cells = self._forms[0]
         if self._lanes is not None:
             self._forms.pop(0)
@@ -75,15 +75,13 @@ def _parts(form: Any) -> tuple[Any | None, Any | None]:
     return (ufl.Form(cells) if cells else None), (ufl.Form(rest) if rest else None)
 
 
-def _kernel(name: str, made: Any, msh: Any, to: Numbers | int, comm: Any) -> Kernel | None:
+def _kernel(name: str, made: Any, msh: Any, comm: Any, *to: Numbers, stored: int = 0) -> Kernel | None:
     """A kernel for several cells of the form or expression of this name that DOLFINx has `made`; None without one."""
     own = owned_cells(msh)
     places = np.asarray(msh.geometry.x[version.corners_of_cells(msh)[:own]])
     coefficients = [Numbers(*numbers) for numbers in version.coefficients_of(made)]
-    own_cells = [one._replace(nodes=one.nodes[:own]) for one in coefficients]
-    if isinstance(to, Numbers):
-        to = to._replace(nodes=to.nodes[:own])
-    kernel = Kernel(name, places, own_cells, len(version.constants_of(made)), to, comm)
+    own_cells, own_to = ([one._replace(nodes=one.nodes[:own]) for one in some] for some in (coefficients, to))
+    kernel = Kernel(name, places, own_cells, len(version.constants_of(made)), own_to, stored, comm)
     return kernel if kernel.available else None
 
 
@@ -114,7 +112,7 @@ class PointValues:
         self._mesh = space.mesh
         self.cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
         self._size = len(points) * int(np.prod(expression.ufl_shape))
-        self._lanes = _kernel(self._name, self._expression, space.mesh, self._size, comm) if often else None
+        self._lanes = _kernel(self._name, self._expression, space.mesh, comm, stored=self._size) if often else None
 
     def __call__(self) -> FloatArray:
         """Return the values (n_cells, q · size of the expression) at the current state."""
@@ -132,7 +130,7 @@ class PointValues:
         """
         nodes, _, values = version.numbers_of(space)
         to = Numbers(nodes, self._size // nodes.shape[1], values)
-        kernel = _kernel(self._name, self._expression, self._mesh, to, self._comm)
+        kernel = _kernel(self._name, self._expression, self._mesh, self._comm, to)
         return None if kernel is None else lambda sums: kernel(version.constants_of(self._expression), sums)
 
 

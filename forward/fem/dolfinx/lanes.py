@@ -131,8 +131,9 @@ class Kernel:
         Of the form, in its order.
     constants
         How many it has.
-    to
-        Nodes to which the values of the cells are added; else the number of values of each cell.
+    to, stored
+        Nodes to which the values of the cells are added, in a list; an empty one, and the number of values of each
+        cell, where they are stored.
     comm
         Communicator of the ranks that have compiled it.
 
@@ -150,11 +151,11 @@ class Kernel:
         places: FloatArray,
         coefficients: Sequence[Numbers],
         constants: int,
-        to: Numbers | int,
+        to: Sequence[Numbers],
+        stored: int,
         comm: Any,
     ) -> None:
-        added = [to] if isinstance(to, Numbers) else []
-        loop = _loop(places.shape[1] * places.shape[2], coefficients, constants, to)
+        loop = _loop(places.shape[1] * places.shape[2], coefficients, constants, to, stored)
         text = hashlib.sha256(loop.encode()).hexdigest()[:4]  # an expression is stored, or added up
         beside = f"-lanes-{_VERSION}-{text}"
         self._assemble, self.lanes = compiled(name, lambda folder: self._load(folder, name, loop, comm), comm, beside)
@@ -162,7 +163,7 @@ class Kernel:
         self._cells = len(places)
         self._places = self._grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
         self._at = self._places.ctypes.data
-        self._kept = [self._grouped(one.nodes) for one in [*coefficients, *added]], [one.values for one in coefficients]
+        self._kept = [self._grouped(one.nodes) for one in [*coefficients, *to]], [one.values for one in coefficients]
         nodes, values = self._kept
         self._nodes, self._values = _addresses(nodes), _addresses(values)
 
@@ -218,18 +219,17 @@ def _compile(folder: Path, loop: str, source: Path, library: Path) -> None:
         source.write_text(f"/* {compiler[0]} does not compile vectors of cells */", encoding="utf-8")
 
 
-def _loop(places: int, coefficients: Sequence[Numbers], constants: int, to: Numbers | int) -> str:
+def _loop(places: int, coefficients: Sequence[Numbers], constants: int, to: Sequence[Numbers], stored: int) -> str:
     gathers, width = [], 0
     for i, one in enumerate(coefficients):
         count = one.nodes.shape[1]
         gathers.append(f"    gather(w + {width}, nodes[{i}] + {count} * first, values[{i}], {count}, {one.size});")
         width += count * one.size
-    if isinstance(to, Numbers):
-        count = to.nodes.shape[1]
-        entries, rows = count * to.size, f"nodes[{len(coefficients)}] + {count} * first"
-        output = f"scatter(A, {rows}, out, {count}, {to.size}, left);"
-    else:
-        entries, output = to, f"store(A, out + {to} * first, {to}, left);"
+    entries, output = stored, f"store(A, out + {stored} * first, {stored}, left);"
+    for one in to:
+        count = one.nodes.shape[1]
+        entries, rows = count * one.size, f"nodes[{len(coefficients)}] + {count} * first"
+        output = f"scatter(A, {rows}, out, {count}, {one.size}, left);"
     return _LOOP.format(
         entries=entries, width=width, places=places, constants=constants, gathers="\n".join(gathers), output=output
     )
