@@ -98,6 +98,11 @@ class LoadedBody(Refinable):
         return factor(self.body, mixed=self.mixed, symmetric=self.symmetric).bytes > SINGLE_FROM
 
     @property
+    def cases(self) -> tuple[Self]:
+        """Its load cases, which it is the only one of."""
+        return (self,)
+
+    @property
     def path_dependent(self) -> bool:
         """Whether a tool rubs on it, or another load remembers, so that its state depends on the states before."""
         return any(load.remembers for load in self.loads)

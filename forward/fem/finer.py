@@ -99,8 +99,8 @@ def share(spec: AnyBody) -> float:
 
 def held(spec: AnyBody) -> tuple[str, ...]:
     """Return the boundaries where a body is held, in any load case: by planes of symmetry and rollers it is not."""
-    moved = [item.on for case in _cases(spec) for item in case.displacements if len(item.components) > 1]
-    return tuple(dict.fromkeys([*(face for case in _cases(spec) for face in case.clamp), *moved]))
+    moved = [item.on for case in spec.cases for item in case.displacements if len(item.components) > 1]
+    return tuple(dict.fromkeys([*(face for case in spec.cases for face in case.clamp), *moved]))
 
 
 def counted(spec: Any) -> bool:
@@ -127,11 +127,7 @@ def _layers(spec: AnyBody) -> int:
 
 def _touched(spec: AnyBody) -> bool:
     """Whether a tool is pressed against the body, in any load case."""
-    return any(load.contact for case in _cases(spec) for load in case.loads)
-
-
-def _cases(spec: Any) -> tuple[Any, ...]:
-    return getattr(spec, "cases", (spec,))
+    return any(load.contact for case in spec.cases for load in case.loads)
 
 
 def _on(spec: AnyBody, times: float, *, thin: bool = True) -> Any:

@@ -135,18 +135,17 @@ class Invariants:
         return factor * modulus, j * ufl.sqrt(mean / modulus)
 
     def derivative(self, form: Any, state: Any, direction: Any) -> Any:
-        """Gâteaux derivative of a form, or of an expression, by the state along a direction."""
+        """Gâteaux derivative of a form by the state along a direction."""
         if not self._symbols:
             return ufl.derivative(form, state, direction)
-        if not isinstance(form, ufl.Form):
-            return self._derivative_of(form, state, direction)
         changed = [
-            integral.reconstruct(self._derivative_of(integral.integrand(), state, direction))
+            integral.reconstruct(self.derivative_of(integral.integrand(), state, direction))
             for integral in form.integrals()
         ]
         return ufl.Form(changed)
 
-    def _derivative_of(self, integrand: Any, state: Any, direction: Any) -> Any:
+    def derivative_of(self, integrand: Any, state: Any, direction: Any) -> Any:
+        """Gâteaux derivative of an expression by the state along a direction."""
         change = ufl.grad(self._displacement_of(direction))
         terms = [
             ufl.diff(integrand, self._variables[name]) * ufl.inner(self._shape.slopes[name], change)

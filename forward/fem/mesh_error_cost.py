@@ -169,7 +169,7 @@ def _there(spec: Any, more: float, *, estimated: bool) -> Finer | None:
 def _with_cells(spec: Any, more: float) -> Any | None:
     """Return the body with so many times the cells along each edge; None where it cannot be."""
     with suppress(ValueError):  # it is divided already, or too large
-        if hasattr(spec.body, "with_cells"):
+        if spec.body.structured:
             return spec.body.with_cells(more, spec.plane)
         return spec.body.refined(1) if more == TIMES[0] else None  # cells of a file are divided into eight
     return None

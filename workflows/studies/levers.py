@@ -344,7 +344,7 @@ def _finer_and_finer(study: S, largest: float = math.inf) -> Iterator[tuple[S, T
 def cells(study: SamplingBlocks) -> tuple[int, ...]:
     """Cells along each edge, or how often those of a file are halved."""
     body = study.solid.body
-    return tuple(body.cells) if hasattr(body, "cells") else (2**body.levels,)
+    return tuple(body.cells) if body.structured else (2**body.levels,)
 
 
 def factor(before: Sequence[int], after: Sequence[int]) -> float:

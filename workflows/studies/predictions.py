@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import REPORT, START
 from forward.settings import one_line
 from uq.accuracy.budget import SHARE
@@ -57,7 +56,7 @@ def has_mesh(spec: ModelSpec) -> bool:
 
 def of_file(spec: ModelSpec) -> bool:
     """Whether the mesh of a model, if it has one, is that of a file."""
-    return any(isinstance(one.body, MeshFile) for one in spec.bodies)
+    return any(not one.body.structured for one in spec.bodies)
 
 
 def never_estimable(spec: ModelSpec, names: Collection[str] | None = None) -> tuple[str, ...]:
@@ -77,8 +76,7 @@ def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
     """
     from forward.fem.finer import finer, graded
 
-    made = (one for one in spec.bodies if not isinstance(one.body, MeshFile))
-    both = ((finer(one), graded(one)) for one in made)
+    both = ((finer(one), graded(one)) for one in spec.bodies if one.body.structured)
     return tuple(mesh for pair in both for mesh in pair if mesh is not None)
 
 
@@ -94,11 +92,11 @@ def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | JoinedMes
 
 def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
     """Return the model on finer meshes of a specimen, or of the measured outputs of a body."""
-    from forward.combine import Rows
+    from forward.combine import sums_of
     from forward.fem.finer import extrapolated
 
     own = make()
-    body: Any = own.model if isinstance(own, Rows) else own
+    body, _ = sums_of(own)
     return extrapolated(body, start).of(own)
 
 
@@ -110,7 +108,7 @@ def mesh_check(spec: ModelSpec) -> tuple[float, str]:
         return 0.0, f"not possible: {error}; no result will be called trusted"
     unknowns, once = max((one.unknowns for one in fine), default=0), sum(times_of(one).textbook for one in fine)
     for one in spec.bodies:
-        if isinstance(one.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
+        if not one.body.structured:  # divided in a run; a factor grows faster than the mesh
             unknowns, once = max(unknowns, 8 * one.unknowns), once + 8**2 * times_of(one).textbook
     longest = duration(HOPELESS * once)
     each = f"each about {duration(once)}; up to {longest} if it has no answer"

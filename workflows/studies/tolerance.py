@@ -120,7 +120,7 @@ def _changed(study: SamplingBlocks) -> dict[str, Any]:
     adapt, body = study.solid.adapt, study.solid.body
     if adapt is not None:
         return {"adapt": adapt.tolerance}
-    return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
+    return {"cells": body.cells} if body.structured else {"levels": body.levels}
 
 
 def _moved(lever: MeshLever, changed: dict[str, Any]) -> ModelSpec:
