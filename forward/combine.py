@@ -56,9 +56,9 @@ class Rows(OfOne):
         """Names of the sums."""
         return self.names
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> CombinedSolution:
         """Solve as the other model does."""
-        return DerivedSolution(self.model.solve(parameters, guess), S=self.S)
+        return CombinedSolution((self.model.solve(parameters, guess),), len(parameters), S=self.S)
 
 
 def picked(which: Sequence[int] | NDArray[np.int64], count: int) -> csr_matrix:
@@ -144,9 +144,10 @@ class Mapped(OfOne):
         """Names of q."""
         return self.names
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> CombinedSolution:
         """Solve at q (d,)."""
-        return DerivedSolution(self.model.solve(self.by.values(parameters[None])[0], mapped(guess, self.by)), self.by)
+        there = self.by.values(parameters[None])[0]
+        return CombinedSolution((self.model.solve(there, mapped(guess, self.by)),), len(there), self.by)
 
 
 def mapped(guess: Guess | None, by: Affine) -> Guess | None:
@@ -162,93 +163,6 @@ def mapped(guess: Guess | None, by: Affine) -> Guess | None:
 def along(by: Affine, directions: FloatArray) -> FloatArray:
     """Return A q (…, D) of directions q (…, d)."""
     return by.along(np.atleast_2d(directions)).reshape(*np.shape(directions)[:-1], -1)
-
-
-@dataclass(frozen=True, eq=False)
-class DerivedSolution:
-    """A solution by sums S o of the outputs of another one, or by other parameters, or both."""
-
-    solution: Solution
-    by: Affine | None = None
-    S: csr_matrix | None = None
-
-    @property
-    def outputs(self) -> FloatArray:
-        """Values of the outputs (n,)."""
-        return self._sums(self.solution.outputs)
-
-    @property
-    def state(self) -> FloatArray:
-        """This rank's part of the state."""
-        return self.solution.state
-
-    @property
-    def residual(self) -> float:
-        """Relative residual of the state."""
-        return self.solution.residual
-
-    @property
-    def converged(self) -> bool:
-        """Whether that meets the solver's tolerance."""
-        return self.solution.converged
-
-    @property
-    def stability(self) -> Stability:
-        """What is known of the stability of the equilibrium."""
-        return self.solution.stability
-
-    @property
-    def work(self) -> Work:
-        """What it has cost so far."""
-        return self.solution.work
-
-    def _sums(self, rows: FloatArray) -> FloatArray:
-        return rows if self.S is None else times(self.S, rows)
-
-    def _directions(self, direction: FloatArray) -> FloatArray:
-        return direction if self.by is None else along(self.by, direction)
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (n,) along a `direction` (d,); (k, n) for (k, d)."""
-        return self._sums(self.solution.tangent(self._directions(direction)))
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state along a `direction` (d,), or of k of them."""
-        return self.solution.state_tangent(self._directions(direction))
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (n,); (k, d) for (k, n)."""
-        found = self.solution.adjoint(weights if self.S is None else times(self.S.T, weights))
-        return found if self.by is None else self.by.back(np.atleast_2d(found)).reshape(*np.shape(weights)[:-1], -1)
-
-    def mesh_error(self) -> MeshError | None:
-        """Estimate the error that the mesh makes; None without a mesh."""
-        found = self.solution.mesh_error()
-        if found is None or self.S is None:
-            return found
-        seen = None if found.seen is None else times(self.S, found.seen)
-        return replace(found, outputs=times(self.S, found.outputs), seen=seen)
-
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the error of the mesh; None without a mesh.
-
-        The factor of a sum of several outputs is that by which its error grows where theirs grow by their own.
-        """
-        found = self.solution.saturation(spare)
-        if found is None or self.S is None:
-            return found
-        alone = np.diff(self.S.indptr) == 1
-        factors = np.ones(len(alone))
-        factors[alone] = found.outputs[self.S.indices[self.S.indptr[:-1][alone]]]
-        if not alone.all():
-            error = self.solution.mesh_error()
-            assert error is not None  # of a model with a mesh
-            before, after = times(self.S, error.outputs), times(self.S, found.outputs * error.outputs)
-            some = ~alone & (before != 0)
-            factors[some] = after[some] / before[some]
-        shifts = None if found.shifts is None else times(self.S, found.shifts)
-        doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
-        return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +200,7 @@ class Joined(OneByOne):
         """Whether solutions have tangents and adjoints."""
         return all(model.differentiable for model in self.models)
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> CombinedSolution:
         """Solve all at `parameters` (d,)."""
         return self.solve_each(parameters, self.guesses(guess))
 
@@ -305,7 +219,7 @@ class Joined(OneByOne):
         parts = np.split(rows, len(self.order), axis=-1)
         return [parts[place] for place in np.argsort(self.order)]
 
-    def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess]) -> JoinedSolution:
+    def solve_each(self, parameters: FloatArray, guesses: Sequence[Guess]) -> CombinedSolution:
         """Solve all at `parameters` (d,), each with its own guess."""
         found = []
         for k, (model, near) in enumerate(zip(self.models, guesses, strict=True)):
@@ -315,38 +229,44 @@ class Joined(OneByOne):
                 if not self.labels:
                     raise
                 raise error.within(self.labels[k]) from error
-        return JoinedSolution(tuple(found), len(parameters), self.order)
+        return CombinedSolution(tuple(found), len(parameters), order=self.order)
 
 
 @dataclass(frozen=True, eq=False)
-class JoinedSolution:
-    """Several solutions as one.
+class CombinedSolution:
+    """Sums y = S o of the outputs of one solution or of several, at parameters p = A q + b, as functions of q.
 
     Attributes
     ----------
     solutions
         The solutions.
     count
-        Number d of parameters.
+        Number D of the parameters p.
+    by
+        The map; None where q is p.
+    S
+        Weights (n, m) of all outputs in the sums; None where these are the outputs.
     order
         As of `Joined`.
     """
 
     solutions: tuple[Solution, ...]
     count: int
-    order: tuple[int, ...]
+    by: Affine | None = None
+    S: csr_matrix | None = None
+    order: tuple[int, ...] = (0,)
 
     @cached_property
     def outputs(self) -> FloatArray:
-        """Values of all outputs (m,)."""
-        found = np.concatenate([one.outputs for one in self.solutions])
+        """Values of the outputs (n,)."""
+        found = self._sums(np.concatenate([one.outputs for one in self.solutions]))
         found.flags.writeable = False
         return found
 
     @cached_property
     def state(self) -> FloatArray:
         """This rank's part of the states (U_local,)."""
-        found = side_by_side([one.state for one in self.solutions], self.order) if self.order else np.zeros(0)
+        found = side_by_side([one.state for one in self.solutions], self.order)
         found.flags.writeable = False
         return found
 
@@ -370,15 +290,34 @@ class JoinedSolution:
         """What all have cost so far."""
         return Work.sum_of(one.work for one in self.solutions)
 
+    def _sums(self, rows: FloatArray) -> FloatArray:
+        return rows if self.S is None else times(self.S, rows)
+
+    def _directions(self, direction: FloatArray) -> FloatArray:
+        return direction if self.by is None else along(self.by, direction)
+
     def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,); (k, m) for (k, d)."""
-        return np.concatenate([one.tangent(direction) for one in self.solutions], axis=-1)
+        """Return the derivative of the outputs (n,) along a `direction` (d,); (k, n) for (k, d)."""
+        there = self._directions(direction)
+        return self._sums(np.concatenate([one.tangent(there) for one in self.solutions], axis=-1))
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local) of k of them."""
+        there = self._directions(direction)
+        return side_by_side([one.state_tangent(there) for one in self.solutions], self.order)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,); (k, d) for (k, m).
+        """Return the gradient (d,) of the outputs weighted by `weights` (n,); (k, d) for (k, n).
 
-        Solutions whose outputs have no weight cost nothing.
+        Of several solutions, those whose outputs have no weight cost nothing.
         """
+        own = weights if self.S is None else times(self.S.T, weights)
+        found = self._gradients(own)
+        return found if self.by is None else self.by.back(np.atleast_2d(found)).reshape(*np.shape(weights)[:-1], -1)
+
+    def _gradients(self, weights: FloatArray) -> FloatArray:
+        if len(self.solutions) == 1:
+            return self.solutions[0].adjoint(weights)
         ends = np.cumsum([len(one.outputs) for one in self.solutions])[:-1]
         rows = np.atleast_2d(weights)
         gradients = np.zeros((len(rows), self.count))
@@ -388,12 +327,17 @@ class JoinedSolution:
                 gradients[counted] += one.adjoint(own[counted])
         return gradients.reshape(*np.shape(weights)[:-1], -1)
 
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local) of k of them."""
-        return side_by_side([one.state_tangent(direction) for one in self.solutions], self.order)
-
     def mesh_error(self) -> MeshError | None:
         """Estimate the errors that all meshes make; None where there are none."""
+        found = self._errors()
+        if found is None or self.S is None:
+            return found
+        seen = None if found.seen is None else times(self.S, found.seen)
+        return replace(found, outputs=times(self.S, found.outputs), seen=seen)
+
+    def _errors(self) -> MeshError | None:
+        if len(self.solutions) == 1:
+            return self.solutions[0].mesh_error()
         found = [(one, one.mesh_error()) for one in self.solutions]
         known = [error for _, error in found if error is not None]
         if not known:
@@ -410,8 +354,34 @@ class JoinedSolution:
         )
 
     def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the errors of all meshes; None where there are none, and a factor of one without."""
+        """Calibrate estimates of the errors of all meshes; None where there are none, and a factor of one without.
+
+        The factor of a sum of several outputs is that by which its error grows where theirs grow by their own.
+        """
         parts = self.saturations(spare)
+        found = self._together(parts)
+        if found is None or self.S is None:
+            return found
+        alone = np.diff(self.S.indptr) == 1
+        factors = np.ones(len(alone))
+        factors[alone] = found.outputs[self.S.indices[self.S.indptr[:-1][alone]]]
+        if not alone.all():
+            error = self._errors()
+            assert error is not None  # of a model with a mesh
+            before, after = times(self.S, error.outputs), times(self.S, found.outputs * error.outputs)
+            some = ~alone & (before != 0)
+            factors[some] = after[some] / before[some]
+        shifts = None if found.shifts is None else times(self.S, found.shifts)
+        doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
+        return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
+
+    def saturations(self, spare: float) -> list[Saturation | None]:
+        """Calibrate each."""
+        return [one.saturation(spare) for one in self.solutions]
+
+    def _together(self, parts: Sequence[Saturation | None]) -> Saturation | None:
+        if len(parts) == 1:
+            return parts[0]
         known = [one for one in parts if one is not None]
         if not known:
             return None
@@ -428,10 +398,6 @@ class JoinedSolution:
             all_of([0.0 if one is None else one.shifts for one in parts], 0.0),
             all_of([0.0 if one is None else one.doubts for one in parts], math.nan),
         )
-
-    def saturations(self, spare: float) -> list[Saturation | None]:
-        """Calibrate each."""
-        return [one.saturation(spare) for one in self.solutions]
 
 
 def side_by_side(states: Sequence[FloatArray], order: Sequence[int]) -> FloatArray:

@@ -28,7 +28,7 @@ from scipy.sparse import csr_matrix, identity, kron
 from forward.bodies.location import locate, shapes
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
-from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Rows, sums_of
+from forward.combine import CombinedSolution, Joined, Mapped, Rows, sums_of
 from forward.joined_models import JoinedMeshes
 from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError
 from forward.pointwise import OfOne, OneByOne
@@ -271,7 +271,7 @@ class FromStart(OfOne):
     begun: list[Begun] = field(default_factory=list)
     needed: bool = False
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> JoinedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> CombinedSolution:
         """Solve at `parameters` (d,).
 
         Raises
@@ -301,7 +301,7 @@ class FromStart(OfOne):
             raise unanswered
         return self.model.solve(parameters)
 
-    def _begin(self, start: FloatArray) -> JoinedSolution:
+    def _begin(self, start: FloatArray) -> CombinedSolution:
         """Solve at the start, once, and keep the states with their derivatives."""
         d, found = len(start), self.model.solve(start)
         few = d <= TANGENTS and self.differentiable
@@ -428,7 +428,7 @@ class OtherMesh(OneByOne):
         """Return gradients (n, d) of those (n, D) by the parameters on the other mesh; collective."""
         return gradients @ self.along(np.eye(len(self.parameters))).T
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> DerivedSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> CombinedSolution:
         """Solve at parameters (d,) of the body on its own mesh; collective.
 
         Raises

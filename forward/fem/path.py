@@ -17,7 +17,7 @@ from typing import NamedTuple, Never
 import numpy as np
 from scipy.sparse import eye
 
-from forward.combine import DerivedSolution, Joined, JoinedSolution, Mapped, Sparse, mapped, side_by_side
+from forward.combine import CombinedSolution, Joined, Mapped, Sparse, mapped, side_by_side
 from forward.fem.body import not_estimated
 from forward.fem.equations import Discretisation
 from forward.fem.model import RAISES, STIFFER, HyperelasticModel
@@ -77,7 +77,8 @@ class PathModel(Joined):
         for label, model, one, given in zip(self.labels, self.steps, self.models, self.guesses(guess), strict=True):
             known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
             try:
-                found = StepSolution(model.solve(one.by.values(parameters[None])[0], mapped(known, one.by)), one.by)
+                there = one.by.values(parameters[None])[0]
+                found = StepSolution((model.solve(there, mapped(known, one.by)),), len(there), one.by)
                 if soon:  # while its factor is at hand: the next step needs the room
                     found = replace(found, slopes=found.state_tangent(directions))
                 solutions.append(found)
@@ -86,7 +87,7 @@ class PathModel(Joined):
                 stop.work = Work.sum_of([*(before.work for before in solutions), error.work])
                 stop.reached = reached([before.outputs for before in solutions], len(self.outputs))
                 raise stop from error
-        return PathSolution(tuple(solutions), len(parameters), self.order, self.steps[0])
+        return PathSolution(tuple(solutions), len(parameters), order=self.order, body=self.steps[0])
 
     def _continued(self, solutions: Sequence[StepSolution]) -> FloatArray | None:
         """Predict the state (U_local,) of the next step from the last two."""
@@ -131,10 +132,10 @@ def reached(known: Sequence[FloatArray], count: int) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class StepSolution(DerivedSolution):
+class StepSolution(CombinedSolution):
     """The equilibrium of a step, with derivatives (d, U_local) of its state where they were found with it."""
 
-    solution: FiniteElementSolution
+    solutions: tuple[FiniteElementSolution]
     slopes: FloatArray | None = None
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
@@ -143,24 +144,25 @@ class StepSolution(DerivedSolution):
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        return self.solution.along(self.state_tangent(direction), self._directions(direction))
+        return self.solutions[0].along(self.state_tangent(direction), self._directions(direction))
 
 
 @dataclass(frozen=True, eq=False)
-class PathSolution(JoinedSolution):
+class PathSolution(CombinedSolution):
     """The equilibria of all steps with their linearisations."""
 
     solutions: tuple[StepSolution, ...]
+    _: KW_ONLY
     body: HyperelasticModel
 
     def visit(self) -> Discretisation:
         """Return the equations, set to the last step."""
-        return self.solutions[-1].solution.visit()
+        return self.solutions[-1].solutions[0].visit()
 
     def saturations(self, spare: float) -> list[Saturation | None]:
         """Calibrate each step on one finer mesh; collective."""
         finer = self.body.finer_mesh(spare)
-        return [one.solution.saturation(spare, finer) for one in self.solutions]
+        return [one.solutions[0].saturation(spare, finer) for one in self.solutions]
 
 
 class Increment(NamedTuple):
@@ -328,9 +330,7 @@ class HistoryModel(OneByOne):
     ) -> Never:
         """Raise the reason with the outputs of the steps that were reached."""
         known = HistorySolution(self, parameters, tuple(passed), self.equations.work, stiffer).outputs
-        stop = error
-        if self.spec.labels:
-            stop = error.within(self.spec.labels[len(known) // len(self.body.outputs)])
+        stop = error.within(self.spec.labels[len(known) // len(self.body.outputs)]) if self.spec.labels else error
         found = reached([known], len(self.outputs))
         raise type(error)(stop.reason, history, self.equations.work, error.stability, found) from error
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES
-from forward.combine import Joined, JoinedSolution, Mapped, Sparse, picked
+from forward.combine import CombinedSolution, Joined, Mapped, Sparse, picked
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import relative
 from forward.fem.equations import Discretisation
@@ -137,11 +137,12 @@ class SpecimenModel(Joined):
             With the name of the case that failed.
         """
         found = super().solve(parameters, guess)
-        return SpecimenSolution(found.solutions, found.count, found.order, self.axes < len(AXES))
+        places = self.axes < len(AXES)
+        return SpecimenSolution(found.solutions, found.count, order=found.order, of_places=places)
 
 
 @dataclass(frozen=True, eq=False)
-class SpecimenSolution(JoinedSolution):
+class SpecimenSolution(CombinedSolution):
     """The equilibria of all cases with their linearisations; k derivatives of a case are solved for together.
 
     Attributes
@@ -150,6 +151,7 @@ class SpecimenSolution(JoinedSolution):
         Which outputs (n,) are displacements.
     """
 
+    _: KW_ONLY
     of_places: NDArray[np.bool_]
 
     def mesh_error(self) -> MeshError | None:
