@@ -1,9 +1,9 @@
 """Mean and standard deviation of one model from groups of samples of several, with weights that others determine.
 
-Each model k may have a control T_k of expectation zero and known variance V_k, its tangent. With the deviation w_k from
-a fixed value, the samples of both moments are the remainders of regressions
+There may be a control T of expectation zero and known variance V, the tangent of model 0. With the deviation w_k of
+model k from a fixed value, the samples of both moments are the remainders of regressions
 
-    r_k = w_k − β_k T_k,   r'_k = w_k² − γ_k T_k − δ_k (T_k² − V_k)
+    r_k = w_k − β_k T,   r'_k = w_k² − γ_k T − δ_k (T² − V)
 
 and their means follow from the groups by `uq.estimators.blue`. The coefficients and the covariances that determine the
 weights come from the samples of all models together. Weights of a sample among these come from the others: they are cut
@@ -43,7 +43,7 @@ class Samples:
     deviations
         w_k (n, K, m); zero for models outside the group, NaN where model 0 has no answer.
     controls
-        T_k (n, K, m).
+        T (n, m).
     """
 
     group: Group
@@ -92,13 +92,13 @@ class Fitted:
     means: FloatArray
 
     @classmethod
-    def of(cls, w: FloatArray, squares: FloatArray, T: FloatArray, V: FloatArray) -> Fitted:
-        """Fit deviations w, w² and controls T (n, K) of all models, with the variances V (K,) of the controls."""
+    def of(cls, w: FloatArray, squares: FloatArray, T: FloatArray, V: float) -> Fitted:
+        """Fit deviations w and w² (n, K) of all models, with the control T (n,) and its variance V."""
         n, K = w.shape
         slopes, parts = np.zeros((K, 3)), np.empty((2, n, K))
         for k in range(K):
-            slopes[k, 0] = _slopes(w[:, k], T[:, k, None])[0]
-            slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T[:, k], T[:, k] ** 2 - V[k]]))
+            slopes[k, 0] = _slopes(w[:, k], T[:, None])[0]
+            slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T, T**2 - V]))
         first, second = remainders(w, squares, T, V, slopes)
         means = first.mean(axis=0)
         parts = np.array([first, second - 2 * means * first])
@@ -120,10 +120,10 @@ def _slopes(y: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def remainders(
-    w: FloatArray, squares: FloatArray, T: FloatArray, V: FloatArray, slopes: FloatArray
+    w: FloatArray, squares: FloatArray, T: FloatArray, V: float, slopes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return r and r' (n, K) of deviations w, w² and controls T (n, K), with V (K,) and the slopes (K, 3)."""
-    beta, gamma, delta = slopes.T
+    """Return r and r' (n, K) of deviations w and w² (n, K), with the control T (n,), V and the slopes (K, 3)."""
+    (beta, gamma, delta), T = slopes.T, T[:, None]
     return w - beta * T, squares - gamma * T - delta * (T**2 - V)
 
 
@@ -191,7 +191,7 @@ def estimated(
     offset
         What the deviations of model 0 are from (m,).
     variances
-        V_k (K, m).
+        V (m,).
     apart
         Samples of all models that tell the weights, and nothing else; by default the first group does.
     """
@@ -226,16 +226,16 @@ def _combined(
     first, second = ([np.zeros((one.count, m)) for one in samples] for _ in range(2))
     fitted = []
     for j in range(m):
-        V = variances[:, j]
+        V = float(variances[j])
         middle = _middle(groups, known, j)
-        parts = of_all[:, :, j], squares_of_all[:, :, j], whole.controls[:, :, j]
+        parts = of_all[:, :, j], squares_of_all[:, :, j], whole.controls[:, j]
         for kept, share in cut:
             fit = Fitted.of(parts[0][kept], parts[1][kept], parts[2][kept], V)
             a = [weights(informations(groups, c), counts) for c in fit.covariances]
             for g, (one, (values, squares)) in enumerate(zip(samples, known, strict=True)):
                 inner = g == 0 and apart is None
                 rows = ~kept if inner else slice(None)
-                w, q, T = values[rows, :, j], squares[rows, :, j], one.controls[rows, :, j]
+                w, q, T = values[rows, :, j], squares[rows, :, j], one.controls[rows, j]
                 portion = 1.0 if inner else share
                 for sums, r, by, centre in zip(
                     (first, second), remainders(w, q, T, V, fit.slopes), a, middle, strict=True

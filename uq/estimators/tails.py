@@ -23,6 +23,7 @@ Few replicates may agree by chance, and no design makes them agree where few sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -147,6 +148,25 @@ def counted(
         mean_error=np.hypot(found.mean_error * skewed(first), of_means(inputs, first)),
         std_error=np.hypot(found.std_error * skewed(moved), further),
     )
+
+
+def with_tails(
+    found: Estimates, inputs: Inputs, moved: Sequence[FloatArray], values: FloatArray, of: int = 0
+) -> Estimates:
+    """Return estimates that are sums over parts, with errors of standard deviations that count tails beyond samples.
+
+    Parameters
+    ----------
+    found, inputs
+        The estimates, and the parameters.
+    moved
+        Influences (n, m) of the samples of each part on the variance.
+    values, of
+        Values (n, m) in the samples of one part, and its number.
+    """
+    tails = [of_influences(found, inputs, one) for one in moved]
+    tails[of] = np.maximum(tails[of], unseen(inputs, values) * found.std)
+    return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
 
 
 def of_means(inputs: Inputs, first: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from uq.estimators.fidelities import Found, correlations
 from uq.estimators.moments import Estimates, ratio
 from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
 from uq.estimators.subsampled_difference import FLOOR, Chosen, Design, Pool, Pooled, choice
-from uq.estimators.tails import of_influences, unseen
+from uq.estimators.tails import with_tails
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Taken, Team
 from uq.methods.fidelity_ways import FEWEST, UNLIMITED, sizes
@@ -88,20 +88,15 @@ class ByChoice:
         pools = [one.pool for one in self._pools]
         if self._counts or not pools:
             pools = [self._pilot.pool, *pools]
-        return Pooled(pools, self._team.slopes[0], self._team.inputs.correlation, self._known)
+        return Pooled(pools, self._team.slopes, self._team.inputs.correlation, self._known)
 
     def _estimated(self) -> Chosen:
         team, pooled = self._team, self._pooled()
         found = pooled.estimated(team.offsets[0])
-        estimates = found.estimates
-        chosen = found.rest[1] * len(found.rows)
-        tails = [
-            of_influences(estimates, team.inputs, one - one.mean(axis=0))
-            for one in (chosen, found.cheap[1] * len(found.cheap[1]))
-        ]
-        tails[1] = np.maximum(tails[1], unseen(team.inputs, team.offsets[0] + found.predicted) * estimates.std)
-        error = np.linalg.norm([estimates.std_error, *tails], axis=0)
-        return replace(found, estimates=replace(estimates, std_error=error))
+        parts = found.rest[1] * len(found.rows), found.cheap[1] * len(found.cheap[1])
+        moved = [one - one.mean(axis=0) for one in parts]
+        values = team.offsets[0] + found.predicted
+        return replace(found, estimates=with_tails(found.estimates, team.inputs, moved, values, of=1))
 
     def _design(self) -> Design:
         """Which differences count now."""
@@ -208,6 +203,6 @@ class ByChoice:
             yield gain, gain * np.sqrt(found.relative[which] + 4 * ratio(e.std_error, e.std) ** 2)
 
     @property
-    def plain(self) -> FloatArray:
-        """Variances (m,) of plain samples."""
-        return self.estimates.std**2
+    def plain(self) -> tuple[FloatArray, FloatArray]:
+        """Variances (m,) of plain samples, and of those that have the tangent as control."""
+        return self.estimates.std**2, self.found.left

@@ -101,6 +101,10 @@ class Team:
         Cost of all solves so far but those of the linearisation of the study's model, which every method needs.
     controlled
         Whether the tangent is taken off.
+    slopes, variances
+        Slopes (m, d) and E[T²] (m,) of the control: the tangent of the study's model, for all of them. Tangents of
+        models that follow each other may differ, where the place of the largest stress jumps at the mean parameters,
+        say. Each would take off something else then, and what is left would not be correlated.
     pilot
         Evaluations of the model of the study at the points of the pilot.
     """
@@ -129,20 +133,10 @@ class Team:
         self.groups: list[Group] = subsets(len(self.members))
         self.costs = np.array([sum(self.members[k].cost for k in group) for group in self.groups])
         self.offsets = np.array([one.centre.middle for one in self.members])
-        self.slopes = [self._slopes()] * len(self.members)
-        # E[T²] (K, m).
-        self.variances = np.array([np.einsum("mi,ij,mj->m", s, inputs.correlation, s) for s in self.slopes])
+        self.slopes = centre.output_slopes if self.controlled else np.zeros_like(centre.output_slopes)
+        self.variances = np.einsum("mi,ij,mj->m", self.slopes, inputs.correlation, self.slopes)
         self.taken: dict[int, Taken] = {}
         self.pilot: Evaluations | None = None
-
-    def _slopes(self) -> FloatArray:
-        """Slopes (m, d) of the control: the tangent of the study's model, for all of them.
-
-        Tangents of models that follow each other may differ, where the place of the largest stress jumps at the mean
-        parameters, say. Each would take off something else then, and what is left would not be correlated.
-        """
-        first = self.members[0].centre.output_slopes
-        return first if self.controlled else np.zeros_like(first)
 
     def blocks(self) -> list[Block]:
         """What was taken of each group."""
@@ -191,13 +185,12 @@ class Team:
         taken everywhere. Leaving such points out would estimate something else.
         """
         found = taken.values - self.offsets
-        tangent = self._controls(taken.points)
-        found[:, 1:] = np.where(np.isfinite(found[:, 1:]), found[:, 1:], tangent[:, 1:])
+        tangent = self._controls(taken.points)[:, None]
+        found[:, 1:] = np.where(np.isfinite(found[:, 1:]), found[:, 1:], tangent)
         return np.asarray(found)
 
     def _controls(self, points: FloatArray) -> FloatArray:
-        t = self.members[0].centre.coordinates.of(points)
-        return np.array([t @ slopes.T for slopes in self.slopes]).swapaxes(0, 1)
+        return np.asarray(self.members[0].centre.coordinates.of(points) @ self.slopes.T)
 
     def samples(self, g: int) -> Samples:
         """Return the samples of a group.
@@ -209,8 +202,7 @@ class Team:
         """
         taken, group = self.taken[g], self.groups[max(g, 0)]
         inside = np.isin(np.arange(len(self.members)), group)[:, None]
-        deviations = np.where(inside, self.deviations(taken), 0.0)
-        found = Samples(group, deviations, np.where(inside, self._controls(taken.points), 0.0))
+        found = Samples(group, np.where(inside, self.deviations(taken), 0.0), self._controls(taken.points))
         if found.answered.sum() < 2:
             reasons = "; ".join(sorted(taken.reasons)[:3])
             raise SolveError(f"{found.answered.sum()} of {found.count} samples have an answer, expected 2: {reasons}")

@@ -25,7 +25,7 @@ from uq.estimators.moments import (
     term,
 )
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
-from uq.estimators.tails import influences, of_influences, unseen
+from uq.estimators.tails import influences, with_tails
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Team
 from uq.surrogates.field_regression import Deviations, deviations
@@ -39,20 +39,36 @@ ORDER = 6  # largest order of the expansion
 UNLIMITED = 1e9
 
 
-class ByModels:
+class OfSamples:
+    """A way by samples of a team, of which a pilot tells something (`pilot`)."""
+
+    def __init__(self, team: Team, pilot: Found) -> None:
+        self._team, self.pilot = team, pilot
+
+    def blocks(self) -> list[Block]:
+        """What was taken."""
+        return self._team.blocks()
+
+    @property
+    def plain(self) -> tuple[FloatArray, FloatArray]:
+        """Variances (m,) of plain samples, and of those that have the tangent as control."""
+        plain = np.asarray(own_values(self._team).var(axis=0, ddof=1))
+        return plain, np.einsum("mkk->mk", self.pilot.covariance)[:, 0]
+
+
+class ByModels(OfSamples):
     """Groups of models that share their samples.
 
     Attributes
     ----------
     found
         What all samples so far tell.
-    pilot
-        What the pilot tells.
     """
 
     def __init__(self, team: Team) -> None:
         self._team = team
-        self.pilot = self.found = self._estimated()
+        self.found = self._estimated()
+        super().__init__(team, self.found)
 
     def _samples(self) -> tuple[list[Samples], Samples | None]:
         """All groups that count, the pilot as long as nothing else was taken; and one that tells weights only."""
@@ -70,21 +86,12 @@ class ByModels:
         team = self._team
         samples, apart = self._samples()
         found = estimated(samples, team.offsets[0], team.variances, apart)
-        return replace(found, estimates=with_tails(team, found.estimates, found.moved))
-
-    def blocks(self) -> list[Block]:
-        """What was taken."""
-        return self._team.blocks()
+        return replace(found, estimates=with_tails(found.estimates, team.inputs, found.moved, own_values(team)))
 
     @property
     def estimates(self) -> Estimates:
         """Mean and standard deviation."""
         return self.found.estimates
-
-    @property
-    def plain(self) -> FloatArray:
-        """Variances (m,) of plain samples."""
-        return np.asarray(own_values(self._team).var(axis=0, ddof=1))
 
     def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
@@ -152,7 +159,7 @@ def _share(found: Found, i: int) -> FloatArray:
     return ratio(errors[i], errors.sum(axis=0))
 
 
-class ByExpansion:
+class ByExpansion(OfSamples):
     """An expansion fitted to the pilot, and samples of the study's model that correct what it leaves.
 
     Attributes
@@ -161,15 +168,16 @@ class ByExpansion:
         What it leaves (m,), by the whole fit repeated without each part of its samples.
     """
 
-    def __init__(self, team: Team, fitted: Deviations, scale: Estimates) -> None:
-        self._team, self._fitted, self._scale = team, fitted, scale
+    def __init__(self, team: Team, told: Found, fitted: Deviations, scale: Estimates) -> None:
+        super().__init__(team, told)
+        self._fitted, self._scale = fitted, scale
         self._control: Control = expansion(fitted)
         self._repeats = [expansion(one) for one in fitted.repeats]
         self.left: FloatArray = np.maximum(fitted.relative, fitted.trial.relative) * scale.std
         self.estimates, self._moved = scale, np.zeros((0, 0))
 
     @classmethod
-    def of(cls, team: Team) -> ByExpansion | None:
+    def of(cls, team: Team, told: Found) -> ByExpansion | None:
         """Fit to values, and gradients where there are some, at the pilot; None if that is impossible."""
         pilot, centre = team.pilot, team.members[0].centre
         if pilot is None or objection(team.inputs, "multifidelity") is not None:
@@ -185,22 +193,14 @@ class ByExpansion:
         zero = np.zeros_like(scale)
         return cls(
             team,
+            told,
             deviations(regression, replace(pilot, fields=np.zeros((0, 0))), centre),
             Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
         )
 
-    def blocks(self) -> list[Block]:
-        """What was taken."""
-        return self._team.blocks()
-
-    @property
-    def plain(self) -> FloatArray:
-        """Variances (m,) of plain samples."""
-        return np.asarray(own_values(self._team).var(axis=0, ddof=1))
-
     def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield how many plain samples each unit of cost was worth, and the standard error, for means."""
-        gain = ratio(self.plain, self.estimates.mean_error**2 * cost, empty=1.0)
+        gain = ratio(self.plain[0], self.estimates.mean_error**2 * cost, empty=1.0)
         yield gain, gain * np.sqrt(2 / len(own_values(self._team)))
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
@@ -239,7 +239,8 @@ class ByExpansion:
         # Without the control, the samples that it was fitted to count as well.
         own = own_values(team)
         plain: Estimates = estimate(monomials(own - team.offsets[0], None).sum(axis=1), len(own), team.offsets[0])
-        plain = with_tails(team, plain, (influences(own - team.offsets[0], (own - team.offsets[0]) ** 2),))
+        moved_plain = influences(own - team.offsets[0], (own - team.offsets[0]) ** 2)
+        plain = with_tails(plain, team.inputs, (moved_plain,), own)
         claims, without = (np.hypot(one.mean_error, one.std_error) for one in (found, plain))
         stands = agree(found, plain) & (claims <= without)
         self.estimates = either(stands, found, plain)
@@ -276,7 +277,7 @@ class ByExpansion:
                 np.broadcast_arrays(found.std_error * factor, of_std, self._unseen(points, first)), axis=0
             ),
         )
-        return with_tails(team, found, (moved,)), moved
+        return with_tails(found, team.inputs, (moved,), own_values(team)), moved
 
     def _unseen(self, points: FloatArray, left: FloatArray) -> FloatArray:
         """Error (m,) of the standard deviation from beyond all samples, which leaves so much of them (n, m)."""
@@ -298,14 +299,6 @@ def sizes(estimates: Estimates) -> FloatArray:
     """Return what errors of means are relative to (m,): the mean, or the standard deviation where that is larger."""
     found = np.maximum(np.abs(estimates.mean), estimates.std)
     return np.where(found > 0, found, 1.0)
-
-
-def with_tails(team: Team, found: Estimates, moved: tuple[FloatArray, ...]) -> Estimates:
-    """Return estimates with errors of standard deviations that count tails beyond the samples."""
-    values = own_values(team)
-    tails = [of_influences(found, team.inputs, one) for one in moved]
-    tails[0] = np.maximum(tails[0], unseen(team.inputs, values) * found.std)
-    return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
 
 
 def own_values(team: Team) -> FloatArray:

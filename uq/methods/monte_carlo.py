@@ -102,23 +102,20 @@ class MonteCarlo(Amount):
         ModelError
             If the tangent is the control, and the model has no derivatives.
         """
-        return self._sampled(inputs, evaluate)
+        return self.until(inputs, evaluate, None)
 
     @property
     def aims(self) -> bool:
         """It can stop at a goal."""
         return True
 
-    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
-        """Sample until errors are those of a goal; results and errors as in `run`."""
-        return self._sampled(inputs, evaluate, goal)
-
     @property
     def _control(self) -> tuple[Coefficient, SecondMoment] | None:
         """How the tangent at the mean parameters controls both moments, if it does."""
         return None
 
-    def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None) -> xr.Dataset:
+        """Sample until errors are those of a goal, or as much as is asked for; results and errors as in `run`."""
         control = self._control
         if control is not None and not evaluate.differentiable:
             raise ModelError(f"the model has no derivatives, expected one that has for method.kind = '{self.kind}'")

@@ -193,7 +193,7 @@ class Multifidelity(Amount):
         team.begin(self.first, counts=self.reuse, tangents=self.control == "auto" and evaluate.differentiable)
         models = ByModels(team)
         told = list(useless(team, models.pilot))
-        expansion = ByExpansion.of(team) if self.control == "auto" else None
+        expansion = ByExpansion.of(team, models.pilot) if self.control == "auto" else None
         cost = self._left(team) if self.tolerance is None else models.needed(self.tolerance**2)
         cost = max(min(cost, self._left(team)), FEWEST)
         way: ByModels | ByExpansion | ByChoice = self._full_solves(team, models, cost)
@@ -274,10 +274,10 @@ def described(
     for name, (worth, error) in zip(("gain", "std_gain"), way.gains(team.spent), strict=False):
         dataset = dataset.assign({name: (by_output, worth), f"{name}_error": (by_output, error)})
     squares = np.where(estimates.mean_error > 0, estimates.mean_error, np.nan) ** 2
-    others = {"monte-carlo": way.plain / squares}
+    plain, with_tangent = way.plain
+    others = {"monte-carlo": plain / squares}
     if team.controlled:
-        left = way.found.left if isinstance(way, ByChoice) else np.einsum("mkk->mk", pilot.covariance)[:, 0]
-        others["sensitivity-monte-carlo"] = left / squares
+        others["sensitivity-monte-carlo"] = with_tangent / squares
     if expanded is not None:
         others["expansion"] = expanded.left**2 / squares + sizes_of[0]
     dataset = dataset.assign_coords(alternative=list(others))

@@ -1,7 +1,6 @@
 """Multilevel Monte Carlo over nested meshes: the total error, of mesh and sampling, at the least cost.
 
-The meshes, and the terms of the telescoping sums, are in `uq.methods.multilevel_meshes`; what is estimated from them is
-in `uq.methods.multilevel_meshes`.
+The meshes, the terms of the telescoping sums and what is estimated from them are in `uq.methods.multilevel_meshes`.
 """
 
 from __future__ import annotations
@@ -16,9 +15,7 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray, ModelError
 from uq.estimators.doubts import of_differences, of_tails
 from uq.estimators.estimate import part
-from uq.estimators.moments import (
-    ratio,
-)
+from uq.estimators.moments import ratio
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add

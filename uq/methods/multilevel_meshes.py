@@ -14,14 +14,14 @@ where the controls, in brackets, have expectation zero. `moments.combine` adds t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from forward.model import FloatArray, SolveError
 from uq.estimators.moments import Estimates, Moments, Term, combine, controlled, estimate, monomials, ratio, term
-from uq.estimators.tails import of_influences, unseen
+from uq.estimators.tails import with_tails
 from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
@@ -226,11 +226,7 @@ class Found:
         """Estimate from the samples on all meshes."""
         terms = [mesh.term for mesh in meshes]
         *coarser, finest = (combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
-        moved = influences(meshes)
-        tails = [of_influences(finest, inputs, one) for one in moved]
-        first = np.maximum(tails[0], unseen(inputs, meshes[0].values) * finest.std)
-        error = np.linalg.norm([finest.std_error, first, *tails[1:]], axis=0)
-        by_mesh = (*coarser, replace(finest, std_error=error))
+        by_mesh = (*coarser, with_tails(finest, inputs, influences(meshes), meshes[0].values))
         differences = np.array([mesh.offset + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])

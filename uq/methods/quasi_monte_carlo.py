@@ -153,18 +153,15 @@ class QuasiMonteCarlo(MonteCarlo):
         ValueError
             If the model has no derivatives, which controls need, or the chaos control has correlated parameters.
         """
-        return self._sampled(inputs, evaluate)
+        return self.until(inputs, evaluate, None)
 
-    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal, expanded: Deviations | None = None) -> xr.Dataset:
+    def until(
+        self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None, expanded: Deviations | None = None
+    ) -> xr.Dataset:
         """Sample until errors are those of a goal; an expansion that is known already may be the control of "chaos".
 
         Its samples must not be among those of the scrambles. Results and errors as in `run`.
         """
-        return self._sampled(inputs, evaluate, goal, expanded)
-
-    def _sampled(
-        self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None, expanded: Deviations | None = None
-    ) -> xr.Dataset:
         objection = self.objection(inputs)
         if objection is not None:
             raise ValueError(objection)

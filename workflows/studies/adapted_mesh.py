@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,15 +34,9 @@ def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable
     named("forward.fem.adapt:adapt")  # PETSc begins on all ranks together
     world, path = ensemble.world, directory.resolve() / MESH
 
-    def refined() -> Adapted | None:
-        found: Adapted | None = None
-        if ensemble.index == 0:
-            inputs = study.inputs
-            found = study.spec.adapted(ensemble.group, inputs.names, inputs.mean, say)
-        return found
-
     if not world.bcast(path.exists() if world.rank == 0 else None):
-        found = ensemble.together(refined)
+        of = ensemble.group, study.inputs.names, study.inputs.mean, say
+        found: Adapted | None = ensemble.together(lambda: study.spec.adapted(*of) if ensemble.index == 0 else None)
         if world.rank == 0 and found is not None:
             _keep(study, found, path)
     read = ensemble.together(lambda: study.model.on_mesh(str(path)) if world.rank == 0 else None)
@@ -81,11 +76,15 @@ def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
 
 def history(study: SamplingBlocks) -> dict[str, Any] | None:
     """Return how the mesh of a study came about, which stands beside it; None where that is not known."""
-    try:
-        found: dict[str, Any] = json.loads(_path(study).with_name(HISTORY).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    return found
+    return written(_path(study).with_name(HISTORY))
+
+
+def written(path: Path) -> dict[str, Any] | None:
+    """Return what was written down of meshes; None where there is no such file."""
+    with suppress(FileNotFoundError):
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return found
+    return None
 
 
 def _path(study: SamplingBlocks) -> Path:

@@ -43,7 +43,7 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from workflows.studies import tolerance_words as words
 from workflows.studies.adapted_mesh import FILES as ADAPTED
-from workflows.studies.adapted_mesh import on_adapted_mesh
+from workflows.studies.adapted_mesh import on_adapted_mesh, written
 from workflows.studies.levers import COUNTS, Assessed, MeshLever, cells, goal
 
 if TYPE_CHECKING:
@@ -142,10 +142,7 @@ def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
 
 def history(directory: Path) -> dict[str, Any] | None:
     """Return how the mesh of a study was found, which stands beside its results; None where it was not looked for."""
-    with suppress(FileNotFoundError):
-        found: dict[str, Any] = json.loads((directory.resolve() / FILE).read_text(encoding="utf-8"))
-        return found
-    return None
+    return written(directory.resolve() / FILE)
 
 
 def meshes_before(directory: Path) -> list[dict[str, Any]]:

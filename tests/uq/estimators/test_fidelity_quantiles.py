@@ -22,7 +22,7 @@ def drawn(seed, counts):
         y = np.exp(0.5 * x[:, 0] + 0.03 * x[:, 1])
         values = np.stack([y, 0.3 + 1.05 * np.exp(0.48 * x[:, 0])], axis=1) - np.array([1.0, 1.35])
         inside = np.isin([0, 1], GROUPS[g])
-        found.append(Samples(GROUPS[g], np.where(inside, values, 0.0)[:, :, None], np.zeros((n, 2, 1))))
+        found.append(Samples(GROUPS[g], np.where(inside, values, 0.0)[:, :, None], np.zeros((n, 1))))
     return found
 
 
@@ -43,7 +43,7 @@ def test_intervals_hold_and_are_closer_than_those_of_the_model_alone():
 
 @pytest.mark.unit
 def test_shares_are_those_of_the_model_where_it_is_alone():
-    one = Samples((0, 1), np.random.default_rng(0).standard_normal((50, 2, 1)), np.zeros((50, 2, 1)))
+    one = Samples((0, 1), np.random.default_rng(0).standard_normal((50, 2, 1)), np.zeros((50, 1)))
     t = np.array([-1.0, 0.0, 0.7])
     share, error = below([one], 0, t)
     plain = (one.deviations[:, 0, 0, None] <= t).mean(axis=0)
