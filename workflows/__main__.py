@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         a number cannot be trusted.
     """
     options = _parser().parse_args(arguments)
-    from forward.machine import START, StopError, reason_to_stop, require
+    from forward.machine import INTERRUPTED, START, StopError, reason_to_stop, require
 
     try:
         require(START, "the program alone")
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if reason is None:
             traceback.print_exc()
         else:
-            _say(reason if isinstance(error, KeyboardInterrupt) else f"failed: {reason}")
+            _say(reason if reason == INTERRUPTED else f"failed: {reason}")
         return FAILED
     return code
 
@@ -233,12 +233,7 @@ def _report(options: argparse.Namespace) -> int:
         sys.stdout.write(f"{write_report(directory, code=options.code)}\n")
     if len(options.directories) > 1:
         out = options.out or Path("comparison.html")
-        try:
-            sys.stdout.write(f"{compare(options.directories, out, code=options.code)}\n")
-        except OSError as error:
-            if isinstance(error, FileNotFoundError) and error.filename is None:  # one of the directories, in words
-                raise
-            raise StudyError(f"--out {out}: cannot be written: {error.strerror}") from None
+        sys.stdout.write(f"{compare(options.directories, out, code=options.code)}\n")
     return DONE
 
 

@@ -16,8 +16,10 @@ def completion(shell: str, parser: argparse.ArgumentParser) -> str:
     """Return the script for a shell of `SHELLS`, made from the parser itself: it knows every command and option."""
     from workflows.starter import KINDS
 
-    (group,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    for command in group.choices.values():
+    assert parser._subparsers is not None
+    (group,) = parser._subparsers._group_actions
+    assert group.choices is not None
+    for command in dict(group.choices).values():
         for action in command._actions:
             if action.metavar in TAKEN:
                 action.complete = TAKEN[action.metavar]

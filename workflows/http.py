@@ -142,7 +142,22 @@ class Handler(BaseHTTPRequestHandler):
         """Do not log single requests."""
 
 
-class Server(ThreadingHTTPServer):
+class Listening(ThreadingHTTPServer):
+    """A server at a socket that listens."""
+
+    def __init__(self, listening: socket.socket, handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(listening.getsockname(), handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say in a line what went wrong, unless the client has just disconnected."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
+
+
+class Server(Listening):
     """A server whose requests are answered by a function, in the threads of their connections.
 
     Parameters
@@ -153,15 +168,11 @@ class Server(ThreadingHTTPServer):
         Answers a request, given what it asks and its fields.
     """
 
-    daemon_threads = True
-
     def __init__(self, host: str, listening: socket.socket, ask: Ask) -> None:
         self.ask = ask
         self.called = host.lower()
         self._free = threading.BoundedSemaphore(MOST_WAITING)
-        super().__init__(listening.getsockname(), Handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = listening
+        super().__init__(listening, Handler)
         listening.listen(MOST_WAITING)  # the system's own limit is often lower: clients retry dropped connections
         self.local = ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
@@ -178,12 +189,6 @@ class Server(ThreadingHTTPServer):
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say in a line what went wrong, unless the client has just disconnected."""
-        error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
-        if not isinstance(error, ConnectionError | TimeoutError):
-            sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
 
 
 def listen(host: str, port: int, option: str) -> socket.socket:

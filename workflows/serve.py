@@ -19,7 +19,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from forward.external.models import PROTOCOL
 from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, displacements
@@ -39,6 +39,7 @@ OPTIONS = ("level", "tolerance")
 WAKE = 1.0  # seconds after which an idle server looks for signals
 KEPT = 4  # models of different options
 MOST_UNKNOWNS = 2_000_000  # of a mesh that a request may ask for
+NUMBERS, OPTIONS_BY_NAME = TypeAdapter(list[FiniteFloat]), TypeAdapter(dict[str, Any])
 STEP = 1e-3  # of differences of gradients, in standard deviations of the parameters
 
 
@@ -95,19 +96,19 @@ class Service:
         return [self._solver(question).at(self._point(question)).outputs.tolist()]
 
     def _gradient(self, question: dict[str, Any]) -> list[float]:
-        point, weights = self._point(question), _vector(question, "sens", len(self.outputs))
+        point, weights = self._point(question), _numbers(question.get("sens"), "sens", len(self.outputs))
         _first(question, "inWrt", "outWrt")
         return list(self._solver(question).at(point).adjoint(weights).tolist())
 
     def _jacobian(self, question: dict[str, Any]) -> list[float]:
-        point, direction = self._point(question), _vector(question, "vec", len(self.parameters))
+        point, direction = self._point(question), _numbers(question.get("vec"), "vec", len(self.parameters))
         _first(question, "inWrt", "outWrt")
         return list(self._solver(question).at(point).tangent(direction).tolist())
 
     def _hessian(self, question: dict[str, Any]) -> list[float]:
         """Central difference of gradients, each from the factor at its own solution."""
-        point, weights = self._point(question), _vector(question, "sens", len(self.outputs))
-        direction = _vector(question, "vec", len(self.parameters))
+        point, weights = self._point(question), _numbers(question.get("sens"), "sens", len(self.outputs))
+        direction = _numbers(question.get("vec"), "vec", len(self.parameters))
         _first(question, "inWrt1", "inWrt2", "outWrt")
         length = np.abs(direction / self._inputs.std).max()
         if length == 0:
@@ -118,16 +119,18 @@ class Service:
         return list(((ahead - behind) * length / (2 * STEP)).tolist())
 
     def _point(self, question: dict[str, Any]) -> FloatArray:
-        given = question.get("input")
-        if not isinstance(given, list) or len(given) != 1:
-            raise RefusalError(f"input: expected one vector of {len(self.parameters)} numbers, in a list")
-        return _numbers(given[0], "input[0]", len(self.parameters))
+        match question.get("input"):
+            case [vector]:
+                return _numbers(vector, "input[0]", len(self.parameters))
+            case _:
+                raise RefusalError(f"input: expected one vector of {len(self.parameters)} numbers, in a list")
 
     def _solver(self, question: dict[str, Any]) -> _Solver:
         """The model with the options of a request."""
-        options = question.get("config") or {}
-        if not isinstance(options, dict):
-            raise RefusalError("config: expected options by name")
+        try:
+            options = OPTIONS_BY_NAME.validate_python(question.get("config") or {})
+        except ValidationError:
+            raise RefusalError("config: expected options by name") from None
         for option in options:
             if option not in OPTIONS:
                 raise RefusalError(f"config.{option[:40]}: unknown option; {nearest(option[:40], OPTIONS)}")
@@ -193,18 +196,14 @@ class _Solver:
         return self.model.solve(point, None if self._guess is None else replace(self._guess(point), reference=None))
 
 
-def _vector(question: dict[str, Any], key: str, length: int) -> FloatArray:
-    return _numbers(question.get(key), key, length)
-
-
 def _numbers(given: Any, key: str, length: int) -> FloatArray:
     try:
-        found = np.array([x for x in given if type(x) in {int, float}] if isinstance(given, list) else [], dtype=float)
-    except OverflowError:
-        found = np.zeros(0)
-    if not isinstance(given, list) or not len(given) == len(found) == length or not np.isfinite(found).all():
+        found = NUMBERS.validate_python(given, strict=True)
+    except ValidationError:
+        found = []
+    if len(found) != length:
         raise RefusalError(f"{key}: expected {length} finite numbers")
-    return found
+    return np.array(found)
 
 
 def _first(question: dict[str, Any], *keys: str) -> None:
@@ -262,7 +261,7 @@ def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool =
         return job.future.result()
 
     server = Server(host, listen(host, port, "--port"), ask)
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
     answered, listening = 0, None
     try:
         service = Service(sampled)
@@ -298,7 +297,3 @@ class _Job(NamedTuple):
     future: Future[dict[str, Any]]
     what: str
     question: dict[str, Any]
-
-
-def _interrupt(*_: Any) -> None:
-    raise KeyboardInterrupt

@@ -9,23 +9,7 @@ from workflows.config.mistakes import StudyError
 
 FOLDER = Path(__file__).parent / "starters"
 HEADS = {"select": "tests", "invert": "specimen", "synthesize": "specimen"}  # what comes before the method; else a body
-KINDS = (
-    "monte-carlo",
-    "sensitivity-monte-carlo",
-    "quasi-monte-carlo",
-    "multilevel-monte-carlo",
-    "multifidelity",
-    "reduce",
-    "chaos",
-    "multilevel-chaos",
-    "compare",
-    "sobol",
-    "derivative-based",
-    "local-sensitivity",
-    "select",
-    "invert",
-    "synthesize",
-)
+KINDS = tuple(sorted(path.stem for path in (FOLDER / "methods").glob("*.toml")))
 
 
 def starter(kind: str) -> str:

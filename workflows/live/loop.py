@@ -43,6 +43,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import FiniteFloat, TypeAdapter
 
 from forward.model import SolveError
 from forward.reduced.data import load
@@ -61,6 +62,8 @@ FIRST = 5.0  # s until the first line is there
 AT_ONCE = 2**13  # bytes that are read of one client before others have their turn
 CLIENTS, STRANGERS = 16, 16  # that are connected at the same time: those who have spoken, and those who have not
 FAR = "the body has moved too far at once: outputs are on the tangent at another place, until this one is solved"
+_table = TypeAdapter(dict[str, Any]).validate_json
+_number = TypeAdapter(FiniteFloat).validate_python  # text, truth values and what is not finite are none
 UNBALANCED = "forces were out of balance by more than 1 % before the last correction: the body moves too fast to follow"
 
 
@@ -309,7 +312,7 @@ class Loop:
             number = table.pop("id", None)
             if isinstance(number, str) or (number is not None and np.isfinite(number)):
                 own = {"id": number}
-            self._set({str(path): _number(value) for path, value in table.items()})
+            self._set({str(path): _number(value, strict=True) for path, value in table.items()})
         except _UnknownError as error:
             return {**own, "error": str(error)}
         except (ValueError, TypeError, OverflowError, RecursionError):
@@ -397,20 +400,6 @@ class Loop:
 
 class _UnknownError(ValueError):
     """A parameter that the model does not have."""
-
-
-def _table(line: bytes) -> dict[str, Any]:
-    found = json.loads(line)
-    if isinstance(found, dict):
-        return found
-    raise TypeError
-
-
-def _number(value: Any) -> float:
-    """Return a number of a table; text, truth values and what is not finite are none."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(float(value)):
-        raise ValueError
-    return float(value)
 
 
 def _known(values: Any) -> list[float | None]:

@@ -11,11 +11,10 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.reduced.data import ReducedData, load
-from workflows.http import foreign
+from workflows.http import Listening, foreign
 from workflows.live.mail import Mail
 from workflows.live.token import same
 from workflows.report.scene.skin import flat, outer
@@ -74,7 +73,7 @@ class Scene:
         return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
 
 
-class _Server(ThreadingHTTPServer):
+class _Server(Listening):
     """Serves a scene at a socket to those who have the token; `move` is called with what sliders say."""
 
     def __init__(
@@ -84,9 +83,7 @@ class _Server(ThreadingHTTPServer):
         move: Callable[[dict[str, float]], object],
         token: str | None = None,
     ) -> None:
-        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = listening
+        super().__init__(listening, _Handler)
         self.scene, self.move, self.token = scene, move, token
         self._answered: dict[socket.socket, float] = {}  # open connections, and when they had their last answer
         self._lock = threading.Lock()
@@ -113,11 +110,6 @@ class _Server(ThreadingHTTPServer):
         with self._lock:
             if request in self._answered:
                 self._answered[request] = time.monotonic()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a page that was closed."""
-        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
-            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):

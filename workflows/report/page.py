@@ -90,6 +90,8 @@ def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Pa
     ------
     FileNotFoundError
         If one of the directories holds no results.
+    StudyError
+        If one has no estimates of outputs, or the file cannot be written.
     """
     studies = {}
     for name, directory in zip(_names(directories), directories, strict=True):
@@ -98,7 +100,11 @@ def compare(directories: Sequence[Path], out: Path, *, code: bool = False) -> Pa
         if "nominal" not in studies[name].dataset:
             raise StudyError(f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison")
     title = f"Comparison of {len(studies)} studies"
-    write_text(out, render(title, [("comparison", [Heading(title, 1), *side_by_side(studies)])]))
+    page = render(title, [("comparison", [Heading(title, 1), *side_by_side(studies)])])
+    try:
+        write_text(out, page)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot be written: {error.strerror}") from None
     return out
 
 
@@ -198,23 +204,8 @@ def _names(directories: Sequence[Path]) -> list[str]:
 
 def side_by_side(studies: Mapping[str, Results]) -> Iterator[Block]:
     """Costs, and then the estimates of each output."""
-    yield _costs(studies)
-    yield Text("± is one standard error.")
-    for output in dict.fromkeys(output for results in studies.values() for output in results.outputs):
-        yield Heading(output)
-        yield _estimates(studies, output)
-        datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
-        if datasets:
-            yield Pictures.of(
-                (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
-                (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
-            )
-
-
-def _costs(studies: Mapping[str, Results]) -> Table:
-    """Methods and costs of several studies."""
     told = {name: results.summary for name, results in studies.items()}
-    return Table.of(
+    yield Table.of(
         told,
         {
             "study": str,
@@ -226,6 +217,16 @@ def _costs(studies: Mapping[str, Results]) -> Table:
         },
         text={0, 1},
     )
+    yield Text("± is one standard error.")
+    for output in dict.fromkeys(output for results in studies.values() for output in results.outputs):
+        yield Heading(output)
+        yield _estimates(studies, output)
+        datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
+        if datasets:
+            yield Pictures.of(
+                (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
+                (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
+            )
 
 
 def _estimates(studies: Mapping[str, Results], output: str) -> Table:

@@ -75,11 +75,10 @@ def digest(directory: Path) -> str:
 def read_summary(directory: Path) -> dict[str, Any] | None:
     """Read summary.json; None if there is none, or if it is not the summary of a finished study."""
     try:
-        found = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError, RecursionError):
+        found: dict[str, Any] = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        return found if {"study", "method", "status", "failed", "provenance"} <= found.keys() else None
+    except (FileNotFoundError, ValueError, RecursionError, AttributeError):
         return None
-    whole = isinstance(found, dict) and {"study", "method", "status", "failed", "provenance"} <= found.keys()
-    return found if whole else None
 
 
 def with_random_fields(

@@ -104,8 +104,10 @@ def run(
     try:
         with ExitStack() as held:
             return _run(study, name, directory, held, quiet=quiet or silent, silent=silent, report=report)
+    except StopError:
+        raise
     except Exception as error:
-        if isinstance(error, StopError) or not out_of_memory(error):
+        if not out_of_memory(error):
             raise
         reason = reason_to_stop(error, study.memory + of_program(headroom()))
         raise StopError(reason) from error

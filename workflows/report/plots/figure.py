@@ -85,10 +85,10 @@ def in_fitting_units(figure: Any) -> None:
 
     Axes stay in SI units, so that lines can be added; only what is written beside them changes.
     """
-    from matplotlib.ticker import FixedLocator, LogFormatterSciNotation
+    from matplotlib.ticker import FixedLocator
 
     for axis in (one for ax in figure.axes for one in (ax.xaxis, ax.yaxis)):
-        if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatterSciNotation):
+        if axis.get_scale() == "log" and axis.isDefault_majfmt:
             axis.set_major_formatter(_of_powers())
             axis.set_minor_formatter(_of_powers())
         found = re.search(r"\(([^()]+)\)$", axis.get_label_text())
