@@ -11,7 +11,6 @@ import numpy as np
 
 from forward.model import FloatArray
 from uq.estimators.estimate import BAND, ESTIMATED, OF_MESH, PARTS, holds, part
-from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import gains
 
 if TYPE_CHECKING:
@@ -19,13 +18,8 @@ if TYPE_CHECKING:
 
 Part = dict[str, Any]
 ALONE = ""  # name of a number that stands without one
-OTHER_ESTIMATES = (
-    *("variance_ratio", "std_variance_ratio", "loo_error"),
-    *("bias_error", part("mean", "total"), "std_bias_error", part("std", "total")),
-    *(part(name, which) for name in ESTIMATED for which in OF_MESH),
-)
-# Of these, what is not estimated of every output.
-NOT_OF_ALL = {part(name, which) for name in ESTIMATED for which in (*OF_MESH, "total")}
+NUMBERS = ("rmse", "rmse_error", "claimed", "coverage")  # of a method at a budget
+MOMENTS = (*ESTIMATED, "variance_ratio", "std_variance_ratio", "loo_error", "bias_error", "std_bias_error")
 # Of outputs that were not measured: bands by the posterior and the prior, and errors of the mesh.
 PREDICTED = {
     **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
@@ -41,7 +35,7 @@ def summarise(dataset: xr.Dataset) -> Part:
         if needed <= set(dataset.variables):
             summary |= told(dataset)
     for one in _TOLD:
-        if {*one.variables.values(), *one.needs} <= set(dataset.variables):
+        if set(one.needs or one.variables.values()) <= set(dataset.variables):
             summary[one.key] = one.of(dataset)
     if "accuracy" in dataset.attrs:
         summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
@@ -126,20 +120,6 @@ def _comparison(dataset: xr.Dataset) -> Part:
     return {"models": {name: one | {"trusted": bool(trusted.sel(model=name))} for name, one in models.items()}}
 
 
-def _moments(dataset: xr.Dataset) -> Part:
-    names = [name for name in (*ESTIMATES, *OTHER_ESTIMATES) if name in dataset]
-    return {
-        "outputs": {
-            str(output): {
-                name: _number(value) if name in NOT_OF_ALL else value
-                for name in names
-                for value in [float(dataset[name].sel(output=output))]
-            }
-            for output in dataset.output.values
-        }
-    }
-
-
 def _nested(labels: Sequence[tuple[str, Sequence[str]]], values: Mapping[str, FloatArray], above: str = "") -> Any:
     """Return values of one shape under names of dimensions within each other: numbers by the names of the values.
 
@@ -171,14 +151,11 @@ def _methods(dataset: xr.Dataset) -> Part:
         outputs = {
             str(output): {
                 estimated: {
-                    "rmse": _number(of_output[f"{estimated}_rmse"]),
-                    "rmse_error": _number(of_output[f"{estimated}_rmse_error"]),
-                    "resolved": bool(of_output[f"{estimated}_resolved"]),
-                    "claimed": _number(of_output[f"{estimated}_claimed"]),
-                    "coverage": _number(of_output[f"{estimated}_coverage"]),
-                    "understated": bool(of_output[f"{estimated}_understated"]),
+                    **{key: _number(of_output[f"{estimated}_{key}"]) for key in NUMBERS},
+                    **{key: bool(of_output[f"{estimated}_{key}"]) for key in ("resolved", "understated")},
                     **{
-                        f"gain_{key}": _number(g.isel(row=i).sel(output=output)) for key, g in gained[estimated].items()
+                        f"gain_{key}": _number(of.isel(row=i).sel(output=output))
+                        for key, of in gained[estimated].items()
                     },
                 }
                 for estimated in ESTIMATED
@@ -216,7 +193,7 @@ class _Told:
     variables
         Of the same dimensions, by their names there; one that is `ALONE` stands without a name, and without errors.
     needs
-        Other variables that must be there.
+        Variables that must be there; otherwise all. Of the others those are told that are there.
     """
 
     key: str
@@ -226,11 +203,12 @@ class _Told:
     def of(self, dataset: xr.Dataset) -> Part:
         """Return the numbers, by output and the other dimensions in their order."""
         names: dict[str, str] = {}
-        for short, name in self.variables.items():
+        there = {short: name for short, name in self.variables.items() if name in dataset}
+        for short, name in there.items():
             first, parts = "" if short == "value" else short, () if short == ALONE else PARTS
             names[short] = name
             names |= {part(first, which): part(name, which) for which in parts if holds(dataset, name, which)}
-        dims = sorted(dataset[name].dims, key=lambda dimension: dimension != "output")
+        dims = sorted(dataset[next(iter(there.values()))].dims, key=lambda dimension: dimension != "output")
         number = {str(one): "{:g}" if dataset[one].dtype.kind == "f" else "{}" for one in dims}
         labels = [(one, [*map(shown.format, dataset[one].to_numpy().tolist())]) for one, shown in number.items()]
         values = {short: dataset[name].transpose(*dims).to_numpy() for short, name in names.items()}
@@ -242,11 +220,11 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"clean"}, _synthetic),
     ({"random_equal"}, _design),
     ({"probability"}, _comparison),
-    ({"nominal", "mean"}, _moments),
     ({"row_method"}, _methods),
 )
 _TOLD = (
-    _Told("quantiles", {"value": "quantiles"}, ("mean",)),
+    _Told("outputs", {name: name for name in MOMENTS}, ("nominal", "mean")),
+    _Told("quantiles", {"value": "quantiles"}, ("quantiles", "mean")),
     _Told("sobol", {"first": "sobol_first", "total": "sobol_total"}),
     _Told("sobol_groups", {"first": "sobol_group_first", "total": "sobol_group_total"}),
     _Told("sobol_second", {"second": "sobol_second"}),
@@ -254,7 +232,7 @@ _TOLD = (
     _Told("outputs", {name: name for name in ("mean", "std", "within", "between")}, ("candidate_mean",)),
     _Told("bounds", {"total": "total_bound"}),
     _Told("local", {ALONE: "derivative"}),
-    *(_Told(f"local_per_{one}", {ALONE: f"derivative_per_{one}"}, ("derivative",)) for one in ("std", "range")),
-    *(_Told(part("local", which), {ALONE: part("derivative", which)}, ("derivative",)) for which in OF_MESH),
+    *(_Told(f"local_per_{one}", {ALONE: f"derivative_per_{one}"}) for one in ("std", "range")),
+    *(_Told(part("local", which), {ALONE: part("derivative", which)}) for which in OF_MESH),
     _Told("nominal", {"value": "nominal"}, ("derivative", part("nominal", "corrected"))),
 )

@@ -71,10 +71,11 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
     meshed = any(np.isfinite(single(values, "mean").mesh) for values in outputs.values())
     rows: list[Row] = [("", "value ± sampling", *(("mesh", "in all", "corrected") if meshed else ()))]
     for (output, values), nothing in zip(outputs.items(), rounding, strict=True):
-        size, unit = scale(max(abs(values["mean"]), values["std"]), units[output])
+        found = {name: single(values, name) for name in ESTIMATED}
+        size, unit = scale(max(abs(found["mean"].value), found["std"].value), units[output])
         rows.append((named(output, unit) + (": zero but for rounding" if nothing else ""),))
         for name in ESTIMATED if not nothing else ():
-            one = Estimate(*(part / size for part in single(values, name)))
+            one = Estimate(*(part / size for part in found[name]))
             write = f"{number(one.value, DIGITS)} ± {margin(one.error)}"
             value = write if unknown.get(output) else with_error(one.value, one.error)
             rows.append((f"  {name}", value, *_of_mesh(one, known=output not in unknown)))
