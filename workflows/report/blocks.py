@@ -263,17 +263,14 @@ def curve_of(at: FloatArray, curve: FloatArray, inside: tuple[float, float], uni
     return Curve([float(y) for y in curve], (a, b), (left, right))
 
 
-def smooth(values: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+def smooth(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return places (m,) and the density (m,) of samples (n,) there, with Gaussian kernels on a lattice."""
-    weights = np.ones(len(values)) if weights is None else weights
-    weights = weights / weights.sum()
-    mean = weights @ values
-    std = float(np.sqrt(weights @ (values - mean) ** 2))
+    mean, std = float(values.mean()), float(values.std())
     if std <= ALIKE * abs(mean):  # one value, but for rounding: it has a place, and no density
         std = abs(mean) or 1.0
-    width = 1.06 * std * float(1 / (weights**2).sum()) ** -0.2
+    width = 1.06 * std * len(values) ** -0.2
     low, high = max(values.min(), mean - 5 * std), min(values.max(), mean + 5 * std)
     at = np.linspace(low - width, high + width, CURVE)
-    counts, edges = np.histogram(values, bins=400, range=(low, high), weights=weights)
+    counts, edges = np.histogram(values, bins=400, range=(low, high))
     centres = (edges[1:] + edges[:-1]) / 2
-    return at, np.exp(-0.5 * ((at[:, None] - centres) / width) ** 2) @ counts
+    return at, np.exp(-0.5 * ((at[:, None] - centres) / width) ** 2) @ counts / len(values)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from forward.words import settings
+
 
 def stability(counts: dict[str, int]) -> str:
     """Say how the stability of the states of a study was tested, from `stability` in summary.json."""
@@ -32,6 +34,11 @@ def joined(counts: Mapping[str, int], work: Mapping[str, int]) -> str:
         f"joined to rest: {audited:,} by following the path, {counts['screened']:,} by the screens only"
         f"{found}; audits took {', '.join(cost)}"
     )
+
+
+def law(block: dict[str, Any]) -> str:
+    """Write the block of a distribution: uniform: lower = 1, upper = 2."""
+    return f"{block['kind']}: {settings(block, 'kind')}"
 
 
 def solves(summary: Mapping[str, Any]) -> int:

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from workflows.results.surfaces import CORNERS
+from workflows.results.surfaces import lattice
 
 POINTS = 4  # of Gauss' rule along each direction: exact up to degree 7
 CELLS = 2000  # that are integrated at once
-_TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
-_HEXAHEDRON = CORNERS.astype(float)
 
 
 def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> tuple[FloatArray, float]:
@@ -68,12 +66,10 @@ def node_volumes(nodes: FloatArray, cells: NDArray[np.int64]) -> FloatArray:
 def _basis(nodes: FloatArray, cells: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the shape functions (q, k) and their slopes (3, q, k) at Gauss' points, and the weights (q,) of these."""
     tetrahedra = cells.shape[1] in {4, 10}
-    corners = _TETRAHEDRON if tetrahedra else _HEXAHEDRON
-    quadratic = cells.shape[1] > len(corners)
-    powers = np.array(
-        [p for p in product(range(3 if quadratic else 2), repeat=3) if not tetrahedra or sum(p) <= 1 + quadratic]
-    )
-    basis = np.linalg.inv(_monomials(_reference(nodes[cells[0]], corners, tetrahedra=tetrahedra), powers))
+    places = lattice(nodes[cells[0]], hexahedral=not tetrahedra)
+    degree = places.max()
+    powers = np.array([p for p in product(range(degree + 1), repeat=3) if not tetrahedra or sum(p) <= degree])
+    basis = np.linalg.inv(_monomials(places / degree, powers))
     points, weights = _rule(tetrahedra=tetrahedra)
     slopes = np.array([_derivatives(points, powers, axis) @ basis for axis in range(3)])
     return _monomials(points, powers) @ basis, slopes, weights
@@ -83,20 +79,6 @@ def _measure(places: FloatArray, slopes: FloatArray, weights: FloatArray) -> Flo
     """Volumes (n, q) of Gauss' points of cells with nodes at places (n, k, 3)."""
     jacobians = np.einsum("aqk,nkx->nqxa", slopes, places)
     return np.asarray(np.abs(np.linalg.det(jacobians)) * weights)
-
-
-def _reference(places: FloatArray, corners: FloatArray, *, tetrahedra: bool) -> FloatArray:
-    """Return the positions (k, 3) of a cell's nodes in the reference cell: at corners, and between them."""
-    if len(places) == len(corners):
-        return corners
-    grid = np.array(list(product((0.0, 0.5, 1.0), repeat=3)))
-    if tetrahedra:
-        grid = grid[grid.sum(axis=1) <= 1]
-    powers = np.array([p for p in product(range(2), repeat=3) if not tetrahedra or sum(p) <= 1])
-    images = _monomials(grid, powers) @ np.linalg.inv(_monomials(corners, powers)) @ places[: len(corners)]
-    nearest = np.linalg.norm(places[:, None] - images[None], axis=2).argmin(axis=1)
-    assert len(set(nearest.tolist())) == len(places)
-    return np.asarray(grid[nearest])
 
 
 def _monomials(points: FloatArray, powers: NDArray[np.int64]) -> FloatArray:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from itertools import product
+from math import comb
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +29,7 @@ SHOWN = 0.35  # part of the body's extent that a tool without end is drawn over,
 def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
     """Return the tools of a study, along a path at the last step."""
     model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
-    loads = [load for load in model.get("loads", ()) if isinstance(load, Mapping) and load.get("kind") == "indenter"]
+    loads = [load for load in model.get("loads", ()) if load.get("kind") == "indenter"]
     if not loads:
         return
     from forward.terms.indenter import Indenter
@@ -38,7 +40,7 @@ def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
         means = dict(zip(names, map(float, dataset["parameter_mean"].values), strict=True))
     means |= {path: values[-1] for path, values in model.get("steps", {}).items()}
     for load in loads:
-        block = {key: value[-1] if key == "depth" and isinstance(value, list) else value for key, value in load.items()}
+        block = load | {"depth": np.ravel(load["depth"])[-1].item()}
         label = Indenter.model_construct(**block).label
         own = {path.rpartition(".")[2]: v for path, v in means.items() if path.rpartition(".")[0] == f"loads.{label}"}
         block["at"] = [own.pop(axis, value) for axis, value in zip("xyz", block["at"], strict=True)]
@@ -96,6 +98,25 @@ def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
 
 HEXAHEDRA = (12, 29, 72)  # kinds of cells of VTK
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # of VTK
+
+
+def lattice(places: FloatArray, *, hexahedral: bool) -> IntArray:
+    """Return where (k, 3) nodes at places (k, 3) of a cell are in the reference cell, in steps from 0 to its degree.
+
+    Cells of a body have straight sides, and nodes at equal distances; their corners come first, in VTK's order.
+    """
+    degree = 1
+    while ((degree + 1) ** 3 if hexahedral else comb(degree + 3, 3)) < len(places):
+        degree += 1
+    steps = np.array([at for at in product(range(degree + 1), repeat=3) if hexahedral or sum(at) <= degree])
+    if hexahedral:
+        shares = np.prod(np.where(CORNERS, steps[:, None] / degree, 1 - steps[:, None] / degree), axis=2)
+    else:
+        shares = np.column_stack([1 - steps.sum(axis=1) / degree, steps / degree])
+    images = shares @ places[: shares.shape[1]]
+    nearest = np.linalg.norm(places[:, None] - images, axis=2).argmin(axis=1)
+    assert len(set(nearest.tolist())) == len(places), "the nodes of a cell are not where they are expected"
+    return np.asarray(steps[nearest])
 
 
 def tetrahedra(cells: IntArray, kind: int) -> IntArray:

@@ -17,14 +17,10 @@ from workflows.report.plots.accuracy import mesh_mean as mesh_mean
 from workflows.report.plots.accuracy import mesh_samples as mesh_samples
 from workflows.report.plots.accuracy import mesh_variance as mesh_variance
 from workflows.report.plots.accuracy import refinement as refinement
-from workflows.report.plots.figure import COLOURS as COLOURS
 from workflows.report.plots.figure import CONTROLLED as CONTROLLED
 from workflows.report.plots.figure import DARK as DARK
 from workflows.report.plots.figure import HIGH as HIGH
-from workflows.report.plots.figure import LOW as LOW
-from workflows.report.plots.figure import PLAIN as PLAIN
 from workflows.report.plots.figure import axes as axes
-from workflows.report.plots.figure import grid as grid
 from workflows.report.plots.figure import png as png
 from workflows.report.plots.figure import span as span
 from workflows.report.plots.figure import svg as svg

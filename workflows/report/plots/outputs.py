@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray
 from forward.words import named
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
@@ -219,22 +218,28 @@ def over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes 
     return _along(ax, along, unit, named(text_of(output), str(there["unit"].to_numpy()[0])))
 
 
-def shares_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
-    """Draw the total Sobol' index of each parameter over a path with its 95 % interval."""
+def effects_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw over a path what parameters do to an output: the largest in colours, with names.
+
+    Total Sobol' indices with their 95 % intervals, or what one standard deviation of each does to first order.
+    """
     ax = ax or axes()
     there = _steps(dataset, output)
-    values = there["sobol_total"].transpose("parameter", "output").to_numpy()
-    errors = half_width(dataset) * there["sobol_total_error"].transpose("parameter", "output").to_numpy()
-    _by_parameter(ax, dataset, there[along].to_numpy(), values, errors)
-    return _along(ax, along, unit, f"total Sobol' index of {text_of(output)}")
-
-
-def slopes_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
-    """Draw what one standard deviation of each parameter does to an output, to first order, over a path."""
-    ax = ax or axes()
-    there = _steps(dataset, output)
-    values = there["derivative_per_std"].transpose("parameter", "output").to_numpy()
-    _by_parameter(ax, dataset, there[along].to_numpy(), values, np.zeros_like(values))
+    shares, x = "sobol_total" in dataset, there[along].to_numpy()
+    values = there["sobol_total" if shares else "derivative_per_std"].transpose("parameter", "output").to_numpy()
+    errors = np.zeros_like(values)
+    if shares:
+        errors = half_width(dataset) * there["sobol_total_error"].transpose("parameter", "output").to_numpy()
+    for rank, i in enumerate(np.argsort(-np.abs(values).max(axis=1))):
+        if rank < NAMED:
+            name = text_of(str(dataset["parameter"].to_numpy()[i]))
+            error = errors[i] if errors[i].any() else None
+            ax.errorbar(x, values[i], error, color=f"C{rank}", marker="o", ms=4, capsize=3, label=name)
+        else:
+            ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
+    ax.axhline(0, color=DARK, linewidth=0.8)
+    if shares:
+        return _along(ax, along, unit, f"total Sobol' index of {text_of(output)}")
     changed = named(text_of(output), str(there["unit"].to_numpy()[0]))
     return _along(ax, along, unit, f"change of {changed}", title="by one standard deviation of")
 
@@ -258,19 +263,6 @@ def measured_over_path(one: xr.Dataset, output: str, steps: Steps, ax: Axes | No
     label = "measured, 95 % of its errors"
     ax.errorbar(x, here["measured"].to_numpy(), error, color=DARK, fmt="o", ms=4, capsize=3, label=label)
     return _along(ax, along, unit, named(text_of(output), steps.units[output]))
-
-
-def _by_parameter(ax: Axes, dataset: xr.Dataset, x: FloatArray, values: FloatArray, errors: FloatArray) -> None:
-    """Draw values (d, steps) of each parameter with their errors: the largest in colours, with names."""
-    order = np.argsort(-np.abs(values).max(axis=1))
-    for rank, i in enumerate(order):
-        if rank < NAMED:
-            name = text_of(str(dataset["parameter"].to_numpy()[i]))
-            error = errors[i] if errors[i].any() else None
-            ax.errorbar(x, values[i], error, color=f"C{rank}", marker="o", ms=4, capsize=3, label=name)
-        else:
-            ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
-    ax.axhline(0, color=DARK, linewidth=0.8)
 
 
 def _steps(dataset: xr.Dataset, output: str) -> xr.Dataset:

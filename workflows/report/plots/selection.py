@@ -10,16 +10,7 @@ import numpy as np
 from forward.model import FloatArray
 from forward.readable import percent
 from forward.words import named, with_error
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    axes,
-    finished,
-    stacked,
-    text_of,
-)
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, finished, stacked, text_of
 from workflows.report.plots.posterior import pairs
 from workflows.results.comparison import by_probability, ranking
 

@@ -293,13 +293,8 @@ def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> 
     for k, count in counts.items():
         if k != largest and count > 0:
             name = str(of["region"].values[k]) if k >= 0 else "the rest"
-            yield Inside(f"region {name}", skin_triangles(points, cells[numbers == k], kind), None, "inside")
-
-
-def skin_triangles(points: FloatArray, cells: IntArray, kind: int) -> IntArray:
-    """Return the triangles (t, 3) between nodes of the surface of cells."""
-    found = skin(points, cells, kind)
-    return found.nodes[found.triangles]
+            own = skin(points, cells[numbers == k], kind)
+            yield Inside(f"region {name}", own.nodes[own.triangles], None, "inside")
 
 
 def _tools(of: xr.Dataset, points: FloatArray) -> Iterator[Inside]:

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from forward.model import FloatArray
-from workflows.results.surfaces import HEXAHEDRA, IntArray
+from workflows.results.surfaces import HEXAHEDRA, IntArray, lattice
 
 SHARP = np.cos(np.radians(40))  # of the angle between faces from which an edge is one
 # The corners of each face, seen from outside against the clock.
@@ -48,36 +48,20 @@ def skin(points: FloatArray, cells: IntArray, kind: int) -> Skin:
 def faces(points: FloatArray, cells: IntArray, kind: int) -> list[tuple[IntArray, IntArray]]:
     """Return for each face of a cell its corners, and its triangles (t, 3) between all its nodes; numbers in the cell.
 
-    Where the nodes of a cell of higher degree are on its edges and faces is found from their places in the first
-    cell: cells of a body have straight sides, and nodes at equal distances.
+    Where the nodes of a cell are is found from their places in the first cell.
     """
-    count, hexahedral = cells.shape[1], kind in HEXAHEDRA
-    degree = 1
-    while ((degree + 1) ** 3 if hexahedral else (degree + 1) * (degree + 2) * (degree + 3) // 6) < count:
-        degree += 1
-    at = points[cells[0]]
-    size = np.ptp(at, axis=0).max()
-
-    def number(weights: FloatArray) -> int:
-        distances = np.linalg.norm(at - weights @ at[: len(weights)], axis=1)
-        nearest = int(distances.argmin())
-        assert distances[nearest] < 0.2 * size / degree, "the nodes of a cell are not where they are expected"
-        return nearest
-
+    hexahedral = kind in HEXAHEDRA
+    places = lattice(points[cells[0]], hexahedral=hexahedral)
+    degree, numbers = int(places.max()), {tuple(at): n for n, at in enumerate(places.tolist())}
     found = []
     for corners in QUADRILATERALS if hexahedral else TRIANGLES:
-        numbers: dict[tuple[int, int], int] = {}
-        for i, j in product(range(degree + 1), repeat=2):
-            if not hexahedral and i + j > degree:
-                continue
-            x, y = i / degree, j / degree
-            weights = np.zeros(8 if hexahedral else 4)
-            own = [(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y] if hexahedral else [1 - x - y, x, y]
-            weights[list(corners)] = own
-            numbers[i, j] = number(weights)
+        first, one, other = (places[corners[k]] for k in (0, 1, -1))
         triangles = []
         for i, j in product(range(degree), repeat=2):
-            square = [numbers.get(at_) for at_ in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))]
+            square = [
+                numbers.get(tuple((first + (x * (one - first) + y * (other - first)) // degree).tolist()))
+                for x, y in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
+            ]
             if square[1] is None or square[3] is None:
                 continue
             if square[2] is None:

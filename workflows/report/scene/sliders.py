@@ -185,7 +185,10 @@ class Sliders:
         scaled = sizes[:count, None] * modes[:count]
         factors = left[:, :count]
         rounded = np.rint(scaled / step) * step
-        points = np.column_stack([self._some(i) for i in range(len(self.expansion.parameters))])
+        # Over the whole of each slider, each in an order of its own.
+        ends = zip(self.expansion.lower, self.expansion.upper, strict=True)
+        some = [np.random.default_rng(i).permutation(np.linspace(*end, CHECKED)) for i, end in enumerate(ends)]
+        points = np.column_stack(some)
         psi = self.expansion.basis.values(points)
         error = np.abs(psi @ (coefficients - factors @ rounded)).max()
         return {
@@ -194,11 +197,6 @@ class Sliders:
             "rounding": float(1.5 * error + SINGLE * np.abs(psi @ coefficients).max()),
             "loo": self.field_loo if np.isfinite(self.field_loo) else None,
         }
-
-    def _some(self, i: int) -> FloatArray:
-        """Return values (n,) of a parameter, in an order of its own, over the whole of its slider."""
-        told = self._parameter(i, self.expansion.parameters[i])
-        return np.random.default_rng(i).permutation(np.linspace(told["fitted"][0], told["fitted"][1], CHECKED))
 
 
 def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
@@ -211,10 +209,13 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
     if dataset.sizes["parameter"] > MOST or study.correlations:
         return None
     if "multi_index" not in dataset:
-        found = of_reduced(study)
-        if found is None:
+        spec: Any = study.spec
+        if spec.kind != "reduced":
             return None
-        dataset = found
+        try:
+            dataset = expanded(Path(spec.file), study, alone=spec.larger)
+        except SolveError:
+            return None
     expansion, samples = Expansion.of(dataset), None
     if expansion.basis.joint is not None:
         inputs = study.inputs
@@ -232,17 +233,6 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
         dataset.attrs.get("source", ""),
         samples,
     )
-
-
-def of_reduced(study: Study) -> xr.Dataset | None:
-    """Fit an expansion to the reduced model that a study samples; None if it samples another, or this cannot be."""
-    spec: Any = study.spec
-    if spec.kind != "reduced":
-        return None
-    try:
-        return expanded(Path(spec.file), study, alone=spec.larger)
-    except SolveError:
-        return None
 
 
 def expanded(file: Path, study: Study, *, alone: bool = False) -> xr.Dataset:

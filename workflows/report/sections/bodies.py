@@ -150,10 +150,11 @@ def curve(results: Results) -> Iterator[Block]:
         drawn.append((outputs.over_path(dataset, output, along, unit), f"Over the path: {output}."))
         if "sobol_total" in dataset:
             caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
-            drawn.append((outputs.shares_over_path(dataset, output, along, unit), caption))
+            drawn.append((outputs.effects_over_path(dataset, output, along, unit), caption))
         elif "derivative_per_std" in dataset:
-            caption = f"What moves {output}, step by step."
-            drawn.append((outputs.slopes_over_path(dataset, output, along, unit), caption))
+            drawn.append(
+                (outputs.effects_over_path(dataset, output, along, unit), f"What moves {output}, step by step.")
+            )
     yield Pictures.of(*drawn)
 
 

@@ -258,19 +258,7 @@ def adapted_mesh(results: Results) -> Iterator[Block]:
         f"{by}. An error is the exact minus the discrete value, estimated with elements of one degree higher; it "
         "is not a bound. It does not include the part of a curved body that a coarse mesh cuts off."
     )
-    yield cycles(results)
-    named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
-    yield Pictures.of((plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh."))
-    captions = {
-        False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
-        True: "What is behind the cell that contributes most.",
-    }
-    yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])
-
-
-def cycles(results: Results) -> Table:
-    """The meshes, with the outputs and their estimated errors."""
-    dataset, rows = results.dataset, []
+    rows = []
     for k, told in enumerate(results.summary["adapted"]["cycles"]):
         found = []
         for output in results.outputs:
@@ -280,4 +268,11 @@ def cycles(results: Results) -> Table:
             found += [size(at.value, unit, 4), NONE if np.isnan(at.mesh) else sign + size(at.mesh, unit, like=at.value)]
         rows.append((f"{told['cells']:,}", f"{told['unknowns']:,}", duration(told["cpu_seconds"]), *found))
     head = ("cells", "unknowns", "processor time")
-    return Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=())
+    yield Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=())
+    named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
+    yield Pictures.of((plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh."))
+    captions = {
+        False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
+        True: "What is behind the cell that contributes most.",
+    }
+    yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])

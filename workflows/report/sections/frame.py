@@ -13,7 +13,7 @@ from forward.words import NONE, duration, number, settings, with_unit
 from uq import findings as of_results
 from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text
 from workflows.report.section import Results, section
-from workflows.report.words import counted, joined, stability
+from workflows.report.words import counted, joined, law, stability
 
 if TYPE_CHECKING:
     from workflows.studies.sampling import Study
@@ -66,14 +66,13 @@ def model(results: Results) -> Iterator[Block]:
     yield Pairs(list(model_in_words(results.study)))
     rows = []
     for name, distribution in results.study.given.items():
-        block = distribution.model_dump()
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
-        rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, results.parameter_unit(name)))
+        rows.append((name, law(distribution.model_dump()), mean, std, results.parameter_unit(name)))
     for field, count in Counter(path.split(".")[1] for path in results.study.model.coefficients).items():
         kept = float(results.dataset["variance_kept"].sel(random_field=field))
-        law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
-        rows.append((f"fields.{field}.0 to {count - 1}", law, "0", "1", "1"))
+        normal = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
+        rows.append((f"fields.{field}.0 to {count - 1}", normal, "0", "1", "1"))
     rows += [
         (" and ".join(c.between), f"joined by a Gaussian copula with correlation {c.value:g}", "", "", "")
         for c in results.study.correlations
@@ -96,17 +95,14 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
 def priors(results: Results) -> Iterator[Block]:
     """The priors of the unknowns."""
     config = tomllib.loads(results.dataset.attrs["config"])
-    rows = [
-        (path, f"{block['kind']}: {settings(block, 'kind')}", results.parameter_unit(path))
-        for path, block in config.get("parameters", {}).items()
-    ]
+    rows = [(path, law(block), results.parameter_unit(path)) for path, block in config.get("parameters", {}).items()]
     rows += [
         (f"fields.{block.get('name') or block['of']}", f"log-normal field: {settings(block, 'of', 'name')}", "1")
         for block in config["model"].get("fields", ())
     ]
     noise = config["method"].get("noise")
     if noise is not None:
-        rows.append(("factor on all sigma", f"{noise['kind']}: {settings(noise, 'kind')}", "1"))
+        rows.append(("factor on all sigma", law(noise), "1"))
     rows = [(unknown, prior, NONE if unit == "1" else unit) for unknown, prior, unit in rows]
     yield Table(("unknown", "prior", "unit"), rows, text=range(3))
 
@@ -141,20 +137,17 @@ def failures(results: Results) -> Iterator[Block]:
 @section(heading="Run time")
 def run_time(results: Results) -> Iterator[Block]:
     """What the study took."""
-    yield Pairs.of(*_times(results))
-
-
-def _times(results: Results) -> Iterator[tuple[str, str]]:
-    """What the study took."""
     summary, count = results.summary, max(results.solves, 1)
-    yield "wall time", f"{duration(summary['wall_seconds'])} (of the run that finished the study)"
-    cpu = summary["cpu_seconds"]
-    yield "processor time of the solves", f"{duration(cpu)}; {duration(cpu / count)} a solve"
+    cpu, work = summary["cpu_seconds"], summary["work"].items()
+    told = {
+        "wall time": f"{duration(summary['wall_seconds'])} (of the run that finished the study)",
+        "processor time of the solves": f"{duration(cpu)}; {duration(cpu / count)} a solve",
+    }
     if "own_seconds" in summary:
-        yield "processor time of the method itself", duration(summary["own_seconds"])
-    if any(summary["work"].values()):  # unknown for inversions in parallel
-        for name, amount in summary["work"].items():
-            yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
+        told["processor time of the method itself"] = duration(summary["own_seconds"])
+    if any(amount for _, amount in work):  # unknown for inversions in parallel
+        told |= {name.replace("_", " "): f"{amount:,}; {amount / count:.1f} a solve" for name, amount in work}
+    yield Pairs.of(*told.items())
 
 
 @section(heading="Provenance")

@@ -32,11 +32,6 @@ def batch(results: Results) -> Iterator[Block]:
         "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
         "inverted follow one by one."
     )
-    yield _batch(results)
-
-
-def _batch(results: Results) -> Table:
-    """A row for each data set."""
     dataset = results.dataset
     sizes = _sizes(results, abs(dataset["mean"]).median("data_set"))
     rows = []
@@ -55,7 +50,7 @@ def _batch(results: Results) -> Table:
         rows.append((str(label), count, TRUSTED[int(one["trust"])], *values, *rest))
     units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
-    return Table(head, rows, text={0, 2})
+    yield Table(head, rows, text={0, 2})
 
 
 def _sizes(results: Results, usual: xr.DataArray) -> dict[str, tuple[float, str]]:

@@ -141,23 +141,18 @@ def local_sensitivities(results: Results) -> Iterator[Block]:
     yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
     for output in results.drawn:
         yield Heading(output, level=3)
-        yield sensitivities(results, output)
+        unit, slopes, rows = results.unit(output), results.of(output), []
+        for name in results.leading(slopes["derivative_per_std"]):
+            of_parameter = slopes.sel(parameter=name)
+            by = per(unit, results.parameter_unit(name))
+            slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
+            _, *corrected = results.cells(("derivative",), {"output": output, "parameter": name}, by)
+            scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
+            rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
+        heads = results.heads({"derivative": "derivative"})
+        yield Table(("parameter", *heads, "× standard deviation", "× range"), rows)
     drawn = {output: plots.tornado(dataset, output) for output in results.drawn}
     yield Pictures.of(*((ax, f"Change of {o}, to first order{largest_of(dataset)}.") for o, ax in drawn.items()))
-
-
-def sensitivities(results: Results, output: str) -> Table:
-    """Derivatives of an output, in physical units and times the standard deviation and the range of the parameter."""
-    unit, slopes = results.unit(output), results.of(output)
-    rows = []
-    for name in results.leading(slopes["derivative_per_std"]):
-        of_parameter = slopes.sel(parameter=name)
-        by = per(unit, results.parameter_unit(name))
-        slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
-        _, *corrected = results.cells(("derivative",), {"output": output, "parameter": name}, by)
-        scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
-        rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
-    return Table(("parameter", *results.heads({"derivative": "derivative"}), "× standard deviation", "× range"), rows)
 
 
 def largest_of(dataset: xr.Dataset) -> str:
@@ -193,7 +188,11 @@ def sobol_indices(results: Results) -> Iterator[Block]:
         yield Heading(output, level=3)
         yield sobol(results, output)
         if "sobol_second" in dataset:
-            yield second_order(results, output)
+            pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
+            at = {pair: {"output": output, "parameter": pair[0], "partner": pair[1]} for pair in pairs}
+            rows = [(*pair, *results.cells(("sobol_second",), at[pair])) for pair in pairs]
+            heads = results.heads({"sobol_second": "second order"})
+            yield Table(("parameter", "with", *heads), rows, text={0, 1})
         caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
         pictures = [(plots.index_bars(dataset, output), caption)]
         if dataset.sizes.get("index_round", 0) > 1:
@@ -213,17 +212,6 @@ def sobol(results: Results, output: str) -> Table:
     rows = [(name, *results.cells(list(words), {"output": output, "parameter": name})) for name in leading]
     rows += [(f"group {name}", *results.cells(grouped, {"output": output, "group": name})) for name in groups]
     return Table(("parameter", *results.heads(words)), rows)
-
-
-def second_order(results: Results, output: str) -> Table:
-    """Shares of the variance of an output due to interactions of two parameters."""
-    names = results.parameters
-    rows = []
-    for i, name in enumerate(names):
-        for partner in names[i + 1 :]:
-            at = {"output": output, "parameter": name, "partner": partner}
-            rows.append((name, partner, *results.cells(("sobol_second",), at)))
-    return Table(("parameter", "with", *results.heads({"sobol_second": "second order"})), rows, text={0, 1})
 
 
 @section("field_sobol_first", heading="Displacement field", level=3)

@@ -56,8 +56,7 @@ def posterior(results: Results) -> Iterator[Block]:
     """The posterior of a few parameters for each data set."""
     before, units = prior_densities(results.study), results.study.units_of("/")
     for one in first(results):
-        yield from verdict(results, one)
-        yield from again(results, one)
+        yield from begun(results, one)
         yield Pairs.of(*amounts(one, one.sizes["direction"], results.study))
         yield parameters(one, units)
         if _part(one) == OUTPUT:
@@ -90,15 +89,11 @@ def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tupl
     return heads, [[_shown(x / sizes[n][0], 2) for n, x in zip(names, row, strict=True)] for row in rows]
 
 
-def verdict(results: Results, one: xr.Dataset) -> Iterator[Block]:
-    """Name a data set and, if there are several, say whether it can be trusted; for a single one, findings do."""
+def begun(results: Results, one: xr.Dataset) -> Iterator[Block]:
+    """Name a data set; of several, say whether it can be trusted, and show those that are not on the first screen."""
     yield Heading(str(one.data_set.item()))
     if results.dataset.sizes["data_set"] > 1:
         yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
-
-
-def again(results: Results, one: xr.Dataset) -> Iterator[Block]:
-    """Show the specimen of a data set, unless it is the one on the first screen."""
     shown = results.dataset.data_set.values[results.dataset["ok"]][0]
     if "stiffness_mean" in one and "cell_nodes" in one and one.data_set.item() != shown:
         yield specimen(one, results)
@@ -313,8 +308,7 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
 def field_posterior(results: Results) -> Iterator[Block]:
     """The posterior of a field for each data set."""
     for one in first(results):
-        yield from verdict(results, one)
-        yield from again(results, one)
+        yield from begun(results, one)
         yield Pairs.of(*amounts(one, one.sizes["node"], results.study), *more_amounts(one))
         yield parameters(one, results.study.units_of("/"))
         yield Pictures.of(*field_pictures(one))

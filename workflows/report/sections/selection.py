@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import percent, size
-from forward.words import NONE, named, number, settings, with_error
+from forward.words import NONE, named, number, with_error
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
 from workflows.report.plots.figure import text_of
 from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
+from workflows.report.words import law
 from workflows.results.comparison import bayes_factor, by_probability, chance, conflicts, grade, ranking
 
 if TYPE_CHECKING:
@@ -188,7 +189,21 @@ def constants(results: Results) -> Iterator[Block]:
         )
     )
     yield Heading("Candidates and priors", level=3)
-    yield _priors(results)
+    yield Table.of(
+        [
+            (name, constant, prior)
+            for name, one in study.candidates.items()
+            for constant, prior in one.parameters.items()
+        ],
+        {
+            "candidate": lambda one: one[0],
+            "model": lambda one: study.described(one[0]),
+            "constant": lambda one: one[1],
+            "prior": lambda one: law(one[2].model_dump()),
+            "unit": lambda one: results.parameter_unit(one[1], one[0]),
+        },
+        text=range(5),
+    )
     if study.data.source:
         yield Heading("Data", level=3)
         yield Text("\n".join(study.data.source))
@@ -212,18 +227,6 @@ def posteriors(results: Results) -> Table:
                 rows.append((str(model), str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
     head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
     return Table(head, rows, text={0, 1, 2})
-
-
-def _priors(results: Results) -> Table:
-    """The candidates with the priors of their constants."""
-    study: Selection = results.study
-    rows = []
-    for name, candidate in study.candidates.items():
-        for constant, distribution in candidate.parameters.items():
-            block = distribution.model_dump()
-            unit = results.parameter_unit(constant, name)
-            rows.append((name, study.described(name), constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
-    return Table(("candidate", "model", "constant", "prior", "unit"), rows, text=range(5))
 
 
 @section("probability", heading="Is the best one good?")
