@@ -68,18 +68,12 @@ class Chains:
 
     Attributes
     ----------
-    names
-        Of the quantities (k,).
     draws
         (chains, draws, k).
-    log_density
-        ℓ (chains, draws).
     accepted
         Share (chains,) of proposals that were accepted.
     step
         β; NaN for an ensemble.
-    solves
-        How often ℓ was evaluated.
     needed
         Effective draws from which on R̂ and quantiles are meaningful.
     evidence
@@ -90,12 +84,9 @@ class Chains:
         Of few parameters, the draws in standard normal coordinates (chains, draws, c).
     """
 
-    names: tuple[str, ...]
     draws: FloatArray
-    log_density: FloatArray
     accepted: FloatArray
     step: float
-    solves: int
     needed: float = INDEPENDENT
     evidence: tuple[float, float] | None = None
     apart: int = 0
@@ -202,8 +193,7 @@ def crank_nicolson(
     if not np.isfinite(here).all():
         raise SolveError("the model has no answer where a chain starts")
     odds = np.log(FIRST_STEP / (1 - FIRST_STEP))
-    kept, levels = [], []
-    accepted = np.zeros(lengths.chains)
+    kept, accepted = [], np.zeros(lengths.chains)
     for step in range(-burn, lengths.draws * thin):
         beta = float(1 / (1 + np.exp(-odds)))
         moved = np.sqrt(1 - beta**2) * z + beta * normals()
@@ -219,10 +209,7 @@ def crank_nicolson(
         accepted += taken
         if (step + 1) % thin == 0:
             kept.append(keep(x))
-            levels.append(here)
-    values = np.swapaxes(np.array(kept), 0, 1)
-    share, names = accepted / (lengths.draws * thin), tuple(map(str, range(values.shape[2])))
-    return Chains(names, values, np.array(levels).T, share, beta, lengths.evaluations)
+    return Chains(np.swapaxes(np.array(kept), 0, 1), accepted / (lengths.draws * thin), beta)
 
 
 def chains_of_few(
@@ -257,7 +244,7 @@ def in_units(posterior: Posterior, chains: Chains) -> Chains:
     """Return chains of standard normal coordinates as those of the parameters in physical units."""
     x = chains.draws
     values = posterior.physical(x.reshape(-1, x.shape[2])).reshape(x.shape)
-    return replace(chains, names=posterior.names, draws=values, x=x)
+    return replace(chains, draws=values, x=x)
 
 
 def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = None, *, seed: int = 0) -> Chains:
@@ -287,7 +274,5 @@ def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = 
     state = emcee.State(gaussian.mode + z @ gaussian.root.T, random_state=generator.get_state())
     state = sampler.run_mcmc(state, long.burn, store=False)
     sampler.run_mcmc(state, long.draws, thin_by=long.thin)
-    x = np.swapaxes(sampler.get_chain(), 0, 1)
-    accepted = np.asarray(sampler.acceptance_fraction)
-    walked = Chains((), x, sampler.get_log_prob().T, accepted, np.nan, long.evaluations)
+    walked = Chains(np.swapaxes(sampler.get_chain(), 0, 1), np.asarray(sampler.acceptance_fraction), np.nan)
     return in_units(posterior, walked)

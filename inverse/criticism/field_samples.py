@@ -96,11 +96,6 @@ class FieldWeights:
         return effective_sample_size(self.weights)
 
     @property
-    def share(self) -> float:
-        """Effective sample size over the number of samples."""
-        return self.ess / len(self.log_weights)
-
-    @property
     def pareto_k(self) -> float:
         """Shape k̂ of the largest weights; infinite if there are too few."""
         return pareto_shape(self.weights)

@@ -121,7 +121,8 @@ def gradient_chains(
         more = (np.array(found.traces["z"]), -np.array(found.traces["potential"]), found.statistics["accept_stat"])
         parts = (*parts, more)
         z, log_density, accepts = (np.concatenate([part[k] for part in parts], axis=1) for k in range(3))
-        chains = _chains(posterior, gaussian, z, log_density, accepts, potential.count)
+        walked = Chains(gaussian.mode + z @ gaussian.root.T, accepts.mean(axis=1), np.nan, EACH * len(z))
+        chains = in_units(posterior, walked)
 
     def at(there: FloatArray) -> FloatArray:
         return posterior.at(gaussian.mode + there @ gaussian.root.T).log_posterior
@@ -197,14 +198,6 @@ def _half(
     above, below = g / (many * g + (1 - many) * r), 1 / (many * p + (1 - many) * r)
     error = np.sqrt(above.var() / above.mean() ** 2 / len(g) + below.var() / below.mean() ** 2 / ess)
     return top + float(np.log(r)), float(error)
-
-
-def _chains(
-    posterior: Posterior, gaussian: Laplace, z: FloatArray, log_density: FloatArray, accepts: FloatArray, count: int
-) -> Chains:
-    """Chains of draws z (chains, draws, c), in physical units."""
-    x = gaussian.mode + z @ gaussian.root.T
-    return in_units(posterior, Chains((), x, log_density, accepts.mean(axis=1), np.nan, count, EACH * len(z)))
 
 
 def _start(potential: _Potential, z: FloatArray) -> FloatArray:

@@ -44,11 +44,9 @@ class Prior(Protocol):
 
 @dataclass
 class Counts:
-    """Numbers of solutions, and of products with derivatives; a Hessian product is one tangent and one adjoint."""
+    """Number of solutions."""
 
     solves: int = 0
-    tangents: int = 0
-    adjoints: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +218,12 @@ class Point:
     def jvp(self, whitened: FloatArray) -> FloatArray:
         """Return the Jacobian-vector product Aξ (n,), or (k, n) for k of them."""
         posterior = self.posterior
-        posterior.counts.tangents += len(np.atleast_2d(whitened))
         moved = posterior.weights * self.solution.tangent(posterior.prior.root(whitened))
         return self.root * posterior.whitening(moved)
 
     def vjp(self, data: FloatArray) -> FloatArray:
         """Return the vector-Jacobian product Aᵀr (N,), or (k, N) for k of them."""
         posterior = self.posterior
-        posterior.counts.adjoints += len(np.atleast_2d(data))
         weights = posterior.weights * posterior.whitening(self.root * data)
         return posterior.prior.root_transposed(self.solution.adjoint(weights))
 

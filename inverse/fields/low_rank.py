@@ -160,10 +160,6 @@ class LowRankPosterior:
         m̂ (N,).
     whitened
         ξ̂ (N,).
-    residual
-        r (n,) there.
-    weights
-        1/σ (n,), times the root of the Gauss–Newton weights; zero where nothing was measured.
     prior, spectrum
         The prior, and the pairs at the mode.
     log_likelihood
@@ -172,8 +168,6 @@ class LowRankPosterior:
 
     mean: FloatArray
     whitened: FloatArray
-    residual: FloatArray
-    weights: FloatArray
     prior: Prior
     spectrum: Spectrum
     log_likelihood: float
@@ -183,8 +177,7 @@ class LowRankPosterior:
         """Find the directions at a mode that the data constrain, as `leading_pairs` does with the same settings."""
         posterior = mode.posterior
         spectrum = leading_pairs(mode.jvp, mode.vjp, posterior.size, **settings)
-        weights, likelihood = mode.root * posterior.weights, mode.log_likelihood
-        return cls(mode.values, mode.whitened, mode.residual, weights, posterior.prior, spectrum, likelihood)
+        return cls(mode.values, mode.whitened, posterior.prior, spectrum, mode.log_likelihood)
 
     # --- the field ---------------------------------------------------------------------------------------------------
 

@@ -56,8 +56,6 @@ class Laplace:
         ln p(y | x̂) − ½|x̂|².
     hessian
         H (c, c), positive definite.
-    outputs
-        ψ (m,) at the mode.
     converged
         Whether the search ended at a stationary point.
     left
@@ -71,7 +69,6 @@ class Laplace:
     mode: FloatArray
     log_posterior: float
     hessian: FloatArray
-    outputs: FloatArray
     converged: bool
     steps: tuple[Step, ...]
     modes: FloatArray
@@ -145,7 +142,6 @@ def laplace(
         here.x[0],
         float(here.log_posterior[0]),
         hessian if exact else here.curvature[0],
-        here.outputs[0],
         left <= np.sqrt(NEAR) or left**2 <= ROUNDED * abs(values[best]),
         tuple(steps),
         np.array([(here if k == best else end).x[0] for k, end in enumerate(ends)]),

@@ -23,8 +23,9 @@ Wright, Numerical Optimization (2006), section 10.2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,22 +80,14 @@ class Density:
     @classmethod
     def joined(cls, parts: Sequence[Density], order: NDArray[np.intp] | None = None) -> Density:
         """Join points, in a new order if one is given; with derivatives if all parts have them."""
-
-        def column(name: str) -> FloatArray:
-            values = np.concatenate([getattr(part, name) for part in parts])
-            return values if order is None else np.asarray(values[order])
-
-        n, differentiated = sum(len(part.x) for part in parts), all(part.tangents is not None for part in parts)
-        return cls(
-            x=column("x"),
-            parameters=column("parameters"),
-            outputs=column("outputs"),
-            log_likelihood=column("log_likelihood"),
-            everything=column("everything"),
-            tangents=column("tangents") if differentiated else None,
-            gradient=column("gradient") if differentiated else np.zeros((n, 0)),
-            curvature=column("curvature") if differentiated else np.zeros((n, 0, 0)),
-        )
+        n, names = sum(len(part.x) for part in parts), [one.name for one in fields(cls)]
+        known: dict[str, Any] = {"tangents": None, "gradient": np.zeros((n, 0)), "curvature": np.zeros((n, 0, 0))}
+        if not all(part.tangents is not None for part in parts):
+            names = [name for name in names if name not in known]
+        for name in names:
+            values = np.concatenate([vars(part)[name] for part in parts])
+            known[name] = values if order is None else values[order]
+        return cls(**known)
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ def invert_field(
     if method.chains is not None:
         # Chains are judged by the mean over the body: mixing at all vertices would need far more draws.
         whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
-        chains = replace(whole, names=("mean",), draws=whole.draws[:, :, :1])
+        chains = replace(whole, draws=whole.draws[:, :, :1])
     drawn = None if whole is None else whole.flat[:, 1:]
     verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains, drawn)
     error = np.nan

@@ -48,10 +48,8 @@ def test_linear_models(run):
     gaussian = laplace(posterior)
     lengths = Lengths(32, 150, 100, 8) if run is ensemble else replace(FEW, draws=500)
     found = run(posterior, gaussian, seed=2, lengths=lengths)
-    assert found.names == ("a", "b", "c")
     assert (found.rhat < 1.06).all()
     agrees(found, gaussian.mode, np.sqrt(np.diag(gaussian.covariance)))
-    assert found.log_density.shape == found.draws.shape[:2]
     again = run(posterior, gaussian, seed=2, lengths=lengths)
     np.testing.assert_array_equal(found.draws, again.draws)
     assert not np.array_equal(found.draws, run(posterior, gaussian, seed=3, lengths=lengths).draws)
@@ -85,13 +83,12 @@ def test_diagnostics_are_those_of_arviz():
     arviz = pytest.importorskip("arviz")
     posterior = few()
     found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=100, burn=50))
-    draws = {name: found.draws[:, :, k] for k, name in enumerate(found.names)}
+    draws = {name: found.draws[:, :, k] for k, name in enumerate(posterior.names)}
     table = arviz.summary(arviz.from_dict(posterior=draws), round_to="none")
     assert list(table.index) == ["a", "b", "c"]
     np.testing.assert_allclose(table["r_hat"], found.rhat)
     np.testing.assert_allclose(table["ess_bulk"], found.ess_bulk)
     np.testing.assert_allclose(table["ess_tail"], found.ess_tail)
-    assert found.log_density.shape == (4, 100)
 
 
 def test_where_there_is_no_answer():

@@ -210,8 +210,9 @@ def test_the_mode_is_found_and_explains_the_data():
     assert mode.solves <= 20
     assert mode.products <= 400
     found = LowRankPosterior.at(mode.point, cutoff=1.0)
-    square = found.residual @ found.residual + found.whitened @ found.whitened
-    assert chi2(len(found.residual)).sf(square) > 0.01
+    residual = mode.point.residual
+    square = residual @ residual + found.whitened @ found.whitened
+    assert chi2(len(residual)).sf(square) > 0.01
     assert (np.abs(found.mean - true) < 2 * found.std).mean() >= 0.9
     again = mode.point.product(found.spectrum.vectors[:3])
     expected = found.spectrum.values[:3, None] * found.spectrum.vectors[:3]

@@ -10,9 +10,9 @@ from inverse.fields.newton_cg import find_mode
 from tests.problems import DATA, Linear, N, curved, solved
 
 
-def square_of(found):
+def square_of(point):
     """χ² = |r|² + |ξ̂|² of the mode, of as many degrees of freedom as there are data."""
-    return found.residual @ found.residual + found.whitened @ found.whitened
+    return point.residual @ point.residual + point.whitened @ point.whitened
 
 
 @pytest.mark.unit
@@ -36,7 +36,7 @@ def test_everything_is_exact_with_all_pairs(holes):
     gap = (problem.data - problem.G @ problem.m_0)[problem.seen]
     evidence = stats.multivariate_normal(np.zeros(len(gap)), problem.scatter).logpdf(gap)
     assert found.log_evidence == pytest.approx(evidence, rel=1e-9)
-    assert square_of(found) == pytest.approx(gap @ np.linalg.solve(problem.scatter, gap), rel=1e-8)
+    assert square_of(mode.point) == pytest.approx(gap @ np.linalg.solve(problem.scatter, gap), rel=1e-8)
     prior, shift = problem.prior_covariance, found.mean - problem.m_0
     divergence = np.trace(np.linalg.solve(prior, problem.covariance)) - N + shift @ np.linalg.solve(prior, shift)
     assert found.information == pytest.approx((divergence - expected) / 2, rel=1e-8)
@@ -45,9 +45,11 @@ def test_everything_is_exact_with_all_pairs(holes):
 @pytest.mark.unit
 def test_predictions_and_resolution_are_those_of_the_exact_posterior():
     problem = Linear(holes=7)
-    _, found = solved(problem, cutoff=1e-12)
+    mode, found = solved(problem, cutoff=1e-12)
     spread = np.sqrt(np.diag(problem.G @ problem.covariance @ problem.G.T))
-    np.testing.assert_allclose(np.sqrt(found.spectrum.resolution[7:]) / found.weights[7:], spread[7:], rtol=1e-7)
+    np.testing.assert_allclose(
+        np.sqrt(found.spectrum.resolution[7:]) / mode.point.posterior.weights[7:], spread[7:], rtol=1e-7
+    )
     K = problem.G[7:]
     influence = K @ problem.covariance @ K.T / problem.sigma[7:] ** 2  # of each datum on its prediction
     np.testing.assert_allclose(found.spectrum.resolution[7:], np.diag(influence), rtol=1e-7)
@@ -113,10 +115,11 @@ def test_calibration():
         truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
         data = problem.G @ truth + problem.sigma * rng.standard_normal(DATA)
         posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
-        found = LowRankPosterior.at(find_mode(posterior).point, cutoff=1e-3)
+        point = find_mode(posterior).point
+        found = LowRankPosterior.at(point, cutoff=1e-3)
         inside.append((np.abs(truth - found.mean) <= stats.norm.ppf(0.9) * found.std).mean())
-        probabilities.append(stats.chi2(DATA).sf(square_of(found)))
-        assert np.abs(found.residual / np.sqrt(1 - found.spectrum.resolution)).max() < 6
+        probabilities.append(stats.chi2(DATA).sf(square_of(point)))
+        assert np.abs(point.residual / np.sqrt(1 - found.spectrum.resolution)).max() < 6
     assert np.mean(inside) == pytest.approx(0.8, abs=3 * np.std(inside) / np.sqrt(60))
     assert stats.kstest(probabilities, "uniform").pvalue > 0.01
 
