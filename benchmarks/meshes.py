@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,7 @@ from forward.fem.finer import extrapolated
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
-from inverse.criticism.doubts import mesh_corrected, mesh_too_coarse
+from inverse.criticism.doubts import of_mesh
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL
@@ -365,16 +365,5 @@ def measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -
 
 def trusted(found: xr.Dataset) -> bool:
     """Whether a study would say that the posterior can be trusted, as far as its weights and the mesh are concerned."""
-    error, shift, left = (found[name].to_numpy() for name in ("mesh_error", "mesh_shift", "mesh_left"))
-    nodes = found["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in found else np.zeros(0)
-    shifts, lefts = (dict(enumerate_as_names(values)) for values in (shift, left))
-    if found["mesh_corrected"]:
-        doubts = mesh_corrected(error, shifts, lefts, nodes, settled=bool(found["mesh_settled"]))
-    else:
-        doubts = mesh_too_coarse(bool(found["mesh_checked"]), str(found["mesh_why"].item()), error, shifts, nodes)
+    doubts = of_mesh(found, found["mesh_error"].to_numpy(), settled=bool(found["mesh_settled"]))
     return int(found["trust"]) < NEITHER and all(doubt.severity == "note" for doubt in doubts)
-
-
-def enumerate_as_names(values: FloatArray) -> Iterator[tuple[str, float]]:
-    """Give values (d,) names."""
-    return ((str(k), value) for k, value in enumerate(values.tolist()))
