@@ -147,6 +147,16 @@ class Measurements:
         where = at[:, None] if places is None else places
         return cls.of(values, sigma, cases, np.zeros_like(cases), parts=parts.tolist(), places=where, at=at)
 
+    @classmethod
+    def possible(
+        cls, labels: Sequence[str], places: FloatArray, tests: Sequence[str], names: Sequence[str]
+    ) -> Measurements:
+        """Return what could be measured (m,), by its label: components, or outputs at NaN, in parts by name."""
+        parts, cases = np.unique(np.array(tests, dtype=np.str_), return_inverse=True)
+        axes, nothing = [(*AXES, name).index(name) for name in names], np.full(len(labels), np.nan)
+        points = np.where(np.isfinite(places).all(axis=1), np.arange(len(labels)), -1)
+        return cls.of(nothing, nothing, cases, axes, names, labels, parts.tolist(), places, points)
+
     def __len__(self) -> int:
         """Return their number."""
         return len(self.values)

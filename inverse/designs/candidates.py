@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Literal
@@ -11,47 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.data.measurements import Measurements
 
 IntArray = NDArray[np.int64]
 Each = Literal["value", "point", "place", "case", "output", "step"]
 NEAR = 12  # decimals of coordinates (m) of points that are the same
 
 
-@dataclass(frozen=True, eq=False)
-class Values:
-    """What a model gives, m values.
+def kinds(values: Measurements) -> list[tuple[str, str]]:
+    """Return what errors may be relative to (m,): displacements in a load case, or an output."""
+    where = zip(values.tests.tolist(), values.names.tolist(), values.points >= 0, strict=True)
+    return [(case, "") if at else (case if case and not case.isdigit() else "", part) for case, part, at in where]
 
-    Attributes
-    ----------
-    names
-        Of the values.
-    places
-        Where (m, 3) each is measured in the undeformed body (m); NaN of those at no point.
-    case
-        Name of the load case, or the number of the step, of each; empty without.
-    part
-        Component of the displacement, or name of the output.
-    """
 
-    names: tuple[str, ...]
-    places: FloatArray
-    case: tuple[str, ...]
-    part: tuple[str, ...]
-
-    @property
-    def displaced(self) -> NDArray[np.bool_]:
-        """Which are displacements of points (m,)."""
-        return np.asarray(np.isfinite(self.places).all(axis=1))
-
-    @property
-    def kinds(self) -> list[tuple[str, str]]:
-        """What errors may be relative to: displacements in a load case, or an output."""
-        where = zip(self.case, self.part, self.displaced, strict=True)
-        return [(case, "") if at else (case if case and not case.isdigit() else "", part) for case, part, at in where]
-
-    def matching(self, pattern: str) -> NDArray[np.bool_]:
-        """Return which names (m,) match a pattern."""
-        return np.array([fnmatchcase(name, pattern) for name in self.names], dtype=bool)
+def matching(names: Iterable[str], pattern: str) -> NDArray[np.bool_]:
+    """Return which names (m,) match a pattern."""
+    return np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +52,12 @@ class Candidates:
     parts: tuple[str, ...]
 
     @classmethod
-    def of(cls, values: Values, each: Each, goals: NDArray[np.bool_]) -> Candidates:
+    def of(cls, values: Measurements, each: Each, goals: NDArray[np.bool_]) -> Candidates:
         """Gather values, but for goals (m,), into observations. The same value at one point counts once."""
-        which, seen = np.full(len(values.names), -1), set()
+        which, seen, of_kind = np.full(len(values), -1), set(), kinds(values)
+        texts = (values.labels.tolist(), values.tests.tolist(), values.names.tolist())
         keys: dict[tuple[object, ...], list[int]] = {}
-        for k, (name, case, part, at) in enumerate(
-            zip(values.names, values.case, values.part, values.displaced, strict=True)
-        ):
+        for k, (name, case, part, at) in enumerate(zip(*texts, values.points >= 0, strict=True)):
             place = tuple((np.round(values.places[k], NEAR) + 0.0).tolist()) if at else ()
             same = (case, place, part) if at else (name,)
             if goals[k] or same in seen:
@@ -97,7 +71,7 @@ class Candidates:
                 case "place":
                     key = (place,) if at else (name,)
                 case "output":
-                    key = ("", part) if at else (values.kinds[k][0], part)
+                    key = ("", part) if at else (of_kind[k][0], part)
                 case _:
                     key = (case,)
             keys.setdefault(key, []).append(k)
@@ -108,8 +82,8 @@ class Candidates:
             tuple(_name(values, rows, each) for rows in every),
             which,
             np.array([_one([values.places[k] for k in rows]) for rows in every]).reshape(-1, 3),
-            tuple(_common([values.case[k] for k in rows]) for rows in every),
-            tuple(_parts([values.part[k] for k in rows]) for rows in every),
+            tuple(_common([texts[1][k] for k in rows]) for rows in every),
+            tuple(_parts([texts[2][k] for k in rows]) for rows in every),
         )
 
     def numbers(self, given: Mapping[str, float]) -> FloatArray:
@@ -122,29 +96,30 @@ class Candidates:
         """
         found = np.ones(len(self.names))
         for pattern, value in given.items():
-            mine = np.array([fnmatchcase(name, pattern) for name in self.names], dtype=bool)
+            mine = matching(self.names, pattern)
             if not mine.any():
                 raise ValueError(f"'{pattern}' is the name of no candidate, such as {', '.join(self.names[:3])}")
             found[mine] = value
         return found
 
 
-def _name(values: Values, rows: Sequence[int], each: Each) -> str:
-    first = values.names[rows[0]]
+def _name(values: Measurements, rows: Sequence[int], each: Each) -> str:
+    k = rows[0]
+    first, case, displaced = str(values.labels[k]), values.parts[values.cases[k]], values.points[k] >= 0
     match each:
         case "value":
             return first
         case "point":
-            return first.rpartition(".")[0] if values.displaced[rows[0]] else first
+            return first.rpartition(".")[0] if displaced else first
         case "place":
-            middle = first.partition(".")[2] if values.case[rows[0]] else first
-            return middle.rpartition(".")[0] if values.displaced[rows[0]] else first
+            middle = first.partition(".")[2] if case else first
+            return middle.rpartition(".")[0] if displaced else first
         case "output":
-            return "displacements" if values.displaced[rows[0]] else values.part[rows[0]]
+            return "displacements" if displaced else str(values.names[k])
         case "step":
-            return f"step {values.case[rows[0]]}" if values.case[rows[0]] else first
+            return f"step {case}" if case else first
         case _:
-            return values.case[rows[0]] or first
+            return case or first
 
 
 def _one(places: Sequence[FloatArray]) -> FloatArray:

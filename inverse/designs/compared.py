@@ -9,7 +9,8 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.model import FloatArray
-from inverse.designs.candidates import Candidates, Values
+from inverse.data.measurements import Measurements
+from inverse.designs.candidates import Candidates
 from inverse.designs.criteria import IntArray
 from inverse.designs.greedy import Choice
 from uq.findings import add
@@ -72,7 +73,7 @@ def compared(
 
 def with_values(
     found: xr.Dataset,
-    values: Values,
+    values: Measurements,
     sigma: FloatArray,
     candidates: Candidates,
     mesh: FloatArray | None = None,
@@ -97,9 +98,9 @@ def with_values(
         value_candidate=("value", which),
         value_sigma=("value", sigma),
         value_place=(("value", "axis"), values.places),
-        value_case=("value", list(values.case)),
-        value_part=("value", list(values.part)),
-    ).assign_coords(value=list(values.names))
+        value_case=("value", values.tests),
+        value_part=("value", values.names),
+    ).assign_coords(value=values.labels)
     if mesh is None or not np.isfinite(mesh).any():
         return found
     found = found.assign(value_mesh_error=("value", mesh))

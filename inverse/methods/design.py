@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 from forward.findings import Finding
 from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
-from inverse.designs.candidates import Candidates, Each, Values
+from inverse.data.measurements import Measurements
+from inverse.designs.candidates import Candidates, Each, kinds, matching
 from inverse.designs.compared import compared, with_values
 from inverse.designs.criteria import (
     Criterion,
@@ -115,7 +116,9 @@ class Design(Settings):
         limits += [f"a budget of {self.budget:g}"] if self.budget is not None else []
         return f"{', '.join(limits)}; one is a {self.each}"
 
-    def run(self, inputs: Inputs, evaluate: Evaluate, values: Values, of_mesh: Evaluate | None = None) -> xr.Dataset:
+    def run(
+        self, inputs: Inputs, evaluate: Evaluate, values: Measurements, of_mesh: Evaluate | None = None
+    ) -> xr.Dataset:
         """Linearise the model at draws, and choose.
 
         Parameters
@@ -171,7 +174,7 @@ class Design(Settings):
         """Count errors of the mesh (m,) as noise too, if that is asked for."""
         return sigma if mesh is None or self.mesh_error != "noise" else np.hypot(sigma, np.nan_to_num(mesh))
 
-    def of_fields(self, draws: Sequence[xr.Dataset], values: Values) -> xr.Dataset:
+    def of_fields(self, draws: Sequence[xr.Dataset], values: Measurements) -> xr.Dataset:
         """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
 
         Raises
@@ -210,7 +213,7 @@ class Design(Settings):
         """Points (draws, d) of the unit cube."""
         return np.full((1, d), 0.5) if self.draws == 1 else sobol_points(self.seed, 0, 0, self.draws, d)
 
-    def candidates(self, values: Values) -> tuple[Candidates, NDArray[np.bool_], FloatArray]:
+    def candidates(self, values: Measurements) -> tuple[Candidates, NDArray[np.bool_], FloatArray]:
         """Return the candidates, which values (m,) are goals, and what candidates cost (c,).
 
         Raises
@@ -224,12 +227,12 @@ class Design(Settings):
         found = Candidates.of(values, self.each, goals)
         return found, goals, found.numbers(self.costs)
 
-    def mistakes(self, values: Values) -> Iterator[tuple[str, str, object]]:
+    def mistakes(self, values: Measurements) -> Iterator[tuple[str, str, object]]:
         """Find what asks for more than values (m,) have, or for names that fit none: the key, why, what is given."""
         for key, patterns in (("goals", self.goals), ("noises", tuple(self.noises))):
             for pattern in patterns:
-                if not values.matching(pattern).any():
-                    known = ", ".join(values.names[:3])
+                if not matching(values.labels, pattern).any():
+                    known = ", ".join(values.labels[:3])
                     yield key, f"'{pattern}' is the name of no value of the model, such as {known}", pattern
         found = Candidates.of(values, self.each, self._goals(values))
         most = len(found.names)
@@ -245,11 +248,12 @@ class Design(Settings):
         if self.budget is not None and most and costs.min() > self.budget:
             yield "budget", f"expected at least the cost of the cheapest candidate, {costs.min():g}", self.budget
 
-    def _goals(self, values: Values) -> NDArray[np.bool_]:
+    def _goals(self, values: Measurements) -> NDArray[np.bool_]:
         """Which values (m,) are predicted."""
-        return np.asarray(np.any([np.zeros(len(values.names), dtype=bool), *map(values.matching, self.goals)], axis=0))
+        some = [matching(values.labels, pattern) for pattern in self.goals]
+        return np.asarray(np.any([np.zeros(len(values), dtype=bool), *some], axis=0))
 
-    def sigma(self, values: Values, outputs: FloatArray) -> FloatArray:
+    def sigma(self, values: Measurements, outputs: FloatArray) -> FloatArray:
         """Return standard deviations (m,) of errors, given outputs (draws, m).
 
         Raises
@@ -257,16 +261,18 @@ class Design(Settings):
         ModelError
             If errors are relative to values that are all zero.
         """
-        noises = [self.noise] * len(values.names)
+        noises = [self.noise] * len(values)
         for pattern, noise in self.noises.items():
-            noises = [noise if mine else one for mine, one in zip(values.matching(pattern), noises, strict=True)]
-        kinds = np.unique([str(kind) for kind in values.kinds], return_inverse=True)[1].ravel()
+            noises = [
+                noise if mine else one for mine, one in zip(matching(values.labels, pattern), noises, strict=True)
+            ]
+        which = np.unique([str(kind) for kind in kinds(values)], return_inverse=True)[1].ravel()
         squares = (outputs**2).mean(axis=0)
-        sizes = np.sqrt((np.bincount(kinds, squares) / np.bincount(kinds))[kinds])
+        sizes = np.sqrt((np.bincount(which, squares) / np.bincount(which))[which])
         pairs = zip(noises, sizes, strict=True)
         found = np.array([size * one.relative if one.relative is not None else one.absolute for one, size in pairs])
         if not (found > 0).all():
-            name = values.names[int(np.argmin(found))]
+            name = values.labels[int(np.argmin(found))]
             raise ModelError(f"errors relative to {name}, which is zero at all draws, expected absolute ones")
         return found
 
@@ -275,7 +281,7 @@ class Design(Settings):
         inputs: Mapping[str, Inputs],
         weights: Mapping[str, float],
         models: Mapping[str, Evaluate],
-        values: Values,
+        values: Measurements,
     ) -> xr.Dataset:
         """Choose the observations that tell models apart.
 

@@ -12,7 +12,7 @@ from forward.bodies.geometry import AXES
 from forward.model import FloatArray, ModelError, SolveError
 from forward.scalars import Mistake
 from forward.specimen import Observed
-from inverse.designs.candidates import Values
+from inverse.data.measurements import Measurements
 from inverse.designs.fields import of_field
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
@@ -45,7 +45,7 @@ def mistakes(method: Design, spec: ModelSpec) -> Iterator[Mistake]:
     values = known(spec) if spec.placed else of_outputs(spec)
     if values is None:
         return
-    if not values.names:
+    if not len(values):
         message = "nothing is observed, expected boundaries or points, or outputs of load cases"
         yield ("model", "observed"), message, ()
         return
@@ -53,15 +53,15 @@ def mistakes(method: Design, spec: ModelSpec) -> Iterator[Mistake]:
         yield ("method", key), message, given
 
 
-def of_outputs(spec: ModelSpec) -> Values:
+def of_outputs(spec: ModelSpec) -> Measurements:
     """Say what each output of a model is that is no specimen."""
     axes, names = dict(spec.axes_of_outputs), tuple(output.name for output in spec.returned)
     steps = [str(step) for step in axes["step"][1]] if "step" in axes else [""] * len(names)
     parts = [str(part) for part in axes["output_of"][1]] if "output_of" in axes else list(names)
-    return Values(names, np.full((len(names), 3), np.nan), tuple(steps), tuple(parts))
+    return Measurements.possible(names, np.full((len(names), 3), np.nan), steps, parts)
 
 
-def known(spec: Any) -> Values | None:
+def known(spec: Any) -> Measurements | None:
     """Say what the values of a specimen are; None where nodes of a mesh from a file are observed."""
     names, places, cases, parts = list[str](), list[FloatArray](), list[str](), list[str]()
     for case in spec.cases:
@@ -76,7 +76,7 @@ def known(spec: Any) -> Values | None:
         places += [np.full(3, np.nan) for _ in case.outputs]
         parts += [output.name for output in case.outputs]
         cases += [case.name] * (len(names) - len(cases))
-    return Values(tuple(names), np.array(places).reshape(-1, 3), tuple(cases), tuple(parts))
+    return Measurements.possible(names, np.array(places).reshape(-1, 3), cases, parts)
 
 
 def _points(spec: Any, item: Observed) -> FloatArray | None:
@@ -145,7 +145,7 @@ def job_of_models(
 
 
 def _of_field(
-    method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
+    method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Measurements
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
     prior = spec.fields[0].prior(spec.body)
@@ -197,7 +197,7 @@ def uncalibrated(solution: Solution) -> FloatArray | None:
     return None if error is None else error.outputs
 
 
-def values_of(spec: Any, model: Any) -> Values:
+def values_of(spec: Any, model: Any) -> Measurements:
     """Say of each output of a model what it is and where it is measured."""
     if not spec.placed:
         return of_outputs(spec)
@@ -206,4 +206,4 @@ def values_of(spec: Any, model: Any) -> Values:
         AXES[axis] if axis < len(AXES) else case.outputs[axis - len(AXES)].name
         for axis, case in zip(model.axes, cases, strict=True)
     ]
-    return Values(model.outputs, model.places, tuple(case.name for case in cases), tuple(parts))
+    return Measurements.possible(model.outputs, model.places, [case.name for case in cases], parts)

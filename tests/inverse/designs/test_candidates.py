@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from inverse.designs.candidates import Candidates, Values
+from inverse.data.measurements import Measurements
+from inverse.designs.candidates import Candidates, kinds, matching
 
 P, Q = [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]
-VALUES = Values(
+VALUES = Measurements.possible(
     ("pull.top.0.x", "pull.top.0.z", "pull.side.0.x", "pull.side.1.x", "pull.force", "push.top.0.x", "push.force"),
     np.array([P, P, P, Q, [np.nan] * 3, P, [np.nan] * 3]),
     ("pull",) * 5 + ("push",) * 2,
@@ -42,17 +43,19 @@ def test_values_are_gathered(each, names, which):
 
 @pytest.mark.unit
 def test_steps_and_outputs_of_a_path():
-    values = Values(("F.1", "u.1", "F.2", "u.2"), np.full((4, 3), np.nan), ("1", "1", "2", "2"), ("F", "u", "F", "u"))
+    values = Measurements.possible(
+        ("F.1", "u.1", "F.2", "u.2"), np.full((4, 3), np.nan), ("1", "1", "2", "2"), ("F", "u", "F", "u")
+    )
     steps = Candidates.of(values, "step", NONE[:4])
     assert (steps.names, steps.which.tolist()) == (("step 1", "step 2"), [0, 0, 1, 1])
     outputs = Candidates.of(values, "output", NONE[:4])
     assert (outputs.names, outputs.which.tolist()) == (("F", "u"), [0, 1, 0, 1])
-    assert values.kinds == [("", "F"), ("", "u"), ("", "F"), ("", "u")]
+    assert kinds(values) == [("", "F"), ("", "u"), ("", "F"), ("", "u")]
 
 
 @pytest.mark.unit
 def test_goals_are_no_candidates():
-    goals = VALUES.matching("*.force")
+    goals = matching(VALUES.labels, "*.force")
     found = Candidates.of(VALUES, "value", goals)
     assert goals.tolist() == [False] * 4 + [True, False, True]
     assert (found.which[goals] == -1).all()
