@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, TypeAdapter
+from pydantic_core import CoreSchema
 
+from forward.registry import OfKind
 from forward.settings import Settings
 from uq.evaluation.request import BLOCKS
 
@@ -108,6 +110,17 @@ def _as_decided(block: Any) -> Any:
 
 
 AS_DECIDED = BeforeValidator(_as_decided)
+
+
+@dataclass(frozen=True)
+class PartOrKind:
+    """Annotation of a field for the JSON Schema: a block of one of these kinds, or a part of one."""
+
+    whole: OfKind
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        """Any of the kinds; nothing is known of a part."""
+        return {"anyOf": [self.whole.__get_pydantic_json_schema__(core, handler), {"type": "object"}]}
 
 
 def located(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -162,7 +162,7 @@ def _document(path: Path) -> dict[str, Any]:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, with which editors complete and check it."""
-    forms = [form for kind in STUDIES.names if kind != AVERAGED for form in STUDIES[kind].forms()]
+    forms = [STUDIES[kind] for kind in STUDIES.names if kind != AVERAGED]
     any_form: Any = Union[*forms]
     found = TypeAdapter(any_form).json_schema(ref_template=_REFERENCE)
     for form in forms:  # a file may name a table instead of containing the data

@@ -136,15 +136,15 @@ class OfCandidates(Settings):
         Models by name.
     """
 
-    model: dict[str, Any] | None = None
-    candidates: Mapping[str, Any]
+    model: Any = None
+    candidates: Any
 
     @property
     def changes(self) -> Mapping[str, dict[str, Any]]:
         """The block of the model of each candidate; none of materials."""
         if self.model is None:
             return {}
-        return {name: changed(self.model, one.model) for name, one in self.candidates.items()}
+        return {name: changed(self.model, one.model) for name, one in (self.candidates or {}).items()}
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:

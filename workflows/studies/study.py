@@ -86,11 +86,6 @@ class StudyKind(Settings):
         """
         return cls.model_validate(blocks)
 
-    @classmethod
-    def forms(cls) -> Iterator[type[StudyKind]]:
-        """Go through the classes that files of this kind are read as."""
-        yield cls
-
     @model_validator(mode="after")
     def _check(self) -> Self:
         refused(type(self).__name__, list(self.mistakes()))
