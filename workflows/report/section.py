@@ -83,12 +83,10 @@ class Results:
 
     @cached_property
     def _of_outputs(self) -> dict[str, xr.Dataset]:
-        return {}
+        return {output: self.dataset.sel(output=output) for output in self.outputs}
 
     def of(self, output: str) -> xr.Dataset:
         """What is known of an output: all variables, those without outputs too."""
-        if output not in self._of_outputs:
-            self._of_outputs[output] = self.dataset.sel(output=output)
         return self._of_outputs[output]
 
     @cached_property

@@ -52,7 +52,9 @@ class MeasuredPoints:
 
 
 def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
-    """Return the points of each load case of one data set that was inverted, ``dataset.sel(data_set=name)``."""
+    """Return the points of each load case that has some, of one data set that was inverted."""
+    if not has_points(one):
+        return []
     seen = displacements(one)
     axes = one["datum_axis"].to_numpy()[seen].astype(int)
     along = one["datum_direction"].to_numpy()[seen] if "datum_direction" in one else np.eye(3)[axes]
@@ -62,6 +64,8 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
     found = []
     for number, case in enumerate(one.case.values):
         rows = np.flatnonzero(numbers["datum_case"] == number)
+        if not len(rows):
+            continue
         points, first, which = np.unique(places[rows], axis=0, return_index=True, return_inverse=True)
         which = which.ravel()
         sums: dict[str, FloatArray] = {name: np.zeros((len(points), 3)) for name in ("measured", "predicted")}
@@ -88,7 +92,7 @@ def has_points(one: xr.Dataset) -> bool:
 
 def points_grid(one: xr.Dataset) -> Grid:
     """Return the points of all load cases: a vertex for each point and load case."""
-    parts = [part for part in measured_points(one) if len(part.places)]
+    parts = measured_points(one)
     places = np.concatenate([part.places for part in parts])
     columns = zip(*((one.measured, one.predicted, one.residuals, one.over, one.moved) for one in parts), strict=True)
     data = dict(zip(COLUMNS, map(np.concatenate, columns), strict=True))

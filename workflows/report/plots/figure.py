@@ -215,15 +215,12 @@ def rows(ax: Axes, names: Sequence[str]) -> NDArray[np.int64]:
     return places
 
 
-def stacked(
-    ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], colours: Sequence[str], **look: Any
-) -> FloatArray:
-    """Draw a bar for each name from parts (n,) that follow each other, and return where (n,) the bars end."""
+def stacked(ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], colours: Sequence[str]) -> None:
+    """Draw a bar for each name from parts (n,) that follow each other."""
     places, left = rows(ax, names), np.zeros(len(names))
     for (label, widths), colour in zip(parts.items(), colours, strict=True):
-        ax.barh(places, widths, left=left, color=colour, label=label, **{"height": 0.6} | look)
+        ax.barh(places, widths, left=left, color=colour, label=label, height=0.6)
         left = left + widths
-    return left
 
 
 def quantity(dataset: xr.Dataset, output: str) -> str:

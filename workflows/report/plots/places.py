@@ -82,7 +82,7 @@ PANEL, INSIDE = (3.5, 2.7), (0.15, 0.25, 0.4, 0.25)  # inches
 
 def residuals(one: xr.Dataset) -> Axes:
     """Draw the residuals of each load case: as arrows, and over their errors as a map."""
-    parts = [part for part in measured_points(one) if len(part.places)]
+    parts = measured_points(one)
     found = grid(2 * len(parts), 2, PANEL, INSIDE)
     most = max(3.0, *(float(part.over.max()) for part in parts))
     ends = _ends(one)
@@ -115,7 +115,7 @@ def agreement(one: xr.Dataset) -> Axes:
 
 def distances(one: xr.Dataset) -> Axes:
     """Draw how far points were from the body before they were moved onto it."""
-    parts = [part for part in measured_points(one) if len(part.places)]
+    parts = measured_points(one)
     found = grid(len(parts), 1, PANEL, INSIDE)
     most, ends = max(float(part.moved.max()) for part in parts), _ends(one)
     size, unit = scale(most, "m")

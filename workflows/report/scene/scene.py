@@ -18,7 +18,7 @@ from uq.estimators.estimate import estimate_of, holds
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
-from workflows.results.points import has_points, measured_points
+from workflows.results.points import measured_points
 from workflows.results.surfaces import IntArray, level, surface, tetrahedra, tools_of
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
         np.zeros_like(points),
         [*_stiffness(one), *_by_case(one, points, cells, kind)],
         [*_regions(one, points, cells, kind), *insides],
-        dict(_arrows(one)),
+        {case.case: (case.places, case.residuals, case.over) for case in measured_points(one)},
         cut="" if inclusions or "stiffness_mean" not in one else "v",
     )
 
@@ -245,8 +245,6 @@ def _by_case(one: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) ->
         for case in cases:
             alone = one["alone_stiffness_std"].sel(case=case).to_numpy()
             yield Quantity(f"± of ln stiffness by {case} alone", alone, colours="plasma", low=0.0, high=widest)
-    if "place" not in one or not has_points(one):
-        return
     outer = np.unique(skin(points, cells, kind).nodes)
     for of_case in measured_points(one):
         if of_case.case in cases and len(of_case.places) >= FEWEST:
@@ -346,14 +344,6 @@ def _joined(name: str, parts: Sequence[Inside], kind: str, opacity: float) -> In
         points.append(part.points)
         first += len(part.points)
     return Inside(name, np.concatenate(triangles), np.concatenate(points), kind, opacity, shown=False)
-
-
-def _arrows(one: xr.Dataset) -> Iterator[tuple[str, tuple[FloatArray, FloatArray, FloatArray]]]:
-    if "place" not in one or not has_points(one):
-        return
-    for case in measured_points(one):
-        if len(case.places):
-            yield case.case, (case.places, case.residuals, case.over)
 
 
 def ends(quantity: Quantity) -> tuple[float, float]:
