@@ -11,11 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.curves import Steps, as_rows
 from inverse.data.measurements import Measurements
@@ -86,7 +84,8 @@ def read_outputs(
         raise DataError(*wrong)
     sigma = np.array(numbers.get("sigma", [math.nan] * len(names)))
     values, axes = np.array(numbers["value"]), [outputs.index(one) for one in names]
-    return _outputs(values, sigma, axes, labels, outputs, source=table.source, truth=truth)
+    rows = (values, sigma, axes, axes, names, labels, outputs)
+    return Measurements.of(*rows, some=True, source=table.source, truth=truth)
 
 
 def stated(given: Mapping[str, float | Sequence[float]], outputs: Sequence[str]) -> Measurements:
@@ -98,17 +97,6 @@ def stated(given: Mapping[str, float | Sequence[float]], outputs: Sequence[str])
         )
     pairs = [(name, float(value)) for name, several in given.items() for value in np.atleast_1d(several)]
     labels = [f"data.outputs.{name}" for name, _ in pairs]
+    names, axes = [name for name, _ in pairs], [outputs.index(name) for name, _ in pairs]
     values = np.array([value for _, value in pairs])
-    return _outputs(values, np.full(len(pairs), math.nan), [outputs.index(name) for name, _ in pairs], labels, outputs)
-
-
-def _outputs(
-    values: FloatArray,
-    sigma: FloatArray,
-    axes: Sequence[int],
-    labels: Sequence[str],
-    outputs: Sequence[str],
-    **more: Any,
-) -> Measurements:
-    names = [outputs[axis] for axis in axes]
-    return Measurements.of(values, sigma, axes, axes, names, labels, outputs, some=True, **more)
+    return Measurements.of(values, np.full(len(pairs), math.nan), axes, axes, names, labels, outputs, some=True)

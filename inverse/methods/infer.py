@@ -103,8 +103,7 @@ def infer(
     if posterior.start is None:
         with suppress(SolveError):  # or else every solve begins at zero
             posterior = replace(posterior, start=start(posterior.inputs.mean))
-    asked = look is not None and look.treatment is not None
-    before = before_few(posterior, look.finer, say) if look is not None and asked else None
+    before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = laplace(posterior, starts=starts, seed=seed)
     if shared is not None:  # which depends on the displacements
         posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))

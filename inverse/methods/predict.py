@@ -14,6 +14,7 @@ moves the mean, half the difference, squared, has the expected value Var L where
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -228,11 +229,8 @@ def deviations(prior: Prior, size: int, pairs: int, seed: int, found: LowRankPos
 
 def before_field(model: ForwardModel, prior: Prior, size: int, pairs: int, seed: int) -> Band:
     """Return what the prior N(0, LLᵀ) of a field says on the outputs of a model."""
-
-    def covariance(g: FloatArray) -> FloatArray:
-        return prior.root(prior.root_transposed(g))
-
-    return _of_field(model, np.zeros(size), covariance, deviations(prior, size, pairs, seed))[0]
+    drawn = deviations(prior, size, pairs, seed)
+    return _of_field(model, np.zeros(size), lambda g: prior.root(prior.root_transposed(g)), drawn)[0]
 
 
 def after_field(
@@ -274,11 +272,9 @@ def after_field(
 
 def _of_mesh(solution: Solution, nothing: FloatArray) -> FloatArray:
     """Estimate what the mesh takes away from the outputs (k,)."""
-    try:
+    with suppress(SolveError):
         error = solution.mesh_error()
         calibrated = None if error is None else solution.saturation(SPARE)
-    except SolveError:
-        return nothing
-    if error is None:
-        return nothing
-    return error.outputs if calibrated is None else error.calibrated(calibrated).outputs
+        if error is not None:
+            return error.outputs if calibrated is None else error.calibrated(calibrated).outputs
+    return nothing
