@@ -1,8 +1,15 @@
 """Start programs as a user's shell would, under mpirun too."""
 
+import atexit
+import io
+import itertools
+import json
 import os
 import subprocess
 import sys
+import tempfile
+import time
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -10,6 +17,7 @@ import xarray as xr
 
 from forward.native import library
 from tests import COMPILED
+from workflows.__main__ import main
 
 ROOT = Path(__file__).parent.parent
 TISSUQ = Path(sys.executable).parent / "tissuq"
@@ -70,9 +78,67 @@ def run(ranks, *command, path=None, timeout=HANGS):
     )
 
 
+def in_process(*arguments):
+    """Run the command in this process, which has imported all: a program of its own takes longer to import it."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = main(list(map(str, arguments)))
+        except SystemExit as end:
+            code = end.code
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
 def run_script(ranks, script, *arguments, timeout=HANGS):
     """Run a Python script."""
     return run(ranks, sys.executable, "-c", script, *arguments, timeout=timeout)
+
+
+_COMMAND = "import sys; from workflows.__main__ import main; sys.exit(main(sys.argv[1:]))"
+
+
+class _TwoRanks:
+    """Two ranks that run one script after another: to start them takes longer than what most tests do on them."""
+
+    def __init__(self):
+        self.job = None
+
+    def start(self):
+        self.folder = tempfile.TemporaryDirectory()
+        self.numbers = itertools.count()
+        words = on_ranks(2, sys.executable, "-m", "tests.kept_ranks", self.folder.name, os.getpid())
+        nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        self.job = subprocess.Popen(words, env=environment(), cwd=ROOT, **nothing)
+        atexit.register(self.job.terminate)
+
+    def run(self, script, *arguments):
+        if self.job is None or self.job.poll() is not None:
+            self.start()
+        place, number, begun = Path(self.folder.name), next(self.numbers), time.monotonic()
+        (place / "asked").write_text(json.dumps([script, "-c", *map(str, arguments)]))
+        (place / "asked").rename(place / f"{number}.json")
+        answers = [place / f"{number}.rank{rank}" for rank in range(2)]
+        while not all(map(Path.exists, answers)) and self.job.poll() is None and time.monotonic() - begun < HANGS:
+            time.sleep(0.005)
+        found = [json.loads(one.read_text()) if one.exists() else (-1, "", "without an end") for one in answers]
+        codes, out, err = zip(*found, strict=True)
+        if -1 in codes:
+            self.job.kill()
+            self.job.wait()
+        return subprocess.CompletedProcess(arguments, next(filter(None, codes), 0), "".join(out), "".join(err))
+
+
+_two_ranks = _TwoRanks()
+
+
+def on_kept_ranks(ranks, script, *arguments):
+    """Run a script that ends well, and leaves modules as they are; on two ranks, on those that are kept for others."""
+    return _two_ranks.run(script, *arguments) if ranks == 2 else run_script(ranks, script, *arguments)
+
+
+def tissuq_on_two_ranks(*arguments):
+    """Run the command on the two ranks that are kept."""
+    return _two_ranks.run(_COMMAND, *arguments)
 
 
 def report_of_own(folder, study):

@@ -74,8 +74,7 @@ def test_a_body_of_installed_kinds_on_two_ranks(site, folder):
     assert not re.search(r'kind = "\w+\.', study.read_text())
     jsonschema.validate(tomllib.loads(study.read_text()), json.loads(done(site, None, "schema")))
     assert f"my_tissue ({site / 'my_tissue.py'})" in done(site, None, "check", study)
-    done(site, 2, "run", study, "--out", out, "--no-report")
-    done(site, None, "report", out)
+    done(site, 2, "run", study, "--out", out)
     data = xr.load_dataset(out / "results.nc")
     area = 0.02 * 0.02
     swept, stretch = (data["largest"].sel(output=name).item() for name in ("swept", "stretch"))

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from forward.hyperelastic import Hyperelastic, Path
 from forward.model import Guess, ReferenceSolution, SolveError, Stability
 from tests.bodies import loaded_body
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 STEPS = {"loads.traction.size": (4e2, 1e3, 1.5e3), "displacements.y-max.y": (0.01, 0.03, 0.05)}
 RANDOM = ("material.C1", "material.D1", "loads.gravity.density")
@@ -182,5 +182,5 @@ for one, other in zip(solve(comm), solve(MPI.COMM_SELF)):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_two_ranks_share_a_path():
-    done = run_script(2, SCRIPT)
+    done = on_kept_ranks(2, SCRIPT)
     assert done.returncode == 0, done.stderr

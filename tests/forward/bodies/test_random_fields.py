@@ -11,7 +11,7 @@ from forward.bodies.random_fields import ROBIN, Matern, RandomField, correlation
 from forward.conformance import check_derivatives
 from forward.model import Stability
 from tests.bodies import loaded_body
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
@@ -277,7 +277,7 @@ def alone():
     ("ranks", "share"), [(2, 2), pytest.param(4, 2, marks=pytest.mark.slow), pytest.param(4, 4, marks=pytest.mark.slow)]
 )
 def test_ranks_that_share_a_model_agree_with_one(alone, ranks, share, tmp_path):
-    done = run_script(ranks, SCRIPT, tmp_path / "found.npz", share)
+    done = on_kept_ranks(ranks, SCRIPT, tmp_path / "found.npz", share)
     assert done.returncode == 0, done.stdout + done.stderr
     found = dict(np.load(tmp_path / "found.npz"))
     for name, values in alone.items():

@@ -13,7 +13,7 @@ from forward.fem.adapt import BULK, Cycle, adapt, largest, recovery, saturation
 from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
-from tests.launch import UP_TO_RANKS, run_script
+from tests.launch import UP_TO_RANKS, on_kept_ranks
 from tests.meshes import box, corner
 
 pytestmark = pytest.mark.fem
@@ -140,7 +140,7 @@ for comm in groups():
         if comm.rank == 0:
             print(len(found.cycles), found.cycles[-1].unknowns, hashlib.sha256(packed(found.mesh)).hexdigest())
 """
-    done = run_script(ranks, script)
+    done = on_kept_ranks(ranks, script)
     assert done.returncode == 0, done.stderr
     said = done.stdout.splitlines()
     assert len(said) == 2 * ranks

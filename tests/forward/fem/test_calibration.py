@@ -13,7 +13,7 @@ from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, 
 from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import OUTPUTS, loaded_body
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 from tests.meshes import CUBE
 
 PLAIN = tuple(output for output in OUTPUTS if output["kind"] in {"displacement", "max-displacement", "strain-energy"})
@@ -242,7 +242,7 @@ for comm in groups(1, 2):
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_ranks_agree(tmp_path):
-    done = run_script(2, SCRIPT, tmp_path)
+    done = on_kept_ranks(2, SCRIPT, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for form in ("displacement", "mixed"):
         one, other = (np.load(tmp_path / f"{form} {ranks}.npy") for ranks in (1, 2))

@@ -10,7 +10,7 @@ from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Path
 from forward.model import SolveError
 from tests.forward.terms.test_indenter import SIDE, body, only, tool
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 FRICTION = 0.3
 ACCURATE = 1e-10
@@ -121,7 +121,7 @@ for one, other in zip(solve(MPI.COMM_WORLD), solve(MPI.COMM_SELF)):
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_two_ranks_share_a_body_with_friction():
-    done = run_script(2, SCRIPT)
+    done = on_kept_ranks(2, SCRIPT)
     assert done.returncode == 0, done.stderr
 
 

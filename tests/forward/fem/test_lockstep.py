@@ -10,7 +10,7 @@ from forward.model import Guess, InadmissibleError, SolveError
 from tests.bodies import loaded_body
 from tests.forward.bodies import test_mesh_file
 from tests.forward.fem.test_mixed import BULK, SHEAR, TRACTION, cantilever
-from tests.launch import ROOT, UP_TO_RANKS, run_script
+from tests.launch import ROOT, UP_TO_RANKS, on_kept_ranks
 from tests.meshes import box
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
@@ -189,7 +189,7 @@ for comm in groups():
 @pytest.mark.mpi
 @UP_TO_RANKS
 def test_ranks_that_share_a_model_correct_together_too(ranks):
-    done = run_script(ranks, SCRIPT)
+    done = on_kept_ranks(ranks, SCRIPT)
     assert done.returncode == 0, done.stderr
     one, *others = (np.array(line.split(), dtype=float) for line in done.stdout.splitlines())
     assert len(others) == ranks - 1

@@ -15,7 +15,7 @@ from forward.model import Guess, ReferenceSolution
 from forward.pointwise import FunctionModel
 from forward.specimen import Specimen
 from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
-from tests.launch import ROOT, UP_TO_RANKS, run_script
+from tests.launch import ROOT, UP_TO_RANKS, on_kept_ranks
 from tests.meshes import box
 from workflows.config.study import load as loaded
 
@@ -381,7 +381,7 @@ SHAPES = ("neo-hookean mixed", "mooney-rivlin", "demiray")
 @pytest.mark.mpi
 @UP_TO_RANKS
 def test_ranks_agree(tmp_path, ranks):
-    done = run_script(ranks, SCRIPT, tmp_path)
+    done = on_kept_ranks(ranks, SCRIPT, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     found = [[dict(np.load(tmp_path / f"{form} {n}.npz")) for form in SHAPES] for n in range(1, ranks + 1)]
     for other in found[1:]:

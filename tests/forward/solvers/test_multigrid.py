@@ -10,7 +10,7 @@ from forward.solvers import multigrid
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.multigrid import Levels
 from forward.solvers.steps import finish
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 pytestmark = pytest.mark.fem
 NAMES = ("material.D1", "loads.traction.size")
@@ -244,5 +244,5 @@ for load in (55.0, 70.0):
 
 @pytest.mark.mpi
 def test_ranks_that_share_a_body_agree_with_one():
-    done = run_script(2, SHARED, timeout=900)  # busy machines are slow
+    done = on_kept_ranks(2, SHARED)
     assert done.returncode == 0, done.stderr

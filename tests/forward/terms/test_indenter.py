@@ -14,7 +14,7 @@ from forward.model import Guess, ReferenceSolution, SolveError
 from forward.terms import tools
 from forward.terms.indenter import Indenter
 from tests.bodies import energy_density
-from tests.launch import UP_TO_RANKS, run_script
+from tests.launch import UP_TO_RANKS, on_kept_ranks
 
 SIDE = 20e-3
 C1, D1 = 1e3, 2e3
@@ -479,5 +479,5 @@ for comm in groups():
 @pytest.mark.mpi
 @UP_TO_RANKS
 def test_ranks_share_a_body_between_two_tools(ranks):
-    done = run_script(ranks, SHARED)
+    done = on_kept_ranks(ranks, SHARED)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -19,7 +19,7 @@ from inverse.criticism.field_samples import bent
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import CLOSE, find_mode
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 POINTS = 9  # along each edge of the cube
 SMALL = {"size": (1.0, 0.7, 0.8), "cells": (2, 2, 2), "degree": 1}
@@ -147,7 +147,7 @@ if MPI.COMM_WORLD.rank == 0:
 
 @pytest.mark.mpi
 def test_ranks_do_not_matter(tmp_path):
-    run = run_script(2, SCRIPT, tmp_path / "found.npz")
+    run = on_kept_ranks(2, SCRIPT, tmp_path / "found.npz")
     assert run.returncode == 0, run.stderr
     model, point = built()
     solution = model.solve(point)

@@ -197,7 +197,7 @@ def test_the_file_counts_by_what_it_holds(folder, tmp_path):
 def test_the_same_bytes_on_two_groups_of_ranks(folder):
     assert ran(folder, "one", *BY_REDUCED) in {0, 3}
     words = ["--out", folder / "two", "--no-report", *BY_REDUCED]
-    made = launch.run(2, launch.TISSUQ, "run", folder / "study.toml", *words)
+    made = launch.tissuq_on_two_ranks("run", folder / "study.toml", *words)
     assert made.returncode in {0, 3}, made.stderr
     assert (folder / "one" / "results.nc").read_bytes() == (folder / "two" / "results.nc").read_bytes()
 

@@ -14,7 +14,7 @@ from inverse.criticism.finer import NOT_LOOKED
 from inverse.data.approximation_error import uncertain
 from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.data.measured import motion_of
@@ -218,7 +218,7 @@ if MPI.COMM_WORLD.rank == 0:
 
 @pytest.mark.mpi
 def test_ranks_that_share_a_specimen_find_the_same_forces(tmp_path):
-    run = run_script(2, RANKS, tmp_path / "found.npz")
+    run = on_kept_ranks(2, RANKS, tmp_path / "found.npz")
     assert run.returncode == 0, run.stderr
     solution = specimen().build(MPI.COMM_SELF, NUMBERS).solve(np.array([1e4, 0.1, 0.1]))
     expected = solution.outputs, solution.tangent(np.eye(3)), solution.adjoint(np.eye(len(solution.outputs)))

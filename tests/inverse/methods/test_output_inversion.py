@@ -11,7 +11,7 @@ from mpi4py import MPI
 from inverse.criticism.doubts import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
-from tests.launch import TISSUQ, run, run_script
+from tests.launch import TISSUQ, in_process, run, tissuq_on_two_ranks
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
@@ -194,13 +194,10 @@ def test_files_of_one_name_in_different_folders_are_different_data(folder):
 def test_groups_of_ranks_give_the_same_bytes(folder, alone, batch):
     for there, changes in ((alone, ()), (batch, ("--set", FILES))):
         out = folder / f"{there.name}-shared"
-        done = run_script(2, SCRIPT, "run", folder / "stated.toml", "--out", out, "--quiet", "--no-report", *changes)
+        done = tissuq_on_two_ranks("run", folder / "stated.toml", "--out", out, "--quiet", "--no-report", *changes)
         assert done.returncode in (0, 3), done.stderr
         left, right = (results(place) for place in (there, out))
         xr.testing.assert_identical(left.drop_attrs(), right.drop_attrs())
-
-
-SCRIPT = "import sys\nfrom workflows.__main__ import main\nsys.exit(main(sys.argv[1:]))"
 
 
 BAR = """
@@ -342,7 +339,7 @@ def test_chains_by_gradients_on_several_ranks(tmp_path):
     study.write_text(STUDY.replace("MODULE", "chained").replace("samples = 32", 'samples = 32\nchains = "hmc"'))
     module.write_text(LINES)
     alone, killed = tmp_path / "alone", tmp_path / "killed"
-    assert run(None, TISSUQ, "run", study, "--out", alone, "--no-report").returncode == 0
+    assert in_process("run", study, "--out", alone, "--no-report").returncode == 0
     when = f"len(calls) == 500 and not os.path.exists({str(killed / 'on')!r})"
     ends = f"    calls.append(p)\n    if {when}:\n        os._exit(9)\n"
     module.write_text("import os\n\ncalls = []\n" + LINES.replace("    return A @ p\n", f"{ends}    return A @ p\n"))

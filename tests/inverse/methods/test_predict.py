@@ -14,7 +14,7 @@ from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.predict import after_field, before_field
-from tests.launch import TISSUQ, assert_same_bits, environment, run, run_script
+from tests.launch import TISSUQ, assert_same_bits, environment, in_process, run, run_script, tissuq_on_two_ranks
 from uq.findings import keep_unknown
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
@@ -379,7 +379,7 @@ def test_predictions_of_a_field_do_not_depend_on_groups_nor_kills(specimens, tmp
     assert run_script(None, KILLED, *words, tmp_path / "cut").returncode == 9
     assert list((tmp_path / "cut" / "evaluations").iterdir())
     assert main([*map(str, words), str(tmp_path / "whole")]) in (0, 3)
-    done = run(2, TISSUQ, *words, tmp_path / "cut")
+    done = tissuq_on_two_ranks(*words, tmp_path / "cut")
     assert done.returncode in (0, 3), done.stderr
     assert_same_bits(tmp_path / "whole", tmp_path / "cut")
 
@@ -390,7 +390,7 @@ def test_predictions_of_a_field_do_not_depend_on_groups_nor_kills(specimens, tmp
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_predictions_of_a_field_by_ranks_that_share_a_model(specimens, tmp_path, ranks):
     words = asked(specimens / "field.toml", "predict.samples=2", "model.body.cells=[1, 1, 3]")
-    assert run(None, TISSUQ, *words, tmp_path / "alone").returncode in (0, 3)
+    assert in_process(*words, tmp_path / "alone").returncode in (0, 3)
     more = ["--set", f"parallel.ranks_per_model={ranks}"]
     done = run(ranks, TISSUQ, *words, tmp_path / "shared", *more, timeout=900)
     assert done.returncode in (0, 3), done.stderr

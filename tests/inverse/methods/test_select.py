@@ -22,7 +22,7 @@ from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
 from inverse.methods.record import Problem
 from inverse.methods.selection import Noise, Select, posterior
-from tests.launch import TISSUQ, run, run_script
+from tests.launch import in_process, run_script, tissuq_on_two_ranks
 from tests.problems import bananas
 from tests.rubber import CONFIGS, FACTOR, treloar
 from uq.evaluation.evaluate import SerialEvaluate
@@ -418,7 +418,7 @@ def test_priors_with_inadmissible_tails_are_no_failures(small):
     told = "note *mooney-rivlin: 23 % of the prior is of materials that are not stable at rest"
     assert re.search(told, "\n".join(plan(load(small))))
     out = small.parent / "out"
-    done = run(None, TISSUQ, "run", small, "--out", out, "--no-report")
+    done = in_process("run", small, "--out", out, "--no-report")
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "complete"
@@ -438,7 +438,7 @@ def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
     )
     small.write_text(text)
     out = small.parent / "out"
-    code = run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode
+    code = in_process("run", small, "--out", out, "--no-report").returncode
     summary = json.loads((out / "summary.json").read_text())
     assert summary["failed"] == 0 < summary["zero_likelihood"]
     assert summary["status"] == "complete"
@@ -456,7 +456,7 @@ def test_arviz_reads_results_as_they_are(small):
     rows = "".join(f"uniaxial,{x},{2 * 0.5 * (x - x**-2):.3f}\n" for x in (1.3, 1.5, 1.7, 1.9))
     (small.parent / "table.csv").write_text(TABLE + rows)
     out = small.parent / "out"
-    assert run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode == 0
+    assert in_process("run", small, "--out", out, "--no-report").returncode == 0
     found = xr.load_dataset(out / "results.nc", engine="h5netcdf")
     data = arviz.from_netcdf(out / "results.nc")
     assert {"posterior", "prior", "log_likelihood", "observed_data"} <= set(data.groups())
@@ -517,7 +517,7 @@ def test_other_studies_do_not_import_inversion():
 
 def test_a_study_from_the_command_line(small, looked_at, capsys):
     """One rank or two: the same bytes; a report; nothing to do the second time."""
-    done = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
+    done = in_process("run", small, "--out", small.parent / "one")
     assert done.returncode == 0, done.stderr
     assert re.search("^neo-hookean: .* %; ln Z ", done.stdout, re.MULTILINE)
     summary = json.loads((small.parent / "one" / "summary.json").read_text())
@@ -525,7 +525,7 @@ def test_a_study_from_the_command_line(small, looked_at, capsys):
     for found in summary["models"].values():
         assert set(found) == {"log_evidence", "log_evidence_error", "probability", "stacking", "trusted"}
     assert sum(found["probability"] for found in summary["models"].values()) == pytest.approx(1)
-    done = run(2, TISSUQ, "run", small, "--out", small.parent / "two", "--no-report")
+    done = tissuq_on_two_ranks("run", small, "--out", small.parent / "two", "--no-report")
     assert done.returncode == 0, done.stderr
     assert (small.parent / "one/results.nc").read_bytes() == (small.parent / "two/results.nc").read_bytes()
     page = (small.parent / "one" / "report.html").read_text()

@@ -11,7 +11,7 @@ from scipy import stats
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
@@ -432,10 +432,12 @@ def test_blocks_change_no_bit_and_keep_states_only(beam, tmp_path, monkeypatch):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_ranks_change_no_bit(tmp_path):
+    """Of expansions, and of the samples of Saltelli's design."""
     script = """
 import sys
 from pathlib import Path
 from uq.methods.chaos import Chaos
+from uq.methods.sobol import Sobol
 from tests.ranks import groups
 from uq.evaluation.ensemble import Ensemble
 from workflows.config.study import load
@@ -445,10 +447,12 @@ study = load(Path("configs/tiny.toml"))
 for comm in groups(1, 2):
     ensemble = Ensemble.split(comm)
     model = study.model.build(ensemble.group, study.inputs.names)
-    data = ensemble.run(model, lambda evaluate: Chaos(samples=5).run(study.inputs, evaluate))
-    if data is not None:
-        write_dataset(Path(sys.argv[1]) / f"{comm.size}.nc", data)
+    for method in (Chaos(samples=5), Sobol(design="saltelli", samples=16, scrambles=4)):
+        data = ensemble.run(model, lambda evaluate: method.run(study.inputs, evaluate))
+        if data is not None:
+            write_dataset(Path(sys.argv[1]) / f"{method.kind} {comm.size}.nc", data)
 """
-    done = run_script(2, script, tmp_path)
+    done = on_kept_ranks(2, script, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "1.nc").read_bytes() == (tmp_path / "2.nc").read_bytes()
+    for kind in ("chaos", "sobol"):
+        assert (tmp_path / f"{kind} 1.nc").read_bytes() == (tmp_path / f"{kind} 2.nc").read_bytes()

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run
+from tests.launch import ROOT, assert_same_bits, in_process, tissuq_on_two_ranks
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
@@ -408,7 +408,7 @@ def small(tmp_path_factory):
         f"[method]\nkind = 'multifidelity'\nsamples = 40\ncontrol = 'tangent'\nfull_solves = 'differences'\n{cheap_}"
     )
     (place / "small.toml").write_text(text[: text.index("[method]")] + method)
-    done = run(None, TISSUQ, "run", place / "small.toml", "--out", place / "out")
+    done = in_process("run", place / "small.toml", "--out", place / "out")
     assert done.returncode == 0, done.stderr
     return place
 
@@ -416,7 +416,7 @@ def small(tmp_path_factory):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_same_bits_on_any_number_of_groups(small, tmp_path):
-    done = run(2, TISSUQ, "run", small / "small.toml", "--out", tmp_path / "out", "--no-report")
+    done = tissuq_on_two_ranks("run", small / "small.toml", "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr
     assert_same_bits(small / "out", tmp_path / "out")
 

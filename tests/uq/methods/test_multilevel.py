@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from tests.launch import ROOT, assert_same_bits, in_process, run_script, tissuq_on_two_ranks
 from uq.estimators.moments import combine, estimate, monomials, term
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluations, Request
@@ -459,7 +459,7 @@ def small(tmp_path_factory):
     place = tmp_path_factory.mktemp("multilevel")
     text = (ROOT / "configs" / "tiny.toml").read_text()
     (place / "small.toml").write_text(text[: text.index("[method]")] + METHOD)
-    done = run(None, TISSUQ, "run", place / "small.toml", *SMALL, "--out", place / "out")
+    done = in_process("run", place / "small.toml", *SMALL, "--out", place / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads((place / "out" / "summary.json").read_text())["outputs"]["uy_max"]
     (line,) = (line for line in done.stdout.splitlines() if f" {found['mesh_error']:+.2g} " in line)
@@ -471,7 +471,7 @@ def small(tmp_path_factory):
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_same_bits_on_any_number_of_groups(small, tmp_path):
-    done = run(2, TISSUQ, "run", small / "small.toml", *SMALL, "--out", tmp_path / "out", "--no-report")
+    done = tissuq_on_two_ranks("run", small / "small.toml", *SMALL, "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr
     assert_same_bits(small / "out", tmp_path / "out")
 

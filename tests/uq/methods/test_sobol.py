@@ -9,7 +9,6 @@ import xarray as xr
 
 from forward.model import Solution, SolveError
 from forward.pointwise import FunctionModel, OneByOne
-from tests.launch import run_script
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
@@ -502,32 +501,6 @@ def test_a_field_that_an_expansion_does_not_explain_has_no_indices(moved):
     assert "displacement field explains nothing" in data.attrs["findings"]
     assert (data["dominating"] == -1).all()
     assert np.isnan(data["node_sobol_total"]).all()
-
-
-@pytest.mark.fem
-@pytest.mark.mpi
-def test_ranks_change_no_bit(tmp_path):
-    script = """
-import sys
-from pathlib import Path
-from tests.ranks import groups
-from uq.evaluation.ensemble import Ensemble
-from uq.methods.sobol import Sobol
-from workflows.config.study import load
-from workflows.results.directory import write_dataset
-
-study = load(Path("configs/tiny.toml"))
-for comm in groups(1, 2):
-    ensemble = Ensemble.split(comm)
-    model = study.model.build(ensemble.group, study.inputs.names)
-    method = Sobol(design="saltelli", samples=16, scrambles=4)
-    data = ensemble.run(model, lambda evaluate: method.run(study.inputs, evaluate))
-    if data is not None:
-        write_dataset(Path(sys.argv[1]) / f"{comm.size}.nc", data)
-"""
-    done = run_script(2, script, tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "1.nc").read_bytes() == (tmp_path / "2.nc").read_bytes()
 
 
 def test_rows_that_are_added_in_rounds_are_those_asked_for_at_once():

@@ -13,7 +13,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.launch import ROOT, TISSUQ, assert_same_bits, environment, on_ranks, run, run_script
+from tests.launch import (
+    ROOT,
+    TISSUQ,
+    assert_same_bits,
+    environment,
+    in_process,
+    on_ranks,
+    run,
+    run_script,
+    tissuq_on_two_ranks,
+)
 
 TINY = ROOT / "configs" / "tiny.toml"
 
@@ -71,7 +81,7 @@ def test_uq_does_not_import_fenicsx():
 def test_check_lists_every_mistake(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(TINY.read_text().replace("samples", "sampels").replace('"x-min"', '"x-mid"'))
-    done = tissuq("check", path)
+    done = in_process("check", path)
     assert done.returncode == 2
     lines = done.stderr.splitlines()
     assert len(lines) == 2
@@ -81,8 +91,8 @@ def test_check_lists_every_mistake(tmp_path):
 
 def test_usage_errors_exit_with_2():
     assert tissuq("fly").returncode == 2
-    assert tissuq("run").returncode == 2
-    done = tissuq("init", "mcmc")
+    assert in_process("run").returncode == 2
+    done = in_process("init", "mcmc")
     assert done.returncode == 2
     assert "expected one of: chaos, compare" in done.stderr
 
@@ -93,19 +103,19 @@ def test_the_version_is_that_of_the_distribution():
 
 
 def test_init_lists_all_kinds():
-    done = tissuq("init", "list")
+    done = in_process("init", "list")
     assert done.returncode == 0
     assert {"monte-carlo", "sobol", "select", "invert"} <= set(done.stdout.split())
 
 
 def test_init_prints_a_study(tmp_path):
     path = tmp_path / "new.toml"
-    path.write_text(tissuq("init", "monte-carlo").stdout)
-    assert tissuq("check", path).returncode == 0
+    path.write_text(in_process("init", "monte-carlo").stdout)
+    assert in_process("check", path).returncode == 0
 
 
 def test_report_needs_results(tmp_path):
-    done = tissuq("report", tmp_path)
+    done = in_process("report", tmp_path)
     assert done.returncode == 1
     assert "holds no results" in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -132,7 +142,7 @@ def test_the_directory_holds_what_is_promised(finished):
 @pytest.mark.fem
 def test_a_finished_study_is_not_run_again(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
-    done = tissuq("run", TINY, "--out", finished)
+    done = in_process("run", TINY, "--out", finished)
     assert done.returncode == 0
     assert "nothing to do" in done.stdout
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
@@ -141,7 +151,7 @@ def test_a_finished_study_is_not_run_again(finished):
 @pytest.mark.fem
 def test_another_study_is_refused(finished):
     before = (finished / "study.toml").read_bytes()
-    done = tissuq("run", TINY, "--out", finished, "--set", "method.samples=25")
+    done = in_process("run", TINY, "--out", finished, "--set", "method.samples=25")
     assert done.returncode == 2
     assert "method.samples: 24 → 25" in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -161,18 +171,8 @@ def test_same_bits_on_any_number_of_groups(finished, tmp_path):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_a_model_on_two_ranks_agrees(finished, tmp_path):
-    done = tissuq(
-        "run",
-        TINY,
-        "--out",
-        tmp_path / "out",
-        "--no-report",
-        "--set",
-        "parallel.ranks_per_model=2",
-        "--set",
-        "parallel.blocks=5",
-        ranks=2,
-    )
+    shared = ("--set", "parallel.ranks_per_model=2", "--set", "parallel.blocks=5")
+    done = tissuq_on_two_ranks("run", TINY, "--out", tmp_path / "out", "--no-report", *shared)
     assert done.returncode == 0, done.stderr
     one, two = (xr.load_dataset(d / "results.nc") for d in (finished, tmp_path / "out"))
     for name in ("values", "mean", "std", "derivative", "field_mean", "field_std"):
@@ -186,7 +186,7 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     # Kills while errors of the mesh are estimated are in tests/workflows/studies/test_mesh_error.py.
     arguments = ("run", TINY, "--set", "method.samples=480", "--set", "mesh_error=false", "--no-report", "--out")
     whole = tmp_path / "whole"
-    assert tissuq(*arguments, whole).returncode == 0
+    assert in_process(*arguments, whole).returncode == 0
     broken = tmp_path / "broken"
     chance = random.Random(1)
     kills = 0
@@ -221,11 +221,11 @@ def test_more_ranks_than_work(tmp_path):
     """The others are idle, and the results the same."""
     settings = ("--set", "parallel.blocks=1", "--set", "mesh_error=false")
     arguments = ("run", TINY, "--no-report", *settings, "--out")
-    done = tissuq(*arguments, tmp_path / "out", ranks=2)
+    done = tissuq_on_two_ranks(*arguments, tmp_path / "out")
     assert done.returncode == 0, done.stderr
     (said,) = [line for line in done.stderr.splitlines() if line.startswith("note:")]
     assert said.startswith("note: 2 groups of ranks were started for 1 task: 1 of them will be idle")
-    alone = tissuq(*arguments, tmp_path / "alone")
+    alone = in_process(*arguments, tmp_path / "alone")
     assert "note:" not in alone.stderr
     assert_same_bits(tmp_path / "alone", tmp_path / "out")
 
@@ -238,7 +238,7 @@ def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
         "model.solver.iterations=10",
         "method.fields=false",
     )
-    done = tissuq("run", TINY, "--out", tmp_path / "out", *(word for c in changes for word in ("--set", c)))
+    done = in_process("run", TINY, "--out", tmp_path / "out", *(word for c in changes for word in ("--set", c)))
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["status"] == "partial"
@@ -265,7 +265,7 @@ def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_m
 @pytest.mark.fem
 def test_a_model_without_answer_exits_with_1_and_one_line(tmp_path):
     heavy = ["--set", "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"]
-    done = tissuq("run", TINY, "--out", tmp_path / "out", *heavy)
+    done = in_process("run", TINY, "--out", tmp_path / "out", *heavy)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("failed: the model has no answer at the mean parameters: stopped at")
     assert "Traceback" not in done.stderr
@@ -278,7 +278,7 @@ def test_directories_that_cannot_be_used(tmp_path):
     foreign.mkdir()
     (foreign / "thesis.tex").write_text("precious")
     for directory, message in ((file / "out", "Not a directory"), (foreign, "is not empty and holds no study")):
-        done = tissuq("run", TINY, "--out", directory)
+        done = in_process("run", TINY, "--out", directory)
         assert done.returncode == 2
         assert message in done.stderr
         assert len(done.stderr.splitlines()) == 1
@@ -289,7 +289,7 @@ def test_point_outside_the_body(tmp_path):
     path = tmp_path / "study.toml"
     outside = '{ name = "p", kind = "displacement", at = [1, 0, 0], component = "x" },\n]\n\n[parameters]'
     path.write_text(TINY.read_text().replace("]\n\n[parameters]", outside))
-    done = tissuq("run", path, "--out", tmp_path / "out")
+    done = in_process("run", path, "--out", tmp_path / "out")
     assert done.returncode == 2, done.stderr
     assert "model.outputs[2].at" in done.stderr
     shutil.rmtree(tmp_path / "out", ignore_errors=True)

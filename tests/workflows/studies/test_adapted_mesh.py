@@ -11,7 +11,7 @@ import pyvista
 import xarray as xr
 
 from forward.bodies.mesh_file import MeshFile
-from tests.launch import TISSUQ, assert_same_bits, run
+from tests.launch import TISSUQ, assert_same_bits, in_process, run
 from tests.meshes import corner
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
@@ -50,7 +50,7 @@ def study(tmp_path_factory):
 
 
 def tissuq(*arguments, ranks=None):
-    done = run(ranks, TISSUQ, *arguments)
+    done = in_process(*arguments) if ranks is None else run(ranks, TISSUQ, *arguments)
     assert done.returncode == 0, done.stderr
     return done
 

@@ -9,7 +9,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.model import WORK
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run
+from tests.launch import ROOT, TISSUQ, assert_same_bits, in_process, run
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.surrogates.linearisation import linearise
 from workflows.__main__ import main
@@ -123,7 +123,7 @@ def test_the_shipped_map_of_stiffness_from_forces(tmp_path):
     changes = ("model.body.cells=[3, 3, 1]", "model.body.degree=1", "method.mesh_error=false")
     words = [word for change in changes for word in ("--set", change)]
     study = ROOT / "configs" / "palpation-field.toml"
-    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "map", "--quiet", *words, timeout=1200)
+    done = in_process("run", study, "--out", tmp_path / "map", "--quiet", *words)
     assert done.returncode in {0, 3}, done.stderr
     found = xr.load_dataset(tmp_path / "map" / "results.nc").isel(data_set=0)
     prior = found["stiffness_prior_std"].to_numpy()

@@ -9,7 +9,7 @@ import pytest
 
 from forward.readable import SIZES, margin
 from forward.words import places
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from tests.launch import ROOT, TISSUQ, assert_same_bits, in_process, run, run_script
 from uq.findings import findings
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
@@ -169,7 +169,7 @@ main(sys.argv[1:])
 @pytest.mark.fem
 def test_the_summary_and_the_terminal_say_it(tmp_path):
     study = ["run", TINY, "--set", "model.body.cells=[2, 1, 1]", "--set", "method.samples=8", "--out", tmp_path / "out"]
-    done = run(None, TISSUQ, *study)
+    done = in_process(*study)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["evaluations"] == 9
@@ -217,9 +217,7 @@ def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path):
         "{name='mises', kind='max-von-mises'}]"
     )
     small = ["model.body.cells=[2,1,1]", "method={kind='chaos', samples=8, max_order=2}", f"model.outputs={outputs}"]
-    done = run(
-        None, TISSUQ, "run", TINY, *(word for one in small for word in ("--set", one)), "--out", tmp_path / "out"
-    )
+    done = in_process("run", TINY, *(word for one in small for word in ("--set", one)), "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert re.search(r"^uz \(\S+\): zero but for rounding$", done.stdout, re.MULTILINE)
     said = json.loads((tmp_path / "out" / "summary.json").read_text())["findings"]
@@ -291,7 +289,7 @@ FAR_TOO_COARSE = (*SMALL, "model.body.cell='tetrahedron'", "model.body.degree=1"
 def of_run(directory, *settings):
     """The exit code of a run, what it prints at its end, and its summary."""
     sets = [word for one in settings for word in ("--set", one)]
-    done = run(None, TISSUQ, "run", TINY, *sets, "--out", directory, "--no-report")
+    done = in_process("run", TINY, *sets, "--out", directory, "--no-report")
     return done.returncode, done.stdout, json.loads((directory / "summary.json").read_text())
 
 

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from forward.hyperelastic import Path
 from inverse.data.curves import steps_of
 from inverse.data.outputs import read_outputs
-from tests.launch import TISSUQ, assert_same_bits, run
+from tests.launch import assert_same_bits, in_process, tissuq_on_two_ranks
 from workflows.__main__ import main
 
 STUDY = """
@@ -42,7 +42,7 @@ def test_curves_are_the_same_on_any_number_of_ranks(tmp_path, looked_at):
     study = tmp_path / "curve.toml"
     study.write_text(STUDY)
     assert main(["run", str(study), "--out", str(tmp_path / "None")]) == 0
-    done = run(2, TISSUQ, "run", study, "--out", tmp_path / "2", "--no-report")
+    done = tissuq_on_two_ranks("run", study, "--out", tmp_path / "2", "--no-report")
     assert done.returncode == 0, done.stderr
     assert_same_bits(tmp_path / "None", tmp_path / "2")
     found = xr.load_dataset(tmp_path / "2" / "results.nc")
@@ -74,7 +74,7 @@ def test_a_measured_curve_is_inverted(tmp_path, looked_at):
     errors = 0.02 * np.abs(exact) * np.array([0.5, -0.7, 0.3])
     rows = [f"{x},{1e3 * y:.6g}" for x, y in zip((100, 200, -300), exact + errors, strict=True)]
     (tmp_path / "curve.csv").write_text("x [mm],force [mN]\n" + "\n".join(rows) + "\n")
-    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "out")
+    done = in_process("run", study, "--out", tmp_path / "out")
     assert done.returncode == 3, done.stderr  # two cells: the error of the mesh exceeds the noise, and is only reported
     found = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
     # The forces are linear in mu at a fixed Poisson's ratio, nearly so at a fixed lmbda: weighted means.
@@ -91,7 +91,7 @@ def test_curves_are_made_and_read_again(tmp_path):
     study = tmp_path / "made.toml"
     made = STUDY.partition("[method]")[0]
     study.write_text(made + '[method]\nkind = "synthesize"\nnoise = { relative = 0.01 }\nfraction = [1, 0.7]\n')
-    assert run(None, TISSUQ, "run", study, "--out", tmp_path / "out", "--no-report").returncode == 0
+    assert in_process("run", study, "--out", tmp_path / "out", "--no-report").returncode == 0
     spec = Path.model_validate(tomllib.loads(made)["model"])
     model = spec.build(MPI.COMM_SELF, ("material.mu",))
     outputs = tuple(output.name for output in spec.returned)
@@ -115,7 +115,7 @@ def test_what_is_measured_of_a_function_is_an_output_in_each_row(tmp_path):
         '[method]\nkind = "synthesize"\nnoise = { absolute = 1e-3 }\n'
     )
     (tmp_path / "line.py").write_text("def both(x):\n    return [x[0], 2 * x[0]]\n")
-    done = run(None, TISSUQ, "run", tmp_path / "made.toml", "--out", tmp_path / "out", "--no-report")
+    done = in_process("run", tmp_path / "made.toml", "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr
     found = read_outputs(tmp_path / "out" / "data" / "made.csv", ("one", "two"))
     np.testing.assert_allclose(found.values, [2, 4], atol=5e-3)
@@ -148,7 +148,7 @@ def test_paths_that_stop_are_said(tmp_path):
         .replace("sensitivity-monte-carlo", "monte-carlo")
     )
     plain = ("--no-report", "--set", "accuracy.mesh_error=false")
-    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "out", *plain)
+    done = in_process("run", study, "--out", tmp_path / "out", *plain)
     assert done.returncode == 3, done.stderr
     found = xr.load_dataset(tmp_path / "out" / "results.nc")
     lost = ~found["ok"].values

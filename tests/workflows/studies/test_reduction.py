@@ -277,7 +277,7 @@ def test_bodies_that_cannot_be_reduced_are_refused_in_one_line(tmp_path):
 @pytest.mark.mpi
 def test_on_ranks_it_is_the_same_model(folder):
     out = folder / "ranks"
-    made = launch.run(2, launch.TISSUQ, "reduce", folder / "body.toml", *SIZES, "--out", out, "--no-report")
+    made = launch.tissuq_on_two_ranks("reduce", folder / "body.toml", *SIZES, "--out", out, "--no-report")
     assert made.returncode == 0, made.stderr
     one, other = load_model(folder / "model.npz"), load_model(out / "reduced.npz")
     assert (folder / "model.npz").read_bytes() == (out / "reduced.npz").read_bytes(), (one.about, other.about)
