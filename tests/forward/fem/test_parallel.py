@@ -52,7 +52,7 @@ def solve(material, comm):
     again = model.solve(values, Guess(model.space.scatter(whole)[0]))
     assert again.work.factorisations == 1  # that which counts eigenvalues
 
-    if comm.size == 2:  # of the other groups they are the same, as is compared
+    if comm.size == 2 and material == "mooney-rivlin":  # of the others they are those of one rank, as is compared
         steps, directions = (1 / 32, 1 / 64, 1 / 128), np.ones((1, len(values)))
         check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, accuracy=1e-12).require()
     cells, _ = model.space.cells()

@@ -26,7 +26,7 @@ from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.record import Problem, as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
-from tests.launch import TISSUQ, run, run_script
+from tests.launch import TISSUQ, run, run_script, tissuq_on_two_ranks
 from tests.problems import curved
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import SerialEvaluate
@@ -260,9 +260,9 @@ draws = 20
 )
 
 
-def here(path, out, *changes):
+def here(path, out, *changes, report=True):
     """Run a study in this process."""
-    return run_study(load(path, changes), path.stem, out, quiet=True)
+    return run_study(load(path, changes), path.stem, out, quiet=True, report=report)
 
 
 THICK = """
@@ -408,9 +408,11 @@ def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
     assert any("of 6 rigid motions that are uncertain, the data determine" in one for one in said)
 
 
-@pytest.fixture(scope="module")
-def one(folder):
-    """The batch, run in this process: how many blocks it kept."""
+FEWER = ("method.samples=32",)
+
+
+def kept_blocks(ran, code):
+    """How many blocks a run in this process keeps that ends with the code; its finer meshes have no thin cells."""
     saved = []
 
     def counted(self, key, block):
@@ -420,8 +422,15 @@ def one(folder):
     save = Checkpoint.save
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Checkpoint, "save", counted)
-        assert here(folder / "few.toml", folder / "one") == 3
+        patched.setattr("forward.bodies.tetrahedra.THINNEST", 1.0)
+        assert ran() == code
     return len(saved)
+
+
+@pytest.fixture(scope="module")
+def one(folder):
+    """The batch, run in this process: how many blocks it kept."""
+    return kept_blocks(lambda: here(folder / "few.toml", folder / "one"), 3)
 
 
 @pytest.mark.usefixtures("one")
@@ -531,35 +540,27 @@ def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, one, monkeyp
     assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
 
 
-def field_by_program(folder, out, blocks=0, ranks=None):
-    """A field whose mesh is too coarse, which is found; killed once so many blocks are kept."""
-    command = ("run", folder / "field.toml", "--out", folder / out, "--set", "method.samples=32", "--quiet")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("BLOCKS", str(blocks))
-        done = run_script(ranks, KILLED, *command)
-    assert done.returncode == (9 if blocks else 3), done.stderr
-    return done
-
-
 @pytest.fixture(scope="module")
 def whole_field(folder):
-    """The run of a field: how many blocks it kept; so quiet, it says nothing but a line of progress a minute."""
-    done = field_by_program(folder, "field-whole")
-    assert all(line.endswith(" left") for line in done.stderr.splitlines())
-    return int(done.stdout.removesuffix(" blocks\n"))
+    """A field whose mesh is too coarse, which is found, run in this process: how many blocks it kept."""
+    return kept_blocks(lambda: here(folder / "field.toml", folder / "field-whole", *FEWER, report=False), 3)
 
 
 IDLE = "{} groups of ranks were started for {} task"
 
 
 @pytest.mark.mpi
-def test_an_interrupted_field_keeps_its_solves(folder, whole_field):
+def test_an_interrupted_field_keeps_its_solves(folder, whole_field, monkeypatch):
     """States, products with the Hessian, finer meshes: nothing is computed twice, and the result is the same.
 
     On two ranks too, of which one has nothing to do.
     """
-    field_by_program(folder, "field-killed", blocks=60)
-    done = field_by_program(folder, "field-killed", ranks=2)
+    command = ("run", folder / "field.toml", "--out", folder / "field-killed", "--set", *FEWER, "--quiet")
+    monkeypatch.setenv("BLOCKS", "60")
+    assert run_script(None, KILLED, *command).returncode == 9
+    monkeypatch.setenv("BLOCKS", "0")
+    done = run_script(2, KILLED, *command)
+    assert done.returncode == 3, done.stderr
     assert IDLE.format(2, 1) in done.stderr
     assert ": 1 of them will be idle" in done.stderr
     rest = sum(map(int, re.findall(r"(\d+) blocks", done.stdout)))
@@ -617,7 +618,7 @@ def test_one_data_set_and_what_others_read_of_it(folder, single, monkeypatch):
 def test_all_groups_share_one_data_set(folder, single):
     """The same bytes as of one rank, the solve on the finer mesh among them."""
     changes = ("--set", "data.files=['data/made-1.csv']", "--set", REPORTED)
-    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "shared", "--quiet", *changes)
+    done = tissuq_on_two_ranks("run", folder / "few.toml", "--out", folder / "shared", "--no-report", *changes)
     assert done.returncode == 3, done.stderr
     assert (single / "results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
 

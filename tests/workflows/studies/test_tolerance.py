@@ -8,7 +8,7 @@ import pytest
 
 from forward.machine import Headroom
 from tests import meshes
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script, tissuq_on_two_ranks
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
@@ -321,7 +321,7 @@ def test_the_same_bits_on_any_number_of_ranks_and_after_kills(tmp_path):
         assert killed.returncode in (-9, 137), killed.stderr
         assert any((tmp_path / "killed" / "evaluations").glob("*.h5"))
     assert "mesh of" in killed.stderr
-    done = run(2, TISSUQ, *study, tmp_path / "killed")
+    done = tissuq_on_two_ranks(*study, tmp_path / "killed")
     assert done.returncode == 0, done.stderr
     assert "tolerance 0.1: kept" in done.stdout
     assert_same_bits(tmp_path / "1", tmp_path / "killed")
@@ -389,7 +389,7 @@ def test_what_is_not_reached_is_said(tmp_path):
 
 @pytest.mark.fem
 def test_what_is_out_of_reach_is_refused_in_a_line_before_the_long_work(tmp_path, capsys):
-    tiny = ("model.body.cell=tetrahedron", "model.body.degree=1", "accuracy={tolerance=1e-6, memory=400}")
+    tiny = ("model.body.cell=tetrahedron", "model.body.degree=1", "accuracy={tolerance=1e-6, memory=100}")
     settings = (word for one in (*COARSE, *tiny) for word in ("--set", one))
     assert main(["run", str(TINY), "--out", str(tmp_path / "out"), "--quiet", *settings]) == 1
     (line,) = capsys.readouterr().err.splitlines()
