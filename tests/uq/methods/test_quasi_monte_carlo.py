@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from benchmarks.coverage import Vectorised, measure
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from tests.functions import higher_moments
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.findings import findings
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
@@ -94,12 +95,21 @@ STEEP = case(
 CASES = {"linear": LINEAR, "quadratic": QUADRATIC, "ishigami": ISHIGAMI, "product": PRODUCT}
 
 
+class AtOnce(SerialEvaluate):
+    """Values at all points by one call of the function, and derivatives as the model gives them."""
+
+    def __call__(self, request):
+        if request.tangents:
+            return super().__call__(request)
+        return Vectorised(SimpleNamespace(function=lambda points: self.model.function(points.T)))(request)
+
+
 def repeats(of, count, **settings):
     """Deviations of mean and variance from the exact ones, and the errors that were claimed, each (count,)."""
     inputs, model, mean, variance = of
     rows = []
     for seed in range(count):
-        data = QuasiMonteCarlo(seed=seed, fields=False, **settings).run(inputs, SerialEvaluate(model))
+        data = QuasiMonteCarlo(seed=seed, fields=False, **settings).run(inputs, AtOnce(model))
         e, s, es = data["mean"].item(), data["std"].item(), data["std_error"].item()
         rows.append((e - mean, data["mean_error"].item(), s**2 - variance, 2 * s * es))
     return np.array(rows).T
@@ -115,8 +125,14 @@ def leaning(deviations):
     return np.sign(deviations).sum() / np.sqrt(len(deviations))
 
 
-@pytest.mark.parametrize("control", CONTROLS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "control"),
+    [  # what the controls are exact for is in a test of its own
+        *(("product", control) for control in CONTROLS),
+        *(("ishigami", control) for control in ("tangent", "quadratic")),
+        pytest.param("ishigami", "chaos", marks=pytest.mark.slow),
+    ],
+)
 def test_mean_and_variance_are_unbiased(name, control):
     mean, _, variance, _ = repeats(CASES[name], 60, samples=32, scrambles=4, control=control)
     assert is_unbiased(mean, CASES[name][2])
@@ -653,7 +669,7 @@ for control in ("quadratic", "chaos"):
 
 @pytest.mark.mpi
 def test_same_numbers_as_in_one_process():
-    done = run_script(2, RANKS)
+    done = on_kept_ranks(2, RANKS)
     assert done.returncode == 0, done.stderr
     assert "same quadratic" in done.stdout
     assert "same chaos" in done.stdout
