@@ -6,8 +6,8 @@ import base64
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,7 @@ def _section(tag: str, arrays: Mapping[str, Array]) -> Iterator[str]:
     for name, given in arrays.items():
         values = np.ascontiguousarray(given, dtype=given.dtype.newbyteorder("<"))
         components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim > 1 else ""
-        begin = f'<DataArray type="{TYPES[values.dtype.str[1:]]}" Name={quoteattr(name)}{components} format="binary">'
+        begin = f'<DataArray type="{TYPES[values.dtype.str[1:]]}" Name="{escape(name)}"{components} format="binary">'
         yield f"{begin}{_packed(values)}</DataArray>"
     yield f"</{tag}>"
 
