@@ -19,6 +19,7 @@ from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, 
 from forward.model import SolveError
 from uq.evaluation.request import Evaluations
 from uq.findings import add
+from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
@@ -38,7 +39,6 @@ from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress
 from workflows.run.summary import summarised
 from workflows.run.version import version
-from workflows.studies.adapted_mesh import FILES as REFINED
 from workflows.studies.job import Job
 from workflows.studies.solves import findings_of_solves
 

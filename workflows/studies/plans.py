@@ -12,9 +12,9 @@ from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Linea
 from forward.machine import MIB, compiled_forms
 from forward.readable import told
 from uq.evaluation.request import OWN, company_of
+from workflows.accuracy import tolerance_words
+from workflows.accuracy.levers import COUNTS
 from workflows.config.priors import ranges
-from workflows.studies import tolerance_words
-from workflows.studies.levers import COUNTS
 from workflows.studies.predictions import (
     NOT_ASKED,
     PRODUCT,

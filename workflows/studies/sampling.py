@@ -68,7 +68,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Memory (bytes) of the largest mesh that it may make, and what sets it; 0 where it makes none."""
         if self.accuracy.tolerance is None or not self.estimates:
             return super().growth
-        from workflows.studies.levers import MeshLever
+        from workflows.accuracy.levers import MeshLever
 
         if not MeshLever.of(self).moves:
             return super().growth
@@ -84,7 +84,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             found = (*found, *self.source.findings(self.spec, self.inputs))
         if self.accuracy.tolerance is None:
             return found
-        from workflows.studies import tolerance_words
+        from workflows.accuracy import tolerance_words
 
         return *found, *tolerance_words.findings(self)
 
@@ -112,12 +112,12 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Refine the mesh, where that is asked for; collective."""
         found = self
         if self.model.unrefined:
-            from workflows.studies.adapted_mesh import on_adapted_mesh
+            from workflows.accuracy.adapted_mesh import on_adapted_mesh
 
             found = on_adapted_mesh(self, ensemble, directory, say)
         if self.accuracy.tolerance is not None and self.estimates:
+            from workflows.accuracy.tolerance import on_fine_mesh
             from workflows.run.own_code import identity
-            from workflows.studies.tolerance import on_fine_mesh
 
             found = on_fine_mesh(found, ensemble, directory, say, identity)
         return found
@@ -127,7 +127,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """The study, with a mesh that was refined where its results are."""
         if not self.model.adaptive:
             return self
-        from workflows.studies.adapted_mesh import kept
+        from workflows.accuracy.adapted_mesh import kept
 
         return kept(self)
 
@@ -139,7 +139,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add how the stability of each sample was tested."""
-        from workflows.studies.adapted_mesh import with_history
+        from workflows.accuracy.adapted_mesh import with_history
         from workflows.studies.sampling_job import with_stability, with_unknown_meshes
 
         found = with_unknown_meshes(self, with_stability(self, dataset, evaluations["/"]))
@@ -156,7 +156,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
         match at(value, "accuracy"):
             case Accuracy() | {"tolerance": _}:
-                from workflows.studies.levers import completed
+                from workflows.accuracy.levers import completed
 
                 return completed(value)
             case _:
@@ -187,7 +187,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         yield from self.mistakes_of_parameters()
         if self.accuracy.tolerance is not None or self.method.kind == "automatic":
-            from workflows.studies import tolerance_words
+            from workflows.accuracy import tolerance_words
 
             yield from tolerance_words.mistakes(self)
         not_sampled = list(self.spec.mistakes_of_samples())

@@ -19,10 +19,10 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
+from workflows.accuracy import adapted_mesh
 from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
-from workflows.studies import adapted_mesh
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
 from workflows.studies.solves import measured, of_answers, stressed, with_contact, with_stresses
@@ -59,7 +59,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
-            from workflows.studies.tolerance import within
+            from workflows.accuracy.tolerance import within
 
             return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
         found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
@@ -220,7 +220,7 @@ def _told(
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        from workflows.studies.tolerance import meshes_before
+        from workflows.accuracy.tolerance import meshes_before
 
         before = meshes_before(directory)
         earlier = sum(one["seconds"] for one in before)

@@ -10,12 +10,12 @@ from forward.machine import Headroom
 from tests import meshes
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script, tissuq_on_two_ranks
 from workflows.__main__ import main
+from workflows.accuracy.levers import Assessed, MeshLever, rate_of
+from workflows.accuracy.tolerance_words import contradictions, taken
+from workflows.accuracy.tolerance_words import out_of_reach as in_words
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
-from workflows.studies.levers import Assessed, MeshLever, rate_of
-from workflows.studies.tolerance_words import contradictions, taken
-from workflows.studies.tolerance_words import out_of_reach as in_words
 
 TINY = ROOT / "configs" / "tiny.toml"
 OWN = ROOT / "configs" / "own-model.toml"
@@ -329,7 +329,7 @@ def test_the_same_bits_on_any_number_of_ranks_and_after_kills(tmp_path):
 
 KILLED = """
 import os, sys
-import workflows.studies.tolerance as meshes
+import workflows.accuracy.tolerance as meshes
 from uq.evaluation.checkpoint import Checkpoint
 save, assessed = Checkpoint.save, meshes._assessed
 seen = []

@@ -1,7 +1,7 @@
 """How one tolerance for all errors is reached: a loop that moves levers until errors are within it.
 
-What can be moved, and what follows from moving it, stands in `workflows.studies.levers`; what is said of it, in
-`workflows.studies.tolerance_words`. The loop has two parts, since results have one mesh:
+What can be moved, and what follows from moving it, stands in `workflows.accuracy.levers`; what is said of it, in
+`workflows.accuracy.tolerance_words`. The loop has two parts, since results have one mesh:
 
 1. `on_fine_mesh` moves the mesh, and the number of estimates of its error, before anything is sampled. On each mesh the
    model is linearised at the mean of its parameters and the error of the mesh is estimated at a few: what is then not
@@ -41,10 +41,10 @@ from uq.evaluation.evaluate import Recorder
 from uq.findings import add
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from workflows.studies import tolerance_words as words
-from workflows.studies.adapted_mesh import FILES as ADAPTED
-from workflows.studies.adapted_mesh import on_adapted_mesh, written
-from workflows.studies.levers import COUNTS, Assessed, MeshLever, cells, goal
+from workflows.accuracy import tolerance_words as words
+from workflows.accuracy.adapted_mesh import FILES as ADAPTED
+from workflows.accuracy.adapted_mesh import on_adapted_mesh, written
+from workflows.accuracy.levers import COUNTS, Assessed, MeshLever, cells, goal
 
 if TYPE_CHECKING:
     import xarray as xr

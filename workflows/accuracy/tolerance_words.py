@@ -12,7 +12,7 @@ from forward.scalars import Mistake
 from forward.words import number
 from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.methods.method import UNASKED
-from workflows.studies.levers import AIMING, AUTOMATIC, Assessed, MeshLever, Reach, Step, most
+from workflows.accuracy.levers import AIMING, AUTOMATIC, Assessed, MeshLever, Reach, Step, most
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:

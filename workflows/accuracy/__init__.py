@@ -1,0 +1,1 @@
+"""One tolerance for all errors, and meshes that are refined for it or before a study."""
