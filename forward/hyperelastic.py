@@ -19,13 +19,12 @@ from forward.findings import Finding
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
-from forward.readable import scale
+from forward.readable import number, scale, with_unit
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.spec import UNREFINED
 from forward.terms.displacement import Block, label, lists, too_far
-from forward.words import number, with_unit
 
 LEAST = 2  # steps of a path
 LISTED = 6  # steps that are named

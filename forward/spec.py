@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 from forward.model import ModelError
+from forward.readable import named
 from forward.registry import Kinds, OfKind
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings
-from forward.words import named
 
 if TYPE_CHECKING:
     from forward.bodies.mesh import Contents

@@ -84,7 +84,7 @@ FAULTS = {
     "variance-between": Fault("uq/estimators/averaged.py", "(p * away**2)", "(p**2 * away**2)"),
     "upper-quantile": Fault("uq/estimators/quantiles.py", "_level(1 - p[:, None], ", "_level(p[:, None], "),
     "budget": Fault("uq/methods/method.py", "(self.budget_seconds / seconds - 1)", "(self.budget_seconds / seconds)"),
-    "digits": Fault("forward/words.py", "1 if error < TWO * 10.0**power", "1 if error > TWO * 10.0**power"),
+    "digits": Fault("forward/readable.py", "1 if error < TWO * 10.0**power", "1 if error > TWO * 10.0**power"),
     "chains": Fault("uq/inputs/draws.py", "2 * pairs.sum() - 1", "2 * pairs.sum()"),
 }
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from forward.materials.material import constants, energy_of
-from forward.words import listed, named, settings
+from forward.readable import listed, named, settings
 
 if TYPE_CHECKING:
     from forward.bodies.inclusions import Inclusion

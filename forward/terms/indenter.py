@@ -23,11 +23,10 @@ from forward.bodies.geometry import Body, Direction, Vector, tolerance, unit_vec
 from forward.bodies.surface import edges, facets, points
 from forward.findings import Finding
 from forward.model import FloatArray
-from forward.readable import told
+from forward.readable import listed, told
 from forward.scalars import Scalar
 from forward.terms import tools
 from forward.terms.term import Place, Term
-from forward.words import listed
 
 SHARP = 1 / 20  # radius of an edge relative to that of the tool, and of a tip relative to the depth
 SMOOTH = 0.1  # width over which contact sets in, relative to the penetration that is aimed at

@@ -11,9 +11,8 @@ from annotated_types import Ge, Gt, Unit
 
 from forward.bodies.geometry import Body, Direction, unit_vector
 from forward.findings import Finding
-from forward.readable import told
+from forward.readable import listed, told
 from forward.terms.term import Place, Term
-from forward.words import listed
 
 
 class Gravity(Term):

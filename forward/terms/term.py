@@ -27,11 +27,11 @@ from typing import Annotated, Any, ClassVar
 
 from forward.bodies.geometry import Body, Vector
 from forward.findings import Finding
+from forward.readable import settings
 from forward.registry import Kinds, OfKind
 from forward.scalars import Scalar, numbers
 from forward.settings import Named
 from forward.terms.acting import Acting
-from forward.words import settings
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,21 @@ import math
 
 import pytest
 
-from forward.readable import and_error, between, interval, percent, quantity, scale
-from forward.words import duration, number, per, places, power_of_ten, rounded, with_error
+from forward.readable import (
+    and_error,
+    between,
+    duration,
+    interval,
+    number,
+    per,
+    percent,
+    places,
+    power_of_ten,
+    quantity,
+    rounded,
+    scale,
+    with_error,
+)
 
 pytestmark = pytest.mark.unit
 

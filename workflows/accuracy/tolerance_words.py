@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.findings import Finding, entries
+from forward.readable import number
 from forward.scalars import Mistake
-from forward.words import number
 from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.methods.method import UNASKED
 from workflows.accuracy.levers import AIMING, AUTOMATIC, Assessed, MeshLever, Reach, Step, most

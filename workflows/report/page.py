@@ -15,9 +15,8 @@ from pydantic import ValidationError
 
 from forward.external.own_modules import OwnCodeError, installed_only, refused
 from forward.machine import write_text
-from forward.readable import size
+from forward.readable import NONE, duration, size
 from forward.settings import one_line
-from forward.words import NONE, duration
 from workflows.config.blocks import Report, located
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse

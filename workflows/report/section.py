@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import and_error, margin, quantity, size
+from forward.readable import NONE, and_error, margin, quantity, size, with_error
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
-from forward.words import NONE, with_error
 from uq.estimators.estimate import PARTS, holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from forward.words import settings
+from forward.readable import settings
 
 
 def stability(counts: dict[str, int]) -> str:

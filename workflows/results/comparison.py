@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.findings import Finding
-from forward.readable import percent
-from forward.words import number, with_error
+from forward.readable import number, percent, with_error
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.machine import write_whole
-from forward.words import per
+from forward.readable import per
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
 from workflows.results.surfaces import tool_grid, tools_of

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.readable import scale
-from forward.words import NONE, duration, margin, named, number, with_error
+from forward.readable import NONE, duration, margin, named, number, scale, with_error
 from uq.estimators.estimate import ESTIMATED, Estimate, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown, only_rounding
 from workflows.report import words

@@ -14,9 +14,9 @@ from pydantic.json_schema import SkipJsonSchema
 from forward.fem.finer import finer
 from forward.materials.material_point import MaterialTest
 from forward.model import ForwardModel
+from forward.readable import named
 from forward.settings import one_line
 from forward.spec import SPECIMEN, ModelSpec, usual_kind
-from forward.words import named
 from inverse.criticism.comparison import Candidate
 from inverse.data.measurements import Measurements
 from inverse.methods.invert import derivable

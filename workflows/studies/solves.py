@@ -16,7 +16,7 @@ import numpy as np
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
 from forward.model import FloatArray, SolveError
-from forward.words import number, with_unit
+from forward.readable import number, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Prediction, Request

@@ -12,7 +12,6 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from forward import readable
-from forward import words as numbers
 from forward.model import WORK, SolveError
 from forward.pointwise import FunctionModel
 from uq.estimators.indices import field_indices
@@ -66,7 +65,7 @@ def test_inclusions_in_words():
     blocks["parameters"] = {"inclusions.tumour.radius": {"kind": "uniform", "lower": 0.1, "upper": 0.3}}
     said = dict(model_in_words(parse(blocks)))["inclusions"]
     assert said == ["tumour (sphere): x = 0.5 m, y = 0.5 m, z = 0.5 m, radius = random, contrast = 4, width = 0.1 m"]
-    assert numbers.per("m", "1") == "m"
+    assert readable.per("m", "1") == "m"
 
 
 def function(point):
@@ -163,7 +162,7 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
         readable.and_error(float(sag["plain_mean"]), float(sag["plain_mean_error"]), "m"),
         readable.and_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0]), "m"),
-        f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        f"worth {readable.worth(float(sag['variance_ratio']))} plain samples for the mean",
         "2.6667 × 10⁻⁴ m/(kg/m³)",
         "root mean square of the derivative",
         "None failed.",
@@ -228,7 +227,7 @@ def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
         words_,
         readable.and_error(float(sag["mean"]), float(sag["mean_error"]), "m"),
         readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
-        f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        f"worth {readable.worth(float(sag['variance_ratio']))} plain samples for the mean",
     ):
         assert text in page, text
     assert page.count("<figure>") == 2 + 2 * 2 + 2 + 2
@@ -274,7 +273,7 @@ def test_sobol_indices_are_reported(tmp_path, undrawn, design):
     sag = dataset.sel(output="sag", parameter="material.D1")
     for told in (
         "The share of the variance due to a parameter alone",
-        numbers.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
+        readable.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
         "group both",
         "second order",
         "Generalised indices",
@@ -295,7 +294,7 @@ def test_bounds_are_reported(tmp_path, undrawn):
     sag = dataset.sel(output="sag", parameter="material.D1")
     for told in (
         "Sensitivity from derivatives",
-        numbers.with_error(float(sag["total_bound"]), float(sag["total_bound_error"])),
+        readable.with_error(float(sag["total_bound"]), float(sag["total_bound_error"])),
         "leading direction",
         "Poincaré constant",
     ):
@@ -528,7 +527,7 @@ def test_two_samples_of_a_linear_model_are_drawn():
     ],
 )
 def test_values_are_rounded_to_their_errors(value, error, text):
-    assert numbers.with_error(value, error) == text
+    assert readable.with_error(value, error) == text
 
 
 @pytest.mark.parametrize(
@@ -545,20 +544,20 @@ def test_values_are_rounded_to_their_errors(value, error, text):
     ],
 )
 def test_numbers_are_rounded(value, text):
-    assert numbers.number(value) == text
+    assert readable.number(value) == text
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.2288, "0.23 s"), (34.9, "35 s"), (99.7, "1 min 40 s"), (11100, "3 h 05 min")]
 )
 def test_times_are_readable(seconds, text):
-    assert numbers.duration(seconds) == text
+    assert readable.duration(seconds) == text
 
 
 def test_no_error_is_below_rounding():
     """Printed with fifteen digits at most, and kept as what rounding leaves."""
-    assert numbers.with_error(0.1, 1e-31) == "0.100000000000000 ± 0.000000000000001"
-    assert numbers.with_error(-1541.02, 1e-20) == "−1,541.02000000000 ± 0.00000000001"
+    assert readable.with_error(0.1, 1e-31) == "0.100000000000000 ± 0.000000000000001"
+    assert readable.with_error(-1541.02, 1e-20) == "−1,541.02000000000 ± 0.00000000001"
     found = above_rounding(
         xr.Dataset(
             {
@@ -614,8 +613,8 @@ def test_report_imports_nothing_that_draws():
     [("Pa", "m/Pa", "2 Pa"), ("1", "m", "2"), ("kg/m³", "m/(kg/m³)", "2 kg/m³"), ("m", "m/m", "2 m")],
 )
 def test_units_in_words(unit, of_a_length, number):
-    assert numbers.per("m", unit) == of_a_length
-    assert numbers.with_unit(numbers.number(2.0), unit) == number
+    assert readable.per("m", unit) == of_a_length
+    assert numbers.with_unit(readable.number(2.0), unit) == number
 
 
 @pytest.mark.parametrize(

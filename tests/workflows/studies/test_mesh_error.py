@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from forward.readable import SIZES, margin
-from forward.words import places
+from forward.readable import SIZES, margin, places
 from tests.launch import ROOT, TISSUQ, assert_same_bits, in_process, run, run_script
 from uq.findings import findings
 from workflows.__main__ import main

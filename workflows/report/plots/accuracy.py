@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.words import number
+from forward.readable import number
 from uq.estimators.estimate import estimate_of
 from workflows.report.plots.figure import (
     COLOURS,

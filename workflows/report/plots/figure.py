@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import SIZES, is_path, scale, spoken
-from forward.words import named, power_of_ten
+from forward.readable import SIZES, is_path, named, power_of_ten, scale, spoken
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import size
-from forward.words import named, number
+from forward.readable import named, number, size
 from workflows.report.plots.figure import (
     COLOURS,
     CONTROLLED,

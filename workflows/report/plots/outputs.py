@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.words import named
+from forward.readable import named
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
 from uq.estimators.tails import skewed

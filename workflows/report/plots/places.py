@@ -9,8 +9,7 @@ import numpy as np
 
 from forward.bodies.geometry import AXES
 from forward.model import FloatArray
-from forward.readable import scale
-from forward.words import number
+from forward.readable import number, scale
 from workflows.report.plots.figure import (
     COLOURS,
     CONTROLLED,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray
-from forward.words import named, number
+from forward.readable import named, number
 from workflows.report.plots.figure import (
     COLOURS,
     CONTROLLED,

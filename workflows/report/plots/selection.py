@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
-from forward.readable import percent
-from forward.words import named, with_error
+from forward.readable import named, percent, with_error
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, finished, stacked, text_of
 from workflows.report.plots.posterior import pairs
 from workflows.results.comparison import by_probability, ranking

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray, SolveError
+from forward.readable import named as with_its_unit
 from forward.readable import spoken
-from forward.words import named as with_its_unit
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels

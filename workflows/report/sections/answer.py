@@ -8,8 +8,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from forward.readable import and_error, interval, margin, percent, quantity, size, spoken
-from forward.words import duration, number, power_of_ten, with_error
+from forward.readable import (
+    and_error,
+    duration,
+    interval,
+    margin,
+    number,
+    percent,
+    power_of_ten,
+    quantity,
+    size,
+    spoken,
+    with_error,
+)
 from uq.estimators.estimate import single
 from uq.findings import NOT_KNOWN
 from workflows.report.blocks import CURVE, Answer, Block, Card, Text, curve_of, smooth

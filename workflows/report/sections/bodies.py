@@ -11,8 +11,7 @@ import numpy as np
 from forward.bodies.geometry import AXES
 from forward.hyperelastic import Path as PathOfLoads
 from forward.model import SolveError
-from forward.readable import and_error, size, spoken
-from forward.words import named, number
+from forward.readable import and_error, named, number, size, spoken
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
 from workflows.report.plots import outputs
 from workflows.report.plots import places as maps

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.readable import percent, size
-from forward.words import NONE, duration, number, with_unit
+from forward.readable import NONE, duration, number, percent, size, with_unit
 from uq.estimators.scores import gains, plain_samples
 from workflows.report import plots
 from workflows.report.blocks import Answer, Block, Card, Heading, Pairs, Pictures, Table, Text

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import and_error, margin, size, spoken
-from forward.words import NONE, duration, number
+from forward.readable import NONE, and_error, duration, margin, number, size, spoken
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.findings import NOT_KNOWN, only_rounding
 from workflows.report import plots

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from forward.readable import size
-from forward.words import NONE, duration, number, settings, with_unit
+from forward.readable import NONE, duration, number, settings, size, with_unit
 from uq import findings as of_results
 from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text
 from workflows.report.section import Results, section

@@ -7,9 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.readable import and_error, interval, percent, place, quantity, scale, size, spoken
+from forward.readable import (
+    NONE,
+    and_error,
+    interval,
+    named,
+    number,
+    percent,
+    place,
+    quantity,
+    scale,
+    size,
+    spoken,
+    with_error,
+)
 from forward.specimen import Specimen
-from forward.words import NONE, named, number, with_error
 from uq.estimators.estimate import single
 from workflows.report.blocks import CURVE, Answer, Block, Card, Heading, Pictures, Table, Text, curve_of, smooth
 from workflows.report.plots import places as maps

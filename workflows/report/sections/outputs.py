@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import and_error, margin, percent, size
-from forward.words import NONE, number, per, with_unit, worth
+from forward.readable import NONE, and_error, margin, number, per, percent, size, with_unit, worth
 from uq.estimators.estimate import estimate_of, part, single
 from uq.estimators.moments import half_width
 from workflows.report import plots

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.readable import interval, scale, size, spoken
-from forward.words import margin, named, number, rounded, with_error
+from forward.readable import interval, margin, named, number, rounded, scale, size, spoken, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import places as maps

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import percent, size
-from forward.words import NONE, named, number, with_error
+from forward.readable import NONE, named, number, percent, size, with_error
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
