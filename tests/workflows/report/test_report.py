@@ -614,7 +614,7 @@ def test_report_imports_nothing_that_draws():
 )
 def test_units_in_words(unit, of_a_length, number):
     assert readable.per("m", unit) == of_a_length
-    assert numbers.with_unit(readable.number(2.0), unit) == number
+    assert readable.with_unit(readable.number(2.0), unit) == number
 
 
 @pytest.mark.parametrize(
