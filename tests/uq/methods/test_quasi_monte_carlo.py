@@ -130,7 +130,12 @@ def leaning(deviations):
     [  # what the controls are exact for is in a test of its own
         *(("product", control) for control in CONTROLS),
         *(("ishigami", control) for control in ("tangent", "quadratic")),
-        pytest.param("ishigami", "chaos", marks=pytest.mark.slow),
+        *(pytest.param("ishigami", control, marks=pytest.mark.slow) for control in ("none", "chaos")),
+        *(
+            pytest.param(name, control, marks=pytest.mark.slow)
+            for name in ("linear", "quadratic")
+            for control in CONTROLS
+        ),
     ],
 )
 def test_mean_and_variance_are_unbiased(name, control):

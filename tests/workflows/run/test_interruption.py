@@ -275,7 +275,15 @@ def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(("ranks", "number"), [(None, signal.SIGINT), (None, signal.SIGTERM), (2, signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("ranks", "number"),
+    [
+        (None, signal.SIGINT),
+        (None, signal.SIGTERM),
+        (2, signal.SIGTERM),
+        pytest.param(2, signal.SIGINT, marks=pytest.mark.slow),
+    ],
+)
 def test_an_interrupted_study_says_one_line(study, tmp_path, ranks, number):
     out = tmp_path / "out"
     process = subprocess.Popen(
