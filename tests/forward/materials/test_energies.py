@@ -202,7 +202,8 @@ def test_ogden_stress_and_stiffness_where_stretches_are_equal():
     P = of.stress(MATERIALS["ogden"](OPS, *of.measures.values(), **values))
     point = np.array([[0.2, 0.2, 0.2]])
     values_at = [
-        assembly.PointValues(of.inserted(form), point, space, MPI.COMM_SELF) for form in (P, of.derivative(P, u, along))
+        assembly.PointValues(of.inserted(form), point, space, MPI.COMM_SELF)
+        for form in (P, of.derivative_of(P, u, along))
     ]
     places = space.tabulate_dof_coordinates()
 

@@ -15,7 +15,7 @@ from tests.launch import on_kept_ranks
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
-from uq.evaluation.request import Request
+from uq.evaluation.request import FieldSum, Request
 from uq.findings import findings
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -359,7 +359,7 @@ def beam():
     return study.inputs, SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names))
 
 
-class States:
+class States(FieldSum):
     """Keeps the states and their slopes as they pass."""
 
     def __init__(self):

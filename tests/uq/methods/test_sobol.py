@@ -11,7 +11,7 @@ from forward.model import Solution, SolveError
 from forward.pointwise import FunctionModel, OneByOne
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
 from uq.evaluation.evaluate import SerialEvaluate
-from uq.evaluation.request import Request
+from uq.evaluation.request import FieldSum, Request
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -309,7 +309,7 @@ def beam():
     return study.inputs, SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names))
 
 
-class States:
+class States(FieldSum):
     """Keeps the states as they pass."""
 
     def __init__(self):
