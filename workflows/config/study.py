@@ -205,9 +205,11 @@ def dump(study: StudyKind) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """List what changed between two documents, one line for each place.
 
-    Blocks on which results do not depend do not count, nor does the path of a mesh, as long as the mesh is the same.
+    Blocks on which results do not depend do not count, nor empty lists, nor the path of a mesh, as long as the mesh is
+    the same.
     """
-    before, after = (dict(leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
+    both = [leaves({key: block for key, block in one.items() if key not in WITHOUT_EFFECT}) for one in (old, new)]
+    before, after = ({place: value for place, value in found if value != []} for found in both)
     for digest, file in _FILES.items():
         for place in [one for one in before if one == digest or one.startswith(f"{digest}.")]:
             if before[place] == after.get(place):

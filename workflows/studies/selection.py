@@ -208,7 +208,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
                 return
         candidate: Any
         for name, candidate in self.candidates.items():
-            tests = (*data.tests, *(self.predict or ()))
+            tests = (*data.tests, *self.predict)
             objections = (unfit(candidate.energy, test.mode, candidate.fibres) for test in tests)
             objection = next(filter(None, objections), None)
             if objection is not None:
@@ -217,7 +217,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         yield from self.mistakes_of_data()
 
     def _of_models(self) -> Iterator[Mistake]:
-        if self.predict is not None:
+        if self.predict:
             yield ("predict",), "tests of materials are predicted, expected none with a model", list(self.predict)
         if self.data.quantity == DisplacementFile.quantity and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"

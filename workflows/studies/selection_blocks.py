@@ -41,7 +41,7 @@ class SelectionBlocks(OfCandidates):
 
     data: Annotated[MeasuredTests | DisplacementFile | OutputFile, AS_DECIDED]
     candidates: Annotated[dict[str, CandidateModel | ModelCandidate], Field(min_length=1), AS_DECIDED]
-    predict: tuple[MaterialTest, ...] | None = None
+    predict: tuple[MaterialTest, ...] = ()
     method: Annotated[SelectSpecimens | Select, AS_DECIDED]
     measurements: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)
 
@@ -56,8 +56,7 @@ class SelectionBlocks(OfCandidates):
         """Choose the blocks by the model."""
         model = at(blocks, "model")
         if model is None:
-            found = decided(blocks, data=MeasuredTests, candidates=dict[str, CandidateModel], method=Select)
-            return found if found is blocks else {"predict": ()} | found
+            return decided(blocks, data=MeasuredTests, candidates=dict[str, CandidateModel], method=Select)
         if at(blocks, "data", "measured") is not None:  # results of earlier versions hold all numbers
             source = blocks["data"].get("source", ())
             blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": source}}
@@ -121,7 +120,7 @@ class SelectionBlocks(OfCandidates):
         """Data by group."""
         if self.model is not None:
             return {WHOLE: self.measurements}
-        found, predicted = {}, [(math.nan,) * len(test.at) for test in self.predict or ()]
+        found, predicted = {}, [(math.nan,) * len(test.at) for test in self.predict]
         data: Any = self.data
         for group in data.data_groups:
             measured, tests = data.of(group), self.tests_in(group)
@@ -138,7 +137,7 @@ class SelectionBlocks(OfCandidates):
     def tests_in(self, group: str) -> list[MaterialTest]:
         """Return the tests of a group, those that are only predicted last."""
         data: Any = self.data
-        return [*data.of(group), *(self.predict or ())]
+        return [*data.of(group), *self.predict]
 
     def data_as_in(self, spec: Any) -> Measurements:
         """Return the data as a candidate numbers what it has in its load cases."""

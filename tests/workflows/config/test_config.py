@@ -288,6 +288,7 @@ def test_differences_name_the_place():
     old, new = blocks(), blocks()
     new["method"]["samples"] = 99
     new["parallel"] = {"ranks_per_model": 2}
+    new["correlations"] = []
     assert differences(old, new) == ["method.samples: 24 → 99"]
 
 
