@@ -170,12 +170,15 @@ def with_slopes_times(factor, of):
 
 @pytest.mark.slow
 def test_a_bad_fit_costs_efficiency_and_no_bias():
-    good, bad = (
-        repeats(of, 60, samples=32, scrambles=4, control="chaos") for of in (PRODUCT, with_slopes_times(3, PRODUCT))
+    """All of it at most: a control that does not help is dropped, which leaves what there is without one."""
+    settings = {"samples": 32, "scrambles": 4}
+    good, bad, none = (
+        repeats(of, 60, **settings, control=control)
+        for of, control in ((PRODUCT, "chaos"), (with_slopes_times(3, PRODUCT), "chaos"), (PRODUCT, "none"))
     )
-    for right, wrong, exact in ((good[0], bad[0], PRODUCT[2]), (good[2], bad[2], PRODUCT[3])):
-        assert is_unbiased(wrong, exact)
-        assert wrong.std() > 10 * right.std()
+    for n, exact in ((0, PRODUCT[2]), (2, PRODUCT[3])):
+        assert is_unbiased(bad[n], exact)
+        assert 3 * good[n].std() < bad[n].std() < 1.2 * none[n].std()
 
 
 @pytest.mark.slow
@@ -188,9 +191,8 @@ def test_samples_that_the_control_was_fitted_to_would_be_noticed(monkeypatch):
     assert abs(leaning(variance)) < 4
     monkeypatch.setattr(quasi_monte_carlo, "FIT", 0)
     mean, _, variance, _ = repeats(STEEP, 120, **settings)
-    # Where the control is dropped, deviations are so large that their mean hides the bias of the others.
-    assert leaning(mean) < -4
-    assert leaning(variance) < -4
+    # Where the control is dropped, deviations are so large that they hide the bias of the others, of variances most.
+    assert min(leaning(mean), leaning(variance)) < -4
 
 
 def test_a_wrong_second_moment_of_the_control_would_be_noticed(monkeypatch):
