@@ -20,6 +20,7 @@ from forward.adapt import OF_ROUNDING, Adapt
 from forward.machine import MIB
 from forward.model import ModelError
 from uq.inputs.sampling import power_of_two
+from workflows.config.tables import at
 from workflows.studies.predictions import times_of
 
 if TYPE_CHECKING:
@@ -59,16 +60,13 @@ SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others:
 
 
 def completed(blocks: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the blocks of a study, with what its tolerance decides: a method, or the most samples of the given one."""
-    accuracy = blocks.get("accuracy")
-    if not isinstance(accuracy, Mapping) or accuracy.get("tolerance") is None:
-        return blocks
+    """Return the blocks of a study with a tolerance, and what it decides: a method, or most samples of a given one."""
     method = blocks.get("method")
     if method is None:
         return {**blocks, "method": {"kind": AUTOMATIC}}
-    if not isinstance(method, Mapping) or method.get("kind") not in AIMING or method.get("fit") == "projection":
+    if at(method, "kind") not in AIMING or at(method, "fit") == "projection":
         return blocks
-    most = accuracy.get("solves", SOLVES)
+    most = blocks["accuracy"].get("solves", SOLVES)
     if not isinstance(most, int) or any(method.get(name) is not None for name in AMOUNTS):
         return blocks
     if method["kind"] == "quasi-monte-carlo":
