@@ -22,6 +22,7 @@ from benchmarks.beams import CONFIG
 from benchmarks.simulated import Kind, calibrate
 from forward.fem.specimen import SpecimenModel
 from forward.specimen import Specimen
+from inverse.data.noise import Noise
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Prediction
@@ -85,7 +86,7 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     sizes = [np.sqrt((part**2).mean()) for part in model.values(solution.outputs)]
     sigma = noise * np.array(sizes)[model.cases]
     start = Prediction(centre, state[0], slopes, inputs.coordinates, inputs.std)
-    return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), sigma, start=start)
+    return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), Noise(sigma), start=start)
 
 
 def main(words: Sequence[str] = ()) -> None:

@@ -21,6 +21,7 @@ from benchmarks.calibration import PRIORS, specimen
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray
 from forward.specimen import LoadCase, Specimen
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -89,7 +90,7 @@ def told(spec: Specimen, case: str, count: int) -> FloatArray:
         clean = model.solve(inputs.from_normals(truth[None])[0][0]).outputs
         sigma = np.full(len(clean), NOISE * np.sqrt((clean**2).mean()))
         data = clean + sigma * np.random.default_rng([2, k]).standard_normal(len(clean))
-        posterior = Posterior(inputs, evaluate, data, sigma, start=start)
+        posterior = Posterior(inputs, evaluate, data, Noise(sigma), start=start)
         found = evidence(posterior, laplace(posterior, starts=1, first=truth), SAMPLES)
         if found.error < LARGEST:
             gained[k] = posterior.at(truth[None]).log_likelihood[0] - found.log_evidence

@@ -13,6 +13,7 @@ from forward.bodies.random_fields import RandomField
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray
 from forward.specimen import Specimen
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -64,7 +65,7 @@ def problem(cells: int) -> tuple[FieldPosterior, FloatArray]:
     sizes = [np.sqrt((part**2).mean()) for part in np.split(clean, np.flatnonzero(np.diff(model.cases)) + 1)]
     sigma = NOISE * np.array(sizes)[model.cases]
     data = clean + sigma * np.random.default_rng(0).standard_normal(len(clean))
-    return FieldPosterior(model, data, sigma, FIELD.prior(spec.body)), true
+    return FieldPosterior(model, data, Noise(sigma), FIELD.prior(spec.body)), true
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,8 @@ from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.doubts import of_mesh
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import ApproximationError, Whitening
-from inverse.data.errors import NORMAL
 from inverse.data.measurements import Measurements
+from inverse.data.noise import ModelError, Noise
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.mesh_correction import Treatment, error_of
@@ -263,7 +262,7 @@ class Known(NamedTuple):
 
     outputs: FloatArray
     slopes: FloatArray
-    error: ApproximationError
+    error: ModelError
 
 
 def known(case: Case, truth: FloatArray) -> Known:
@@ -303,7 +302,7 @@ def expected(
 
 
 def shares(
-    slopes: FloatArray, wanted: FloatArray, sigma: FloatArray, missed: FloatArray, mesh: ApproximationError | None
+    slopes: FloatArray, wanted: FloatArray, sigma: FloatArray, missed: FloatArray, mesh: ModelError | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return shares (q,) of data whose intervals hold the truth, and the shifts (q,) of these over deviations.
 
@@ -320,11 +319,11 @@ def shares(
     """
     from scipy.special import ndtr
 
-    white = Whitening.of(sigma, mesh, NORMAL)
-    A = white((slopes / white.sigma[:, None]).T).T
+    white = Noise(sigma, model=mesh)
+    A = white.whitened((slopes / white.scale[:, None]).T).T
     covariance = wanted @ np.linalg.inv(np.eye(A.shape[1]) + A.T @ A)
     deviations = np.sqrt((covariance * wanted).sum(axis=1))
-    gain = white(covariance @ A.T) / white.sigma
+    gain = white.whitened(covariance @ A.T) / white.scale
     shift = gain @ (missed - (0.0 if mesh is None else mesh.error)) / deviations
     spread = np.sqrt(((gain * sigma) ** 2).sum(axis=1) + (covariance**2).sum(axis=1)) / deviations
     return ndtr((WIDE - shift) / spread) - ndtr((-WIDE - shift) / spread), shift

@@ -39,13 +39,12 @@ from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import ApproximationError, Whitening, along
-from inverse.data.errors import NORMAL
 from inverse.data.measurements import Measurements
+from inverse.data.noise import ModelError, Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_field import Vertices, invert_field
-from inverse.methods.mesh_correction import error_of
+from inverse.methods.mesh_correction import along, error_of
 from inverse.methods.record import Problem as Asked
 from uq.evaluation.evaluate import SerialEvaluate
 
@@ -158,11 +157,11 @@ def _linear(problem: Problem, truth: FloatArray, clean: FloatArray) -> dict[str,
         sigma = sigma_of(model, clean, noise)
         images, _, directions = np.linalg.svd(slopes / sigma[:, None], full_matrices=False)
         wanted = np.vstack([root, directions[:DIRECTIONS], mass @ root / mass.sum()])
-        more = along(images.T, look.between, Whitening.of(sigma, None, NORMAL))
+        more = along(images.T, look.between, Noise(sigma))
         error = replace(plain, root=np.concatenate([plain.root, more]))
         size = float(np.sqrt((((clean - outputs) / sigma) ** 2).mean()))
         for treatment in WORDS:
-            mesh: ApproximationError | None = error if treatment == "correct" else None
+            mesh: ModelError | None = error if treatment == "correct" else None
             held, shift = shares(slopes, wanted, sigma, clean - outputs, mesh)
             found[f"{noise:g} {treatment}"] = {"size": size, "held": held.tolist(), "shift": shift.tolist()}
     return found
@@ -196,7 +195,7 @@ def _invert(problem: Problem, truths: FloatArray, clean: FloatArray, name: str) 
 def _inverted(problem: Problem, data: Measurements, vertices: Vertices, truth: FloatArray) -> dict[str, Any]:
     """Invert one data set for a field."""
     begin = time.process_time()
-    posterior = FieldPosterior(problem.model, data.values, data.sigma, problem.prior)
+    posterior = FieldPosterior(problem.model, data.values, Noise(data.sigma), problem.prior)
     found = invert_field(posterior, Asked(data, Invert(), finer=problem.finer), vertices)
     rest = _of_field(found, truth, problem.prior.matern.mass, problem.root)
     return rest | {"s": time.process_time() - begin}

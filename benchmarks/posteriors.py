@@ -19,6 +19,7 @@ from forward.model import FloatArray
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import Assessment, answer, assess
 from inverse.criticism.verdict import verdict_on_few
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -50,7 +51,7 @@ def problem(size: int, curvature: float, seed: int) -> tuple[Posterior, FloatArr
 
     model = FunctionModel(values, names, outputs, slopes)
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in names})
-    return Posterior(inputs, SerialEvaluate(model), data, np.full(2 * size, NOISE)), A
+    return Posterior(inputs, SerialEvaluate(model), data, Noise(np.full(2 * size, NOISE))), A
 
 
 def truth(posterior: Posterior, A: FloatArray, curvature: float, gaussian: Laplace) -> tuple[FloatArray, ...]:

@@ -18,7 +18,7 @@ from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
 from inverse.criticism.comparison import Candidate
 from inverse.data.measurements import Measurements
-from inverse.methods.selection import Noise, Select
+from inverse.methods.selection import Select, StatedNoise
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -55,7 +55,7 @@ def main() -> None:
     labels = tuple(test.label for test in TESTS for _ in test.at)
     at = np.concatenate([test.at for test in TESTS])
     # The standard deviations stand with the data: they are those that made them, not a part of what was measured.
-    method = Select(samples=64, noise=Noise())
+    method = Select(samples=64, noise=StatedNoise())
 
     def compared(stress: FloatArray, noise: float) -> tuple[FloatArray, bool]:
         """Probabilities given stresses with errors, and whether the most probable model is in conflict with them."""

@@ -133,7 +133,7 @@ def calibrate(
     ties = rng.random((specimens, c))
     physical = posterior.physical(x)
     measured = posterior.at(x)
-    scale = posterior.sigma * (1.0 if posterior.noise is None else physical[:, -1:])
+    scale = posterior.noise.sigma * (1.0 if posterior.noise.factor is None else physical[:, -1:])
     data = measured.outputs + scale * errors
     by_laplace, corrected = np.full((2, specimens, c), np.nan)
     ess, pareto_k = np.zeros(specimens), np.full(specimens, np.inf)

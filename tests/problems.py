@@ -8,6 +8,7 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import quantiles
 from inverse.criticism.predictive import examine, spectrum_of
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -56,7 +57,7 @@ class Linear:
         self.data[:holes] = np.nan
         names, outputs = tuple(f"m{i}" for i in range(N)), tuple(f"y{i}" for i in range(data))
         model = FunctionModel(lambda m: self.G @ m, names, outputs, lambda m: self.G)
-        self.posterior = FieldPosterior(model, self.data, self.sigma, DensePrior(root), self.m_0)
+        self.posterior = FieldPosterior(model, self.data, Noise(self.sigma), DensePrior(root), self.m_0)
         seen = np.isfinite(self.data)
         self.seen = seen
         K = self.G[seen]
@@ -90,13 +91,13 @@ def curved(limit=np.inf):
     root = np.tril(rng.uniform(0, 0.4, (12, 12))) + np.eye(12)
     sigma = np.full(25, 0.05)
     data = np.exp(B @ truth) + sigma * rng.standard_normal(25)
-    return FieldPosterior(model, data, sigma, DensePrior(root))
+    return FieldPosterior(model, data, Noise(sigma), DensePrior(root))
 
 
 def examine_few(posterior, gaussian, neighbours=None):
     """Test the residuals of few parameters at the mode: a solve with derivatives."""
     at = posterior.at(gaussian.mode[None], derivatives=True)
-    residual = posterior.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
+    residual = posterior.noise.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
     return examine(residual, spectrum_of(posterior, at), neighbours)
 
 
@@ -107,7 +108,7 @@ def few(seed=0, wave=0.0, noise=None):
     model = FunctionModel(lambda p: G @ p, names, tuple(f"y{i}" for i in range(30)), lambda p: G)
     data = G @ rng.standard_normal(3) + 0.5 * rng.standard_normal(30) + wave * np.sin(8 * PLACES[:, 0])
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in names})
-    return Posterior(inputs, SerialEvaluate(model), data, np.full(30, 0.5), noise)
+    return Posterior(inputs, SerialEvaluate(model), data, Noise(np.full(30, 0.5), factor=noise))
 
 
 def two_of_four(points):
@@ -125,7 +126,7 @@ def ridge(noise):
     inputs = Inputs({name: Uniform(lower=0.5, upper=2.0) for name in FOUR})
     y = two_of_four(TRUTH)
     model = FunctionModel(two_of_four, FOUR, ("u", "v"), slopes_of_four)
-    return Posterior(inputs, SerialEvaluate(model), y, noise * y)
+    return Posterior(inputs, SerialEvaluate(model), y, Noise(noise * y))
 
 
 def bananas(pairs, bend=0.7, seed=0, wide=100.0):
@@ -155,7 +156,7 @@ def bananas(pairs, bend=0.7, seed=0, wide=100.0):
     covariance = Q @ np.diag(np.tile([1.0, 1 + 2 * bend**2], pairs)) @ Q.T
     log_evidence = -d / 2 * np.log(2 * np.pi * wide**2) - ((centre**2).sum() + np.trace(covariance)) / 2 / wide**2
     inputs = Inputs({name: Normal(mean=0.0, std=wide) for name in names})
-    posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(d), np.ones(d))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(d), Noise(np.ones(d)))
     return model, posterior, centre, np.sqrt(np.diag(covariance)), log_evidence
 
 

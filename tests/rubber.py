@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from forward.materials.material_point import HomogeneousModel
+from inverse.data.noise import Noise
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
@@ -44,4 +45,4 @@ def on_treloar(kind: str, priors: dict[str, Distribution], noise: Distribution |
     data = study.data_groups["all"]
     model = HomogeneousModel(kind, {}, study.data.tests, tuple(priors))
     sigma = np.maximum(0.05 * data.values, 5e3)
-    return Posterior(Inputs(priors), SerialEvaluate(model), data.values, sigma, noise)
+    return Posterior(Inputs(priors), SerialEvaluate(model), data.values, Noise(sigma, factor=noise))

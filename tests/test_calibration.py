@@ -9,6 +9,7 @@ from scipy import stats
 from benchmarks.simulated import calibrate, rank_by_laplace, rank_by_weights
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -23,7 +24,7 @@ def bent():
 
     model = FunctionModel(lambda p: [np.exp(1.5 * p[0])], ("a",), ("y",), lambda p: [[1.5 * np.exp(1.5 * p[0])]])
     inputs = Inputs({"a": Normal(mean=0.0, std=1.0)})
-    return Posterior(inputs, SerialEvaluate(model), np.zeros(1), np.array([0.7]))
+    return Posterior(inputs, SerialEvaluate(model), np.zeros(1), Noise(np.array([0.7])))
 
 
 def test_exact_posteriors_have_uniform_ranks():

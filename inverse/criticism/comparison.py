@@ -274,7 +274,7 @@ def _predictions(
         bands[:, k] = np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T
     average = P @ mean
     missing = np.full(M - m, np.nan)
-    sigma = next(posteriors[name, group].sigma for name in names)
+    sigma = next(posteriors[name, group].noise.sigma for name in names)
     return {
         "output_group": ("output", np.full(M, group)),
         "output_test": ("output", data.tests),

@@ -130,7 +130,7 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
     whitened, log_density = bent(mode, found)(z)
     weights = mode.posterior.weights[mode.posterior.weights > 0]
     constant = float(np.log(weights).sum()) - len(weights) / 2 * float(np.log(2 * np.pi)) + found.log_determinant / 2
-    constant -= mode.posterior.whitening.log_determinant
+    constant -= mode.posterior.seen.log_determinant
     log_weights = log_density + (z**2).sum(axis=1) / 2 + constant
     if not np.isfinite(log_weights.max()):
         raise SolveError("the model has no answer at any of the samples of the Gaussian")

@@ -22,7 +22,6 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray
 from forward.readable import told
 from forward.settings import Settings
-from inverse.data.errors import StudentErrors
 from inverse.data.rigid import Rigid, check_rigid, orthonormal, slopes, turned
 from inverse.data.table import DataError
 
@@ -33,7 +32,7 @@ LEAST = 6  # points of a surface
 COLLINEAR = 1e-6
 FAR = 0.1  # of the extent of a body, by which landmarks may miss their places
 TURN, SHIFT = np.radians(10.0), 0.1  # standard deviations of motions that are not found: rad, and of the extent
-HEAVY = StudentErrors(degrees=4)
+HEAVY = 4  # degrees of freedom of errors
 Vector = tuple[float, float, float]
 Degrees = Annotated[float, Field(ge=0, le=30)]
 Positive = Annotated[float, Field(gt=0)]
@@ -312,7 +311,7 @@ def _fitted(
         gap = ((here - near) * normal).sum(axis=1)
         # The scale of the distances, from their median, while they are large.
         spread = max(1.4826 * float(np.median(np.abs(gap))), 1e-9 * extent)
-        weight = 1 / (1 + (gap / spread) ** 2 / HEAVY.degrees)
+        weight = 1 / (1 + (gap / spread) ** 2 / HEAVY)
         J = np.einsum("na,nak->nk", normal, slopes(here, centre))
         scaled = J / np.repeat([size, 1.0], 3)
         values, vectors = np.linalg.eigh((weight[:, None] * scaled).T @ scaled)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from forward.findings import Finding
 from forward.model import FloatArray, SolveError
-from inverse.data.approximation_error import Whitening
 from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise
 from inverse.data.rigid import Rigid, slopes
 from inverse.fields.low_rank import Spectrum
 from uq.evaluation.request import Evaluate, Request
@@ -146,22 +146,21 @@ def said(values: FloatArray) -> Finding:
     return Finding("motions", "note", {"count": count, "seen": seen, "lost": lost})
 
 
-def determined(spectrum: Spectrum, whitening: Whitening, shared: FloatArray, root: FloatArray) -> FloatArray:
+def determined(spectrum: Spectrum, noise: Noise, root: FloatArray) -> FloatArray:
     """Return eigenvalues (k,), descending, of what the data say about shared errors, over what is known of them before.
 
     Parameters
     ----------
     spectrum
         Of the data at the mode: what the unknowns explain cannot be told from a motion.
-    whitening
+    noise
         Of the data, with these errors in it.
-    shared
-        (k, m), in the units of the data.
     root
         √ (m,) of the weights of the data.
     """
-    G = root * shared / whitening.sigma
-    images = whitening.undone(spectrum.images)
+    assert noise.shared is not None
+    G = root * noise.shared / noise.scale
+    images = noise.coloured(spectrum.images)
     # (I + AAᵀ)⁻¹ = I − Q diag(s²/(1 + s²)) Qᵀ with the images of the whole model, without these errors.
     _, sizes, rows = np.linalg.svd(images, full_matrices=False)
     seen = G @ rows.T

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, Solution
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior, Point, Prior
 from inverse.fields.low_rank import leading_pairs
 
@@ -75,7 +76,7 @@ def of_field(
     import xarray as xr
 
     data = np.where(goals, np.nan, 0.0)
-    posterior = FieldPosterior(model, data, sigma, prior)
+    posterior = FieldPosterior(model, data, Noise(sigma), prior)
     point = Point(posterior, whitened, posterior.values(whitened), solution)
     spectrum = leading_pairs(point.jvp, point.vjp, posterior.size, rank=rank, seed=seed)
     directions = prior.root(spectrum.vectors)

@@ -15,15 +15,14 @@ Vectors are rows: k of them are (k, N) in the field and (k, n) in the data.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
-from inverse.data.approximation_error import ApproximationError, Whitening
-from inverse.data.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
+from inverse.data.noise import HALF_LOG, Noise
 
 BLOCK = 32  # vectors whose products are computed together
 
@@ -59,40 +58,29 @@ class FieldPosterior:
         The model; all of its parameters are values of the field.
     data
         y (n,), in the units of the outputs; NaN where nothing was measured.
-    sigma
-        Standard deviations σ (n,) of the errors.
+    noise
+        The errors, of known size; a model misses the same for all fields.
     prior
         Prior of the differences from `mean`.
     mean
         m_0 (N,); by default zero.
     progress
         Told of each solve, and whether it failed.
-    errors
-        Distribution of the errors over their scale σ.
-    mesh
-        What the mesh of the model takes away from the outputs, the same for all fields; None where that is not known,
-        or nothing.
-    shared
-        (k, n): errors that the data share, a row for a standard deviation of each; None if there are none.
     """
 
     model: ForwardModel
     data: FloatArray
-    sigma: FloatArray
+    noise: Noise
     prior: Prior
     mean: FloatArray | None = None
     counts: Counts = field(default_factory=Counts)
     progress: Callable[[int, int], None] = lambda done, failed: None
-    errors: NormalErrors | StudentErrors = NORMAL
-    mesh: ApproximationError | None = None
-    shared: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
-        if self.data.shape != (n,) or self.sigma.shape != (n,):
-            raise ValueError(f"{self.data.size} data and {self.sigma.size} standard deviations, expected {n} of each")
-        if not (self.sigma > 0).all():
-            raise ValueError(f"standard deviation of the errors {self.sigma.min():g}, expected positive ones")
+        sigma = self.noise.sigma
+        if self.data.shape != (n,) or sigma.shape != (n,):
+            raise ValueError(f"{self.data.size} data and {sigma.size} standard deviations, expected {n} of each")
         if not self.measured.any():
             raise ValueError("all data are NaN, expected at least one number")
 
@@ -107,18 +95,14 @@ class FieldPosterior:
         return np.isfinite(self.data).astype(float)
 
     @cached_property
-    def whitening(self) -> Whitening:
-        """What makes the errors of what was measured independent."""
-        mesh = self.mesh
-        if mesh is not None:
-            mesh = replace(mesh, root=mesh.root * self.measured, apart=mesh.apart * self.measured)
-        shared = None if self.shared is None else self.shared * self.measured
-        return Whitening.of(self.sigma, mesh, self.errors, shared)
+    def seen(self) -> Noise:
+        """The errors of what was measured."""
+        return self.noise.seen(self.measured)
 
     @cached_property
     def weights(self) -> FloatArray:
         """1/σ (n,) of what was measured."""
-        return self.measured / self.whitening.sigma
+        return self.measured / self.seen.scale
 
     def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
@@ -169,35 +153,35 @@ class Point:
         """Predicted minus measured outputs, over σ (n,); zero where nothing was measured."""
         posterior = self.posterior
         gap = np.where(posterior.measured > 0, self.predicted_outputs - posterior.data, 0.0)
-        return posterior.whitening(posterior.weights * gap)
+        return posterior.seen.whitened(posterior.weights * gap)
 
     @property
     def predicted_outputs(self) -> FloatArray:
         """What is predicted (n,), corrected where the error of the mesh is known."""
-        mesh = self.posterior.mesh
-        return np.asarray(self.solution.outputs if mesh is None else self.solution.outputs + mesh.error)
+        missed = self.posterior.noise.model
+        return np.asarray(self.solution.outputs if missed is None else self.solution.outputs + missed.error)
 
     @cached_property
     def root(self) -> FloatArray:
-        """√ (n,) of the weights of the data for Gauss–Newton: 1 for normal errors, see `inverse.data.errors`."""
-        return np.asarray(np.sqrt(self.posterior.errors.information(self.gaps)))
+        """√ (n,) of the weights of the data for Gauss–Newton: 1 for normal errors, see `inverse.data.noise`."""
+        return np.asarray(np.sqrt(self.posterior.noise.errors.information(self.gaps)))
 
     @cached_property
     def residual(self) -> FloatArray:
         """Residuals r (n,); for errors that are not normal, with the same gradient under Gauss–Newton weights."""
-        return np.asarray(self.posterior.errors.score(self.gaps) / self.root)
+        return np.asarray(self.posterior.noise.errors.score(self.gaps) / self.root)
 
     @cached_property
     def misfit(self) -> float:
         """−ln p(y | ξ) without Σ ln σ + (n/2) ln 2π: ½ r·r for normal errors."""
-        minus_log = self.posterior.errors.minus_log(self.gaps) - HALF_LOG
+        minus_log = self.posterior.noise.errors.minus_log(self.gaps) - HALF_LOG
         return float(self.posterior.measured @ minus_log)
 
     @property
     def log_likelihood(self) -> float:
         """Ln p(y | ξ)."""
         weights = self.posterior.weights[self.posterior.weights > 0]
-        more = self.posterior.whitening.log_determinant
+        more = self.posterior.seen.log_determinant
         return -self.misfit - more + float(np.log(weights).sum()) - len(weights) * HALF_LOG
 
     @property
@@ -219,12 +203,12 @@ class Point:
         """Return the Jacobian-vector product Aξ (n,), or (k, n) for k of them."""
         posterior = self.posterior
         moved = posterior.weights * self.solution.tangent(posterior.prior.root(whitened))
-        return self.root * posterior.whitening(moved)
+        return self.root * posterior.seen.whitened(moved)
 
     def vjp(self, data: FloatArray) -> FloatArray:
         """Return the vector-Jacobian product Aᵀr (N,), or (k, N) for k of them."""
         posterior = self.posterior
-        weights = posterior.weights * posterior.whitening(self.root * data)
+        weights = posterior.weights * posterior.seen.whitened(self.root * data)
         return posterior.prior.root_transposed(self.solution.adjoint(weights))
 
     def product(self, whitened: FloatArray) -> FloatArray:

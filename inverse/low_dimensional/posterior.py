@@ -5,7 +5,7 @@ With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) +
     −ln p(y | x) = ½ r·r + Σ ln(s σ_i) + (m/2) ln 2π,   r_i = (ψ_i(ω) − y_i)/(s σ_i),
 
 where s = 1, or is unknown too, with its own prior and one more coordinate. The prior of x is normalised, so that
-evidences of different models are comparable (for errors with heavy tails see `inverse.data.errors`):
+evidences of different models are comparable (for errors with heavy tails see `inverse.data.noise`):
 
     Z = ∫ p(y | x) N(x; 0, I) dx.
 
@@ -13,7 +13,7 @@ If the model is defined only on a part A of the prior (`Inputs.admissible`), the
 elsewhere: outside A the model has no answer, and p(y | x) here includes the factor 1/P(A).
 
 Where the error of the model's mesh is known, ψ is corrected by it, and what is uncertain of that is another error of
-the data (`inverse.data.approximation_error`): r is then W r.
+the data (`inverse.data.noise`): r is then W r.
 
 Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
 multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
@@ -24,17 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from inverse.data.approximation_error import ApproximationError, Whitening
-from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from inverse.data.noise import Noise
 from uq.evaluation.request import Evaluate, Request, Start
-from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
 NOISE = "noise"  # name of the coordinate of s
@@ -102,100 +99,82 @@ class Posterior:
         The model.
     data
         y (m,), in the units of the outputs.
-    sigma
-        Standard deviations σ (m,) of the errors, up to the factor s if that is unknown.
     noise
-        Prior of s; None for s = 1.
+        The errors.
     which
         Outputs of the model that were measured: numbers (m,), or all of a slice.
     start
         Initial guesses of the solver.
-    errors
-        Distribution of the errors over their scale sσ.
-    mesh
-        What the mesh of the model takes away from the data; None where that is not known, or nothing.
-    shared
-        (k, m): errors that the data share, a row for a standard deviation of each; None if there are none.
     """
 
     inputs: Inputs
     evaluate: Evaluate
     data: FloatArray
-    sigma: FloatArray
-    noise: Distribution | None = None
+    noise: Noise
     which: NDArray[np.int64] | slice = field(default_factory=lambda: slice(None))
     start: Start | None = None
-    errors: NormalErrors | StudentErrors = NORMAL
-    mesh: ApproximationError | None = None
-    shared: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        if self.data.shape != self.sigma.shape:
-            message = f"{self.data.size} data with {self.sigma.size} standard deviations, expected equal numbers"
+        if self.data.shape != self.noise.sigma.shape:
+            message = f"{self.data.size} data with {self.noise.sigma.size} standard deviations, expected equal numbers"
             raise ValueError(message)
-        if not (self.sigma > 0).all():
-            raise ValueError(f"standard deviation of the errors {self.sigma.min():g}, expected positive ones")
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the c coordinates: the parameters, and the noise if it is unknown."""
-        return self.inputs.names + ((NOISE,) if self.noise is not None else ())
+        return self.inputs.names + ((NOISE,) if self.noise.factor is not None else ())
 
     def physical(self, x: FloatArray) -> FloatArray:
         """Return the parameters, and s if it is unknown, (n, c) at x (n, c)."""
         d = len(self.inputs.names)
         values = self.inputs.from_normals(x[:, :d])[0]
-        if self.noise is None:
+        if self.noise.factor is None:
             return values
-        return np.column_stack([values, self.noise.from_normal(x[:, d])[0]])
+        return np.column_stack([values, self.noise.factor.from_normal(x[:, d])[0]])
 
     def slopes(self, x: FloatArray) -> FloatArray:
         """Return the derivatives (n, c, c) of the parameters, and of s if it is unknown, by x (n, c)."""
         d, (n, c) = len(self.inputs.names), x.shape
         found = np.zeros((n, c, c))
         found[:, :d, :d] = self.inputs.from_normals(x[:, :d])[1]
-        if self.noise is not None:
-            found[:, d, d] = self.noise.from_normal(x[:, d])[1]
+        if self.noise.factor is not None:
+            found[:, d, d] = self.noise.factor.from_normal(x[:, d])[1]
         return found
-
-    @cached_property
-    def whitening(self) -> Whitening:
-        """What makes the errors independent."""
-        return Whitening.of(self.sigma, self.mesh, self.errors, self.shared)
 
     def scale(self, x: FloatArray) -> FloatArray:
         """Return the standard deviations (n, m) of the independent errors at x (n, c)."""
-        s = np.ones(len(x)) if self.noise is None else self.noise.from_normal(x[:, -1])[0]
-        return s[:, None] * self.whitening.sigma
+        factor = self.noise.factor
+        s = np.ones(len(x)) if factor is None else factor.from_normal(x[:, -1])[0]
+        return s[:, None] * self.noise.scale
 
     def residuals(self, outputs: FloatArray, x: FloatArray) -> FloatArray:
         """Return independent residuals (n, m) of corrected outputs (n, m) at x (n, c)."""
-        return self.whitening((outputs - self.data) / self.scale(x))
+        return self.noise.whitened((outputs - self.data) / self.scale(x))
 
     def output_slopes(self, at: Density) -> FloatArray:
         """Return derivatives (n, m, d) of the corrected outputs by the normal coordinates of the parameters."""
         assert at.tangents is not None
         tangents = at.tangents[:, self.which]
-        if self.mesh is not None and self.mesh.slopes.size:
-            tangents = tangents + self.mesh.slopes
+        if self.noise.model is not None and self.noise.model.slopes.size:
+            tangents = tangents + self.noise.model.slopes
         return np.asarray(tangents @ self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1])
 
     def sensitivities(self, at: Density) -> FloatArray:
         """Return derivatives (n, m, d) of these residuals by the normal coordinates of the parameters."""
         A = self.output_slopes(at) / self.scale(at.x)[:, :, None]
-        return np.swapaxes(self.whitening(np.swapaxes(A, 1, 2)), 1, 2)
+        return np.swapaxes(self.noise.whitened(np.swapaxes(A, 1, 2)), 1, 2)
 
     def _misfit(self, residual: FloatArray, x: FloatArray) -> FloatArray:
         """−ln of the likelihood (n,) of independent residuals (n, m) at x (n, c)."""
-        logs = np.log(self.scale(x)).sum(axis=1) + self.whitening.log_determinant
-        return np.asarray(self.errors.misfit(residual, logs) + np.log(self.inputs.admitted))
+        logs = np.log(self.scale(x)).sum(axis=1) + self.noise.log_determinant
+        return np.asarray(self.noise.errors.misfit(residual, logs) + np.log(self.inputs.admitted))
 
     def potential(self, x: FloatArray, model: ForwardModel) -> tuple[float, FloatArray]:
         """Return −ln p(y | x) + ½|x|² at x (c,), and its gradient (c,), by one solve of the model and one adjoint.
 
         Where the model has no answer that is infinite, and the gradient zero. Collective over the ranks of the model.
         """
-        d, m, here = len(self.inputs.names), self.data.size, x[None]
+        d, m, here, noise = len(self.inputs.names), self.data.size, x[None], self.noise
         point, slopes = self.inputs.from_normals(here[:, :d])
         guess = None if self.start is None else self.start.on(model)(point[0])
         try:
@@ -203,33 +182,33 @@ class Posterior:
         except SolveError:
             return np.inf, np.zeros(len(x))
         outputs = np.asarray(solution.outputs)[None, self.which]
-        if self.mesh is not None:
-            outputs = outputs + self.mesh.at(point)
+        if noise.model is not None:
+            outputs = outputs + noise.model.at(point)
         residual = self.residuals(outputs, here)
-        score = self.errors.score(residual)
-        pull = (self.whitening(score) / self.scale(here))[0]  # W is symmetric
+        score = noise.errors.score(residual)
+        pull = (noise.whitened(score) / self.scale(here))[0]  # W is symmetric
         weights = np.zeros(len(model.outputs))
         np.add.at(weights, np.arange(len(weights))[self.which], pull)
         by_parameters = solution.adjoint(weights)
-        if self.mesh is not None and self.mesh.slopes.size:
-            by_parameters = by_parameters + pull @ self.mesh.slopes
+        if noise.model is not None and noise.model.slopes.size:
+            by_parameters = by_parameters + pull @ noise.model.slopes
         gradient = x.copy()
         gradient[:d] += by_parameters @ slopes[0]
-        if self.noise is not None:
-            s, s_slope = self.noise.from_normal(here[:, d])
+        if noise.factor is not None:
+            s, s_slope = noise.factor.from_normal(here[:, d])
             gradient[d] += float(((m - (residual * score).sum(axis=1)) * s_slope / s)[0])
         return float(self._misfit(residual, here)[0] + x @ x / 2), gradient
 
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
         """Solve at the points x (n, c)."""
         d, m = len(self.inputs.names), self.data.size
-        errors = self.errors
+        errors = self.noise.errors
         n, c = x.shape
         points = self.inputs.from_normals(x[:, :d])[0]
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
         outputs = found.outputs[:, self.which]
-        if self.mesh is not None:
-            outputs = outputs + self.mesh.at(points)
+        if self.noise.model is not None:
+            outputs = outputs + self.noise.model.at(points)
         residual = self.residuals(outputs, x)
         log_likelihood = np.where(found.ok, -self._misfit(residual, x), -np.inf)
         empty = np.zeros((n, 0))
@@ -241,8 +220,8 @@ class Posterior:
         score = errors.score(residual)
         gradient = x + np.einsum("zm,zmc->zc", score, A)
         curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, errors.information(residual), A)
-        if self.noise is not None:
-            s, s_slope = self.noise.from_normal(x[:, d])
+        if self.noise.factor is not None:
+            s, s_slope = self.noise.factor.from_normal(x[:, d])
             ln_s_slope = s_slope / s
             # r falls with ln s: d(Σρ + m ln s)/d ln s = m − r·ψ; the second derivatives are exact in ln s.
             gradient[:, d] += (m - (residual * score).sum(axis=1)) * ln_s_slope

@@ -147,7 +147,7 @@ def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel,
 def _corrected(inputs: Inputs, full: Evaluate, cheap: Evaluate, problem: Problem) -> tuple[Linearisation, Corrected]:
     """Search with the reduced model as it is, and solve the body where that ends."""
     data, method = problem.data, problem.method
-    posterior = Posterior(inputs, cheap, data.values, data.sigma, method.noise, data.which, errors=problem.errors)
+    posterior = Posterior(inputs, cheap, data.values, problem.noise, data.which)
     gaussian = laplace(posterior, starts=method.starts, seed=method.seed, exact=False)
     point = posterior.physical(gaussian.mode[None])[0, : len(inputs.names)]
     own = cheap(Request(point[None], tangents=True))

@@ -99,14 +99,14 @@ def infer(
     """
     d = len(posterior.inputs.names)
     if shared is not None:
-        posterior = replace(posterior, shared=shared(posterior.inputs.mean))
+        posterior = _sharing(posterior, shared(posterior.inputs.mean))
     if posterior.start is None:
         with suppress(SolveError):  # or else every solve begins at zero
             posterior = replace(posterior, start=start(posterior.inputs.mean))
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = laplace(posterior, starts=starts, seed=seed)
     if shared is not None:  # which depends on the displacements
-        posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
+        posterior = _sharing(posterior, shared(posterior.physical(gaussian.mode[None])[0, :d]))
         gaussian = laplace(posterior, starts=1, first=gaussian.mode)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     if look is not None:
@@ -114,6 +114,10 @@ def infer(
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
     one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed)
     return Inferred(posterior, searched, one, mesh, before)
+
+
+def _sharing(posterior: Posterior, shared: FloatArray) -> Posterior:
+    return replace(posterior, noise=replace(posterior.noise, shared=shared))
 
 
 def by_tangents(inputs: Inputs, evaluate: Evaluate) -> Starts:

@@ -130,9 +130,9 @@ def invert_few(
     SolveError
         If the model has no answer where the search needs one.
     """
-    data, method, errors = problem.data, problem.method, problem.errors
+    data, method = problem.data, problem.method
     counted = Recorder(evaluate)
-    of_data_set = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
+    of_data_set = Posterior(inputs, counted, data.values, problem.noise, data.which)
     solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
     looked = None if problem.finer is None else Looked(problem.finer, data, method.treatment)
     inferred = infer(
@@ -154,6 +154,7 @@ def invert_few(
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
+    errors = posterior.noise.errors
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, data.neighbours())
     verdict = verdict_on_few(gaussian, found, test, chains)
@@ -166,7 +167,7 @@ def invert_few(
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
-        **of_motions(spectrum, posterior.whitening, posterior.shared, root),
+        **of_motions(spectrum, posterior.noise, root),
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(posterior, drawn.draws, drawn.outputs),
@@ -260,7 +261,7 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Me
 
 def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:
     """Draws of equal weight with what the data say of each."""
-    s = np.ones(len(draws)) if posterior.noise is None else draws[:, -1]
-    scale = s[:, None] * posterior.whitening.sigma
-    gaps = posterior.whitening((outputs - posterior.data) / scale)
-    return {"draw": draws, "draw_log_likelihood": -posterior.errors.minus_log(gaps) - np.log(scale)}
+    noise = posterior.noise
+    scale = (np.ones(len(draws)) if noise.factor is None else draws[:, -1])[:, None] * noise.scale
+    gaps = noise.whitened((outputs - posterior.data) / scale)
+    return {"draw": draws, "draw_log_likelihood": -noise.errors.minus_log(gaps) - np.log(scale)}

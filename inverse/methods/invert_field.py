@@ -23,7 +23,7 @@ from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode, find_mode
-from inverse.fields.noise import SolvedField, infer_noise
+from inverse.fields.noise_size import SolvedField, infer_noise
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import corrected_field, told
 from inverse.methods.record import (
@@ -67,8 +67,8 @@ class Vertices:
 
 
 def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) -> SolvedField:
-    if method.noise is not None:
-        return infer_noise(posterior, method.noise, start=start, cutoff=method.cutoff, rank=method.rank)
+    if posterior.noise.factor is not None:
+        return infer_noise(posterior, start=start, cutoff=method.cutoff, rank=method.rank)
     mode = find_mode(posterior, start)
     found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
     return SolvedField(mode, found, mode.converged)
@@ -94,9 +94,10 @@ def invert_field(
     before = _before(posterior, finer, problem.say) if method.treatment is not None else None
     first = None
     if shared is not None:  # which depends on the displacements
-        posterior = replace(posterior, shared=shared(posterior.values(np.zeros(posterior.size))))
-        begun = _solve(method, posterior, None).mode.point
-        posterior, first = replace(posterior, shared=shared(begun.values)), begun.whitened
+        noise = replace(posterior.noise, shared=shared(posterior.values(np.zeros(posterior.size))))
+        begun = _solve(method, replace(posterior, noise=noise), None).mode.point
+        noise, first = replace(noise, shared=shared(begun.values)), begun.whitened
+        posterior = replace(posterior, noise=noise)
 
     def solve(asked: FieldPosterior, start: FloatArray | None) -> SolvedField:
         return _solve(method, asked, first if start is None else start)
@@ -106,8 +107,8 @@ def invert_field(
     mode, found, converged, factor = solved.mode, solved.found, solved.converged, solved.factor
     log_evidence = solved.log_evidence
     spectrum = found.spectrum
-    errors, root = posterior.errors, mode.point.root
-    residual = errors.normal_scores(mode.point.gaps)
+    root = mode.point.root
+    residual = posterior.noise.errors.normal_scores(mode.point.gaps)
     test = examine(residual, spectrum, data.neighbours())
     samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
@@ -121,7 +122,7 @@ def invert_field(
     error = np.nan
     if log_evidence is None and weighed is not None and weighed.trusted:
         log_evidence, error = weighed.log_evidence, weighed.error
-    scale = mode.point.posterior.whitening.sigma  # with the factor where that is inferred
+    scale = mode.point.posterior.seen.scale  # with the factor where that is inferred
     cases = int(data.cases.max()) + 1
     inferred_noise = (factor, solved.log_std) if method.noise is not None else None
     corrected = _corrected(verdict, weighed, chains, drawn)
@@ -129,7 +130,7 @@ def invert_field(
     mean = _of_mean(found, vertices, inferred_noise, corrected)
     stiffness = _of_stiffness(found, vertices, method, corrected)
     record: Record = {
-        **of_motions(spectrum, mode.point.posterior.whitening, posterior.shared, root),
+        **of_motions(spectrum, mode.point.posterior.seen, root),
         **of_data(data, predicted, residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(mode.point.whitened, spectrum),

@@ -1,6 +1,6 @@
 """Posteriors corrected for the error of the mesh: found at the mode on finer meshes, and again at the next mode.
 
-Each round solves on the finer meshes at the mode, corrects the model there (`inverse.data.approximation_error`) and
+Each round solves on the finer meshes at the mode, corrects the model there (`inverse.data.noise`) and
 searches on from that mode, until the error at the new mode moves no unknown any more. Of few parameters the derivatives
 of the error are known too. Of a field they are left out: they move its mode by Γ_post(A_f − A)ᵀr, a share of its
 deviations as small as that by which the mesh changes the derivatives A of what the data see well.
@@ -17,21 +17,26 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
-from inverse.data.approximation_error import OF_DATUM, ApproximationError, along, uncertain
 from inverse.data.measurements import Measurements
+from inverse.data.noise import ModelError, Noise
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior
-    from inverse.fields.noise import SolvedField
+    from inverse.fields.noise_size import SolvedField
 
 
 Treatment = Literal["correct", "report"]
 S = TypeVar("S")
 # An error, None where nothing tells it; what it does; and how far it moves unknowns at most.
-Seen = tuple[ApproximationError | None, MeshFound, float]
+Seen = tuple[ModelError | None, MeshFound, float]
+# Standard deviations of what finer meshes still miss: of the pattern of the difference between them and of the error
+# itself, over these, and datum by datum, over the difference (chosen by `python -m benchmarks meshes`).
+OF_DIFFERENCE, OF_ERROR, OF_DATUM = 0.35, 0.1, 0.3
+# And along each direction of a field that the data determine (chosen by `python -m benchmarks meshes_of_fields`).
+OF_DIRECTION = 0.5
 
 
 class MeshTreatment:
@@ -76,20 +81,69 @@ def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -
     own = posterior.evaluate(Request(point[None], start=posterior.start))
     if look is None or own.failures:
         return np.nan
-    error = (look.outputs - own.outputs[0])[posterior.which] / posterior.sigma
+    error = (look.outputs - own.outputs[0])[posterior.which] / posterior.noise.sigma
     return told(error, error.size, say)
 
 
 def error_of(
     look: Look, outputs: FloatArray, point: FloatArray, data: Measurements, tangents: FloatArray | None = None
-) -> ApproximationError:
+) -> ModelError:
     """Return the error of a mesh on which a model has outputs (m,) at parameters (d,), and tangents (m, d)."""
     slopes = np.zeros((len(outputs), 0))
     if tangents is not None and look.tangents is not None:
         slopes = look.tangents - tangents
     error = look.outputs - outputs
     root, apart = uncertain(error, look.between, data), OF_DATUM * np.abs(look.between)
-    return ApproximationError(point, error, slopes, root, apart)
+    return ModelError(point, error, slopes, root, apart)
+
+
+def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> FloatArray:
+    """Return Uᵀ (k, m): what finer meshes still miss, of the patterns of the error and of the difference between them.
+
+    The rest is extrapolated by one factor; in truth the factor is another in each load case, for each component, and
+    varies slowly over the body.
+
+    Parameters
+    ----------
+    error
+        δ (m,).
+    between
+        Difference (m,) between the two finer meshes.
+    data
+        What the data are, and where.
+    """
+    somewhere, points, groups = np.isfinite(data.places).all(axis=1), data.places, data.kinds
+    seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    across = np.zeros((len(between), 3))
+    across[somewhere] = 2 * (points[somewhere] - low) / np.where(high > low, high - low, 1.0) - (high > low)
+    shapes = [np.ones(len(between)), *across.T]
+    patterns = (OF_DIFFERENCE * between, OF_ERROR * error)
+    rows = [
+        pattern * shape * (groups == group) for pattern in patterns for group in np.unique(groups) for shape in shapes
+    ]
+    found = np.array(rows).reshape(-1, len(between))
+    return np.asarray(found[np.abs(found).max(axis=1, initial=0.0) > 0])
+
+
+def along(images: FloatArray, between: FloatArray, noise: Noise) -> FloatArray:
+    """Return rows (r, m) of what is uncertain along the directions of a field, in addition to `uncertain`.
+
+    What the data determine best is what few patterns of all data determine, and a rest that is small in every datum may
+    lie along these: there it counts as much as the difference between the finer meshes.
+
+    Parameters
+    ----------
+    images
+        A u (r, m) of orthogonal directions u of the field: orthogonal patterns in independent errors.
+    between
+        Difference (m,) between the two finer meshes.
+    noise
+        The errors without those of the mesh.
+    """
+    patterns = images / np.maximum(np.linalg.norm(images, axis=1, keepdims=True), 1e-300)
+    seen = OF_DIRECTION * np.abs(patterns @ noise.whitened(between / noise.scale))
+    return np.asarray(seen[:, None] * noise.coloured(patterns) * noise.scale)
 
 
 def part(look: Look, which: NDArray[np.int64] | slice) -> Look:
@@ -98,7 +152,7 @@ def part(look: Look, which: NDArray[np.int64] | slice) -> Look:
 
 
 def _rounds(
-    here: S, looked: Callable[[S], Seen], again: Callable[[S, ApproximationError], S], treatment: Treatment
+    here: S, looked: Callable[[S], Seen], again: Callable[[S, ModelError], S], treatment: Treatment
 ) -> tuple[S, MeshFound]:
     """Look at the error of the mesh where a search has ended, and search again with it, until it moves nothing more."""
     known: MeshFound | None = None
@@ -128,7 +182,7 @@ def corrected_few(
 
     def looked(here: tuple[Posterior, Laplace]) -> Seen:
         posterior, gaussian = here
-        x, mesh = gaussian.mode[None], posterior.mesh
+        x, mesh, noise = gaussian.mode[None], posterior.noise.model, posterior.noise
         at = posterior.at(x, derivatives=True)
         point = at.parameters[0]
         look, why = finer.look(point, tangents=True)
@@ -138,24 +192,24 @@ def corrected_few(
         tangents = at.tangents[0, posterior.which]
         found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, data, tangents)
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
-        root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, x)))[0]
+        root = np.sqrt(noise.errors.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
         deviations = np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T))
         rest = found.error if mesh is None else found.error - mesh.at(point[None])[0]
-        shift = parameters_moved(posterior, gaussian, A, root * posterior.whitening(rest / scale)) / deviations
-        factor = 1.0 if posterior.noise is None else posterior.physical(x)[0, -1]
+        shift = parameters_moved(posterior, gaussian, A, root * noise.whitened(rest / scale)) / deviations
+        factor = 1.0 if noise.factor is None else posterior.physical(x)[0, -1]
         largest, left = np.abs(shift).max(), np.zeros(d)
         if mesh is not None:
             gain = slopes @ np.linalg.solve(gaussian.hessian[:d, :d], (root[:, None] * A).T)
-            left = _left(posterior.whitening(gain) / scale, mesh) / deviations
+            left = _left(noise.whitened(gain) / scale, mesh) / deviations
             # The size of the noise that the covariance was made for must be that of this mode too.
             largest = max(largest, abs(np.log(factor / mesh.scale)))
         added = _evidence(posterior, at, found.error)
-        known = MeshFound("", found.error / (factor * posterior.sigma), shift, left, log_evidence=added)
+        known = MeshFound("", found.error / (factor * noise.sigma), shift, left, log_evidence=added)
         return replace(found, scale=float(factor)), known, float(largest)
 
-    def again(here: tuple[Posterior, Laplace], mesh: ApproximationError) -> tuple[Posterior, Laplace]:
-        corrected = replace(here[0], mesh=mesh)
+    def again(here: tuple[Posterior, Laplace], mesh: ModelError) -> tuple[Posterior, Laplace]:
+        corrected = replace(here[0], noise=replace(posterior.noise, model=mesh))
         return corrected, laplace(corrected, starts=1, first=here[1].mode, exact=False)
 
     (there, best), known = _rounds((posterior, gaussian), looked, again, treatment)
@@ -170,12 +224,12 @@ def corrected_few(
 
 def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
     """What predictions that are larger by `error` (m,) add to ln Z of the model that is linear at a point."""
-    alone = replace(posterior, mesh=None)
-    white = alone.whitening
-    d, s = len(posterior.inputs.names), float((alone.scale(at.x) / white.sigma)[0, 0])
+    noise = replace(posterior.noise, model=None)
+    alone = replace(posterior, noise=noise)
+    d, s = len(posterior.inputs.names), float((alone.scale(at.x) / noise.scale)[0, 0])
     A = s * alone.sensitivities(at)[0]
-    residual = white((posterior.data - at.everything[0, posterior.which]) / white.sigma)
-    return evidence_moved(A, residual + A @ at.x[0, :d], white(error / white.sigma), posterior.noise)
+    residual = noise.whitened((posterior.data - at.everything[0, posterior.which]) / noise.scale)
+    return evidence_moved(A, residual + A @ at.x[0, :d], noise.whitened(error / noise.scale), noise.factor)
 
 
 def corrected_field(
@@ -204,13 +258,15 @@ def corrected_field(
 
     def looked(here: SolvedField) -> Seen:
         nonlocal moved
-        point, mesh = here.mode.point, here.mode.point.posterior.mesh
+        point, mesh = here.mode.point, here.mode.point.posterior.noise.model
         look, why = finer.look(point.values)
         if look is None:
             return None, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1), 0.0
         found = error_of(look, np.asarray(point.solution.outputs), point.values, data)
-        found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.whitening)]))
-        over = found.error * posterior.measured / point.posterior.sigma  # nothing is said of data that are not there
+        found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.seen)]))
+        over = (
+            found.error * posterior.measured / point.posterior.noise.sigma
+        )  # nothing is said of data that are not there
         moved = _moved(here, found.error if mesh is None else found.error - mesh.error)
         width = here.found.marginal(weights)[1]
         shift = np.array([weights @ moved / width])
@@ -218,8 +274,8 @@ def corrected_field(
         left = np.zeros(1) if mesh is None else _left(_gain(here, weights)[None], mesh) / width
         return found, MeshFound("", over, shift, left), largest
 
-    def again(here: SolvedField, mesh: ApproximationError) -> SolvedField:
-        return solve(replace(posterior, mesh=mesh), here.mode.point.whitened)
+    def again(here: SolvedField, mesh: ModelError) -> SolvedField:
+        return solve(replace(posterior, noise=replace(posterior.noise, model=mesh)), here.mode.point.whitened)
 
     here, known = _rounds(first, looked, again, treatment)
     if known.corrected:
@@ -231,7 +287,7 @@ def corrected_field(
 def _moved(here: SolvedField, error: FloatArray) -> FloatArray:
     """How far (N,) the mode of a field moves where data are predicted larger by `error` (n,), in their units."""
     point, spectrum = here.mode.point, here.found.spectrum
-    over = point.root * point.posterior.whitening(point.posterior.weights * error)
+    over = point.root * point.posterior.seen.whitened(point.posterior.weights * error)
     return np.asarray(-(spectrum.images @ over / (1 + spectrum.values)) @ here.found.directions)
 
 
@@ -239,9 +295,9 @@ def _gain(here: SolvedField, weights: FloatArray) -> FloatArray:
     """How far (n,) the mean of a field over the body moves with each of the data, in their units."""
     point, spectrum = here.mode.point, here.found.spectrum
     over = spectrum.images.T @ (here.found.directions @ weights / (1 + spectrum.values))
-    return np.asarray(point.posterior.weights * point.posterior.whitening(point.root * over))
+    return np.asarray(point.posterior.weights * point.posterior.seen.whitened(point.root * over))
 
 
-def _left(gain: FloatArray, mesh: ApproximationError) -> FloatArray:
+def _left(gain: FloatArray, mesh: ModelError) -> FloatArray:
     """Standard deviations (k,) by what is uncertain of a mesh, of estimates with derivatives (k, n) by the data."""
     return np.asarray(np.linalg.norm(np.hstack([gain @ mesh.root.T, gain * mesh.apart]), axis=1))

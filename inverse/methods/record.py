@@ -18,9 +18,8 @@ from forward.model import FloatArray
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.predictive import ResidualTest
-from inverse.data.approximation_error import Whitening
-from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.data.measurements import Measurements
+from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
@@ -106,6 +105,11 @@ class Problem:
     finer: Finer | None = NOT_LOOKED
     shared: Shared | None = None
     say: Callable[[str], None] = field(default=lambda line: None)
+
+    @property
+    def noise(self) -> Noise:
+        """The errors of the data, as they are stated."""
+        return Noise(self.data.sigma, self.errors, self.method.noise)
 
 
 def as_dataset(record: Record) -> xr.Dataset:
@@ -209,9 +213,9 @@ def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
     return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
 
 
-def of_motions(spectrum: Spectrum, whitening: Whitening, shared: FloatArray | None, root: FloatArray) -> Record:
+def of_motions(spectrum: Spectrum, noise: Noise, root: FloatArray) -> Record:
     """What the data say about rigid motions that are uncertain; none if none is."""
-    return {} if shared is None else {"motion_eigenvalue": determined(spectrum, whitening, shared, root)}
+    return {} if noise.shared is None else {"motion_eigenvalue": determined(spectrum, noise, root)}
 
 
 def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:

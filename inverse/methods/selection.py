@@ -25,6 +25,7 @@ from inverse.criticism.finer import Finer
 from inverse.criticism.verdict import verdict_on_points
 from inverse.criticism.weights import fewest
 from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise
 from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST, nested
 from inverse.low_dimensional.laplace import Laplace
@@ -42,7 +43,7 @@ STATED = "as stated"
 NonNegative = Annotated[float, Field(ge=0)]
 
 
-class Noise(Settings):
+class StatedNoise(Settings):
     """Errors of the data: independent and normal, with standard deviation s σ_i, σ_i = max(relative |y_i|, absolute).
 
     Parameters
@@ -80,6 +81,13 @@ class Noise(Settings):
             raise ValueError("relative noise vanishes where a datum is zero, expected a floor: absolute = ...")
         return sigma
 
+    def of(self, data: Measurements, other: Noise | None = None) -> Noise:
+        """Return the errors of data (m,), with what they share and a model misses as in others; errors as above."""
+        sigma = self.sigma_of(data)
+        if other is None:
+            return Noise(sigma, factor=self.factor)
+        return replace(other, sigma=sigma, factor=self.factor)
+
 
 class Select(Settings):
     """Bayesian model selection: evidence and probability of every candidate, and how far they can be trusted.
@@ -109,8 +117,8 @@ class Select(Settings):
 
     kind: Literal["select"] = "select"
     samples: Annotated[int, Field(ge=LEAST)] = 256
-    noise: Noise
-    other_noises: dict[str, Noise] = Field(default={})
+    noise: StatedNoise
+    other_noises: dict[str, StatedNoise] = Field(default={})
     subsets: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
     held_out: bool = False
     seed: Annotated[int, Field(ge=0)] = 0
@@ -214,9 +222,9 @@ class Select(Settings):
                 pair: one.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, one in stated.items()
             }
         for label, noise in self.other_noises.items():
-            sigma = {group: noise.sigma_of(data.seen()) for group, data in data_groups.items()}
             variants[label] = {
-                pair: value(replace(posteriors[pair], sigma=sigma[pair[1]], noise=noise.factor), pair) for pair in pairs
+                pair: value(replace(one, noise=noise.of(data_groups[pair[1]].seen(), one.noise)), pair)
+                for pair, one in posteriors.items()
             }
         for label, tests in self.subsets.items():
             variants[label] = {
@@ -264,11 +272,11 @@ class SelectSpecimens(MeshTreatment, Select):
     mesh_check: bool = True
 
 
-def posterior(candidate: Candidate, data: Measurements, noise: Noise, evaluate: Evaluate) -> Posterior:
+def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, evaluate: Evaluate) -> Posterior:
     """Return the posterior of a candidate."""
     seen = data.seen()
     which = np.arange(len(seen))  # what is only predicted follows
-    return Posterior(candidate.inputs, evaluate, seen.values, noise.sigma_of(seen), noise.factor, which)
+    return Posterior(candidate.inputs, evaluate, seen.values, noise.of(seen), which)
 
 
 def _without(
@@ -291,18 +299,14 @@ def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
     """What the data say about rigid motions that are uncertain, at the mode, as `determined`."""
     from inverse.criticism.predictive import spectrum_of
 
-    assert posterior.shared is not None
     at = posterior.at(gaussian.mode[None], derivatives=True)
-    return determined(spectrum_of(posterior, at), posterior.whitening, posterior.shared, np.ones(posterior.data.size))
+    return determined(spectrum_of(posterior, at), posterior.noise, np.ones(posterior.data.size))
 
 
 def _only(posterior: Posterior, data: Measurements, tests: tuple[str, ...]) -> Posterior:
     """The same with the data of some tests only."""
     which = np.flatnonzero(np.isin(data.seen().tests, tests))
-    mesh = None if posterior.mesh is None else posterior.mesh.of(which)
-    shared = None if posterior.shared is None else posterior.shared[:, which]
-    values, sigma = posterior.data[which], posterior.sigma[which]
-    return replace(posterior, data=values, sigma=sigma, which=which, mesh=mesh, shared=shared)
+    return replace(posterior, data=posterior.data[which], noise=posterior.noise.of(which), which=which)
 
 
 def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from inverse.criticism.weights import (
     resampled,
 )
 from inverse.data.units import factor, split_head
-from inverse.fields.noise import Marginal
+from inverse.fields.noise_size import Marginal
 from inverse.low_dimensional.evidence import weighed
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.proposals import SHARE, WIDER, Mixture

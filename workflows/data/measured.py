@@ -20,9 +20,9 @@ from forward.bodies.surface import Surface
 from forward.combine import selected
 from forward.files import meshes
 from forward.settings import Settings, one_line
-from inverse.data.errors import NORMAL, Errors
 from inverse.data.files import SCANS, distinct, files
 from inverse.data.measurements import Measurements
+from inverse.data.noise import NORMAL, Errors
 from inverse.data.registration import ToSurface
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError, needed

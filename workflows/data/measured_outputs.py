@@ -16,8 +16,8 @@ from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import ModelSpec
 from inverse.data.curves import steps_of
-from inverse.data.errors import NORMAL, Errors
 from inverse.data.measurements import Measurements
+from inverse.data.noise import NORMAL, Errors
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.reader import AnyReader
 from inverse.data.table import DataError, others

@@ -310,8 +310,7 @@ def _inverting_field(
         predicting = of_field(study, lambda name: states_of(name, other))
 
     def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
-        data, errors = problem.data, problem.errors
-        posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
+        posterior = FieldPosterior(states, problem.data.values, problem.noise, prior, progress=ensemble.count)
         predict = None if predicting is None else partial(predicting, name)
         return invert_field(posterior, problem, Vertices(offset, prior.matern.mass), predict)
 

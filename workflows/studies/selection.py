@@ -15,7 +15,7 @@ from inverse.criticism.assessment import NEEDED, own_seconds
 from inverse.criticism.doubts import not_estimable
 from inverse.data.measurements import AXES
 from inverse.data.table import DataError
-from inverse.methods.selection import Noise
+from inverse.methods.selection import StatedNoise
 from workflows.config.mistakes import StudyError, not_installed, refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor
 from workflows.data.material_tests import DataFile, expanded
@@ -246,7 +246,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             yield from mistakes_of_factor(noise.factor, "method", *place, "factor")
 
     @property
-    def _noises(self) -> list[tuple[tuple[str, ...], Noise]]:
+    def _noises(self) -> list[tuple[tuple[str, ...], StatedNoise]]:
         others = self.method.other_noises.items()
         return [(("noise",), self.method.noise), *((("other_noises", name), noise) for name, noise in others)]
 

@@ -12,6 +12,7 @@ from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
 from inverse.criticism.predictive import examine
 from inverse.criticism.verdict import verdict_on_few, verdict_on_field
 from inverse.criticism.weights import enough
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -180,7 +181,7 @@ def test_the_strong_directions_follow_the_weak_ones():
     size = 40
     names = tuple(map(str, range(size)))
     model = FunctionModel(lambda m: [np.exp(m).mean()], names, ("y",), lambda m: [np.exp(m) / size])
-    posterior = FieldPosterior(model, np.ones(1), np.array([3e-3]), DensePrior(0.25 * np.eye(size)))
+    posterior = FieldPosterior(model, np.ones(1), Noise(np.array([3e-3])), DensePrior(0.25 * np.eye(size)))
     mode = find_mode(posterior, tolerance=1e-8).point
     gaussian = LowRankPosterior.at(mode)
     found = weigh_field(mode, gaussian, 400)
@@ -265,6 +266,6 @@ def test_a_posterior_of_one_parameter():
     model = FunctionModel(lambda p: [p[0]], ("a",), ("u",), lambda p: [[1.0]])
     base = few()
     inputs = replace(base.inputs, own={"a": base.inputs.marginals["a"]})
-    posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0]), np.array([1.0]))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0]), Noise(np.array([1.0])))
     found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=500))
     agrees(found, np.array([0.5]), np.array([np.sqrt(0.5)]))

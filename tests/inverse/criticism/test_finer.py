@@ -10,6 +10,7 @@ from forward.pointwise import FunctionModel
 from inverse.criticism.doubts import certain, meshes_not_alike, meshes_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import corrected_few
@@ -28,7 +29,7 @@ PRIOR = np.diag([0.25, 4.0])
 
 def posterior(noise=None):
     model = FunctionModel(lambda p: B @ p + OFFSET, ("a", "b"), tuple("tuvwxyz"), lambda p: B)
-    return Posterior(INPUTS, SerialEvaluate(model), DATA, SIGMA, noise)
+    return Posterior(INPUTS, SerialEvaluate(model), DATA, Noise(SIGMA, factor=noise))
 
 
 def solve(point, tangents):

@@ -9,6 +9,7 @@ from inverse.criticism.predictive import (
     examine,
 )
 from inverse.data.neighbours import neighbours
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -29,7 +30,9 @@ def test_residuals_of_a_right_model_pass_as_often_as_they_should():
         rng = np.random.default_rng(1000 + seed)
         truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
         data = problem.G @ truth + problem.sigma * rng.standard_normal(DATA)
-        posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
+        posterior = FieldPosterior(
+            problem.posterior.model, data, Noise(problem.sigma), problem.posterior.prior, problem.m_0
+        )
         mode = find_mode(posterior, tolerance=1e-4).point
         if seed == 0:
             found = LowRankPosterior.at(mode, cutoff=1e-9)
@@ -64,7 +67,7 @@ def test_residuals_tell_a_wrong_model():
 def test_few_data_of_many_parameters():
     model = FunctionModel(lambda p: [p.sum()], ("a", "b", "c"), ("y",), lambda p: [[1.0, 1.0, 1.0]])
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in "abc"})
-    posterior = Posterior(inputs, SerialEvaluate(model), np.array([2.0]), np.array([1.0]))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([2.0]), Noise(np.array([1.0])))
     found = examine_few(posterior, laplace(posterior))
     assert found.degrees == pytest.approx(1 / 4)  # y ~ N(0, 1 + 3), and r = −y/4
     assert found.probability == pytest.approx(stats.chi2(1).sf(4 / 4), rel=1e-8)

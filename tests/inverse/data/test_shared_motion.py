@@ -6,8 +6,7 @@ from mpi4py import MPI
 
 from forward.bodies.surface import Surface
 from forward.specimen import Specimen
-from inverse.data.approximation_error import Whitening
-from inverse.data.errors import NORMAL, StudentErrors
+from inverse.data.noise import Noise, StudentErrors
 from inverse.data.rigid import Rigid, exponential
 from inverse.data.shared_motion import SharedMotion, determined
 from inverse.fields.low_rank import Spectrum
@@ -109,10 +108,10 @@ def test_intervals_hold_with_an_uncertain_registration(cube):
         truth = observed(cube, misplaced(scan, cube, error, motion.centre), solution.state + x @ tangents)[0]
         residual = (truth + sigma * rng.standard_normal(len(at)) - at) / sigma
         for name, one in (("with", shared), ("without", None)):
-            whitening = Whitening.of(sigma, None, NORMAL, one)
-            A = whitening(J / sigma)
+            noise = Noise(sigma, shared=one)
+            A = noise.whitened(J / sigma)
             covariance = np.linalg.inv(np.eye(3) + A @ A.T)
-            gap = covariance @ A @ whitening(residual) - x
+            gap = covariance @ A @ noise.whitened(residual) - x
             inside[name].append(np.abs(gap) < 1.96 * np.sqrt(np.diag(covariance)))
     share = {name: float(np.mean(found)) for name, found in inside.items()}
     assert 0.90 <= share["with"] <= 0.98, share
@@ -122,20 +121,20 @@ def test_intervals_hold_with_an_uncertain_registration(cube):
 def test_errors_that_are_shared_are_a_covariance():
     rng = np.random.default_rng(0)
     shared, sigma, r = rng.normal(size=(3, 7)), rng.uniform(0.5, 2, size=7), rng.normal(size=7)
-    whitening = Whitening.of(sigma, None, NORMAL, shared)
+    noise = Noise(sigma, shared=shared)
     covariance = np.diag(sigma**2) + shared.T @ shared
-    white = whitening(r / sigma)
+    white = noise.whitened(r / sigma)
     assert white @ white == pytest.approx(r @ np.linalg.solve(covariance, r))
     log = 0.5 * np.linalg.slogdet(covariance)[1] - np.log(sigma).sum()
-    assert whitening.log_determinant == pytest.approx(log)
-    np.testing.assert_allclose(whitening.undone(whitening(r)), r)
-    wider = Whitening.of(sigma, None, StudentErrors(), shared)
-    np.testing.assert_allclose(wider.sigma**2, np.diag(covariance))
+    assert noise.log_determinant == pytest.approx(log)
+    np.testing.assert_allclose(noise.coloured(noise.whitened(r)), r)
+    wider = Noise(sigma, StudentErrors(), shared=shared)
+    np.testing.assert_allclose(wider.scale**2, np.diag(covariance))
     # What data say about a motion, given unknowns of unit prior: dense linear algebra.
     J = rng.normal(size=(7, 2))
-    A = whitening((J / sigma[:, None]).T)
+    A = noise.whitened((J / sigma[:, None]).T)
     values, turn = np.linalg.eigh(A @ A.T)
     spectrum = Spectrum(values[::-1], turn[:, ::-1].T, turn[:, ::-1].T @ A, np.zeros(2), 0.0, 0)
-    found = determined(spectrum, whitening, shared, np.ones(7))
-    noise = np.diag(sigma**2) + J @ J.T
-    np.testing.assert_allclose(found, np.linalg.eigvalsh(shared @ np.linalg.solve(noise, shared.T))[::-1])
+    found = determined(spectrum, noise, np.ones(7))
+    together = np.diag(sigma**2) + J @ J.T
+    np.testing.assert_allclose(found, np.linalg.eigvalsh(shared @ np.linalg.solve(together, shared.T))[::-1])

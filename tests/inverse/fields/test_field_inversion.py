@@ -16,6 +16,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError, Stability
 from forward.specimen import Specimen
 from inverse.criticism.field_samples import bent
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import CLOSE, find_mode
@@ -183,7 +184,7 @@ def coarse():
 
 def part(posterior, measured):
     """The same posterior of some of its data."""
-    return FieldPosterior(posterior.model, np.where(measured, posterior.data, np.nan), posterior.sigma, posterior.prior)
+    return FieldPosterior(posterior.model, np.where(measured, posterior.data, np.nan), posterior.noise, posterior.prior)
 
 
 def test_gradient_and_product_are_derivatives_of_the_density():
@@ -191,7 +192,7 @@ def test_gradient_and_product_are_derivatives_of_the_density():
     rng = np.random.default_rng(0)
     whitened, direction = 0.3 * rng.standard_normal((2, posterior.size))
     exact = FieldPosterior(
-        posterior.model, posterior.model.solve(posterior.values(whitened)).outputs, posterior.sigma, posterior.prior
+        posterior.model, posterior.model.solve(posterior.values(whitened)).outputs, posterior.noise, posterior.prior
     )
     for which, about in ((posterior, whitened + 0.1), (exact, whitened)):
         point = which.at(about)
@@ -232,7 +233,7 @@ def test_samples_near_the_mode_are_screened_rather_than_counted():
             seen.append(solution.stability)
             return solution
 
-    watched = FieldPosterior(Watched(), posterior.data, posterior.sigma, posterior.prior)
+    watched = FieldPosterior(Watched(), posterior.data, posterior.noise, posterior.prior)
     point = Point(watched, mode.point.whitened, mode.point.values, mode.point.solution)
     found = LowRankPosterior.at(mode.point, cutoff=1.0)
     _, densities = bent(point, found)(np.random.default_rng(3).standard_normal((4, posterior.size)))
@@ -267,7 +268,7 @@ def recovered(fine, cells, **settings):
         NOISE * np.array([np.sqrt((clean[model.cases == k] ** 2).mean()) for k in np.unique(model.cases)])[model.cases]
     )
     data = clean + sigma * rng.standard_normal(len(clean))
-    posterior = FieldPosterior(model, data, sigma, FIELD.prior(model.spec.body))
+    posterior = FieldPosterior(model, data, Noise(sigma), FIELD.prior(model.spec.body))
     few = np.repeat(rng.uniform(size=len(data) // 3) < 0.05, 3)
     posteriors = [posterior, part(posterior, few)]
     found = [LowRankPosterior.at(find_mode(p).point, **settings) for p in posteriors]
@@ -327,7 +328,7 @@ def test_a_field_is_felt_from_forces_alone():
     assert len(true) == len(names) == 75
     data = model.solve(true).outputs
     sigma = 0.03 * data
-    posterior = FieldPosterior(model, data * (1 + 0.03 * np.array([1, -1, 0.5, -0.5])), sigma, prior)
+    posterior = FieldPosterior(model, data * (1 + 0.03 * np.array([1, -1, 0.5, -0.5])), Noise(sigma), prior)
     mode = find_mode(posterior)
     found = LowRankPosterior.at(mode.point, cutoff=1e-8)
     assert mode.converged

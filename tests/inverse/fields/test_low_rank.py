@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior, leading_pairs
 from inverse.fields.newton_cg import find_mode
@@ -114,7 +115,9 @@ def test_calibration():
         rng = np.random.default_rng(1000 + seed)
         truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
         data = problem.G @ truth + problem.sigma * rng.standard_normal(DATA)
-        posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
+        posterior = FieldPosterior(
+            problem.posterior.model, data, Noise(problem.sigma), problem.posterior.prior, problem.m_0
+        )
         point = find_mode(posterior).point
         found = LowRankPosterior.at(point, cutoff=1e-3)
         inside.append((np.abs(truth - found.mean) <= stats.norm.ppf(0.9) * found.std).mean())
@@ -137,7 +140,7 @@ def test_gradient_and_product_are_derivatives():
     errors = [abs(posterior.at(whitened + h * direction).cost - point.cost - h * slope) for h in steps]
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
     # Where nothing is left of the residual, the product is that of all second derivatives.
-    exact = FieldPosterior(posterior.model, point.solution.outputs, posterior.sigma, posterior.prior)
+    exact = FieldPosterior(posterior.model, point.solution.outputs, posterior.noise, posterior.prior)
     point = exact.at(whitened)
     curve = direction + point.product(direction)
     moved = [(h, exact.at(whitened + h * direction).gradient - point.gradient) for h in (1e-3, 1e-4)]
@@ -165,8 +168,8 @@ def test_the_mode_is_stationary_also_where_steps_leave_what_can_be_solved(limit)
 def test_what_cannot_be_is_refused():
     posterior = curved()
     with pytest.raises(ValueError, match="expected 25 of each"):
-        FieldPosterior(posterior.model, posterior.data[:3], posterior.sigma, posterior.prior)
+        FieldPosterior(posterior.model, posterior.data[:3], posterior.noise, posterior.prior)
     with pytest.raises(ValueError, match="expected positive"):
-        FieldPosterior(posterior.model, posterior.data, 0 * posterior.sigma, posterior.prior)
+        FieldPosterior(posterior.model, posterior.data, Noise(0 * posterior.noise.sigma), posterior.prior)
     with pytest.raises(ValueError, match="all data are NaN"):
-        FieldPosterior(posterior.model, np.nan * posterior.data, posterior.sigma, posterior.prior)
+        FieldPosterior(posterior.model, np.nan * posterior.data, posterior.noise, posterior.prior)

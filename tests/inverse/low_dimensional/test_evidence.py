@@ -13,6 +13,7 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import own_seconds
 from inverse.criticism.weights import pareto_shape
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence, nested
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -31,8 +32,8 @@ from workflows.config.study import load
 def brute_force(posterior, draws=2**19):
     """Ln of the mean likelihood over points of the prior."""
     points = posterior.inputs.points(sobol_points(5, 0, 0, draws, 4))
-    misfit = (((two_of_four(points) - posterior.data) / posterior.sigma) ** 2).sum(axis=1) / 2
-    return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.sigma.prod())
+    misfit = (((two_of_four(points) - posterior.data) / posterior.noise.sigma) ** 2).sum(axis=1) / 2
+    return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.noise.sigma.prod())
 
 
 @pytest.mark.flags
@@ -127,7 +128,7 @@ def test_where_there_is_no_answer():
         raise SolveError("never")
 
     posterior = Posterior(
-        good.inputs, SerialEvaluate(FunctionModel(refuse, FOUR, ("u", "v"), slopes_of_four)), good.data, good.sigma
+        good.inputs, SerialEvaluate(FunctionModel(refuse, FOUR, ("u", "v"), slopes_of_four)), good.data, good.noise
     )
     with pytest.raises(SolveError, match="no answer at any of the points"):
         evidence(posterior, gaussian, 64)
@@ -146,12 +147,12 @@ def test_models_that_end_somewhere_are_weighted_by_nothing_there():
 
     whole = ridge(0.1)
     posterior = Posterior(
-        whole.inputs, SerialEvaluate(FunctionModel(ends, FOUR, ("u", "v"), slopes_of_four)), whole.data, whole.sigma
+        whole.inputs, SerialEvaluate(FunctionModel(ends, FOUR, ("u", "v"), slopes_of_four)), whole.data, whole.noise
     )
     points = whole.inputs.points(sobol_points(5, 0, 0, 2**18, 4))
-    misfit = (((two_of_four(points) - whole.data) / whole.sigma) ** 2).sum(axis=1) / 2
+    misfit = (((two_of_four(points) - whole.data) / whole.noise.sigma) ** 2).sum(axis=1) / 2
     misfit[points[:, 0] < 1.25] = np.inf
-    truth = logsumexp(-misfit) - np.log(2**18) - np.log(2 * np.pi * whole.sigma.prod())
+    truth = logsumexp(-misfit) - np.log(2**18) - np.log(2 * np.pi * whole.noise.sigma.prod())
     found = evidence(posterior, laplace(posterior), 256)
     assert abs(found.log_evidence - truth) < 4 * found.error
     assert found.error < 0.15
@@ -161,7 +162,7 @@ def test_nested_sampling_agrees():
     pytest.importorskip("dynesty")
     model = FunctionModel(lambda p: [p[0], p[0] + p[1]], ("a", "b"), ("u", "v"), lambda p: [[1.0, 0.0], [1.0, 1.0]])
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in ("a", "b")})
-    posterior = Posterior(inputs, SerialEvaluate(model), np.array([0.3, 0.9]), np.array([0.2, 0.3]))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([0.3, 0.9]), Noise(np.array([0.2, 0.3])))
     value, error = nested(posterior, live=60)
     assert abs(value - laplace(posterior).log_evidence) < 4 * error
 
@@ -215,7 +216,7 @@ def test_evidence_of_priors_with_inadmissible_tails(correlated, by_nested_sampli
     for width in (1.0, 0.5, 2.0):
         prior = -((grid / width) ** 2).sum(axis=1) / 2
         exact[width] = logsumexp((prior - misfit)[good]) - logsumexp(prior[good])
-    whole = Posterior(inputs, SerialEvaluate(model), data, sigma)
+    whole = Posterior(inputs, SerialEvaluate(model), data, Noise(sigma))
     share = np.exp(logsumexp(-(grid[good] ** 2).sum(axis=1) / 2) - logsumexp(-(grid**2).sum(axis=1) / 2))
     assert inputs.admitted == pytest.approx(share, abs=2e-3)
     found = evidence(whole, laplace(whole), 1024)

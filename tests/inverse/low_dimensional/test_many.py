@@ -14,6 +14,7 @@ from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import BUDGET, gradient_chains
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality, usual
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -41,7 +42,7 @@ def bent(size, curvature, seed=7):
 
     model = FunctionModel(values, names, outputs, lambda x: A * (1 + 2 * curvature * (A @ x))[:, None])
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in names})
-    return Posterior(inputs, SerialEvaluate(model), data, np.full(2 * size, NOISE)), A
+    return Posterior(inputs, SerialEvaluate(model), data, Noise(np.full(2 * size, NOISE))), A
 
 
 def reference(posterior, A, curvature, gaussian, draws=60_000):
@@ -150,7 +151,7 @@ def test_moments_of_other_priors_by_a_gaussian():
     names = ("a", "b")
     model = FunctionModel(lambda p: [np.log(p[0]), p[1]], names, ("u", "v"), lambda p: [[1 / p[0], 0.0], [0.0, 1.0]])
     inputs = Inputs({"a": prior, "b": Normal(mean=0.0, std=1.0)}, (("a", "b", 0.5),))
-    posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0, 0.3]), np.array([0.2, 0.5]))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0, 0.3]), Noise(np.array([0.2, 0.5])))
     gaussian = laplace(posterior, starts=1)
     known = by_gaussian(posterior, gaussian)
     mu, tau = np.log(2) - s**2 / 2 + s * gaussian.mode[0], s * np.sqrt(gaussian.covariance[0, 0])
@@ -199,7 +200,7 @@ def test_the_mode_is_found_where_gauss_newton_crawls(short):
     model = FunctionModel(values, ("a", "b"), tuple("stuv"), slopes)
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in ("a", "b")})
     data = short * values(at)
-    found = laplace(Posterior(inputs, SerialEvaluate(model), data, np.full(4, sigma)))
+    found = laplace(Posterior(inputs, SerialEvaluate(model), data, Noise(np.full(4, sigma))))
     assert found.converged
     for k, start in enumerate(at):
         cost = minimize_scalar(

@@ -5,6 +5,7 @@ import pytest
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
+from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from tests.rubber import CURVED, FACTOR, LINEAR, on_treloar
@@ -27,7 +28,7 @@ def ridge(noise=None):
         "c": Normal(mean=1.0, std=0.3),
     }
     inputs = Inputs(marginals, (("a", "b", 0.4),))
-    return Posterior(inputs, SerialEvaluate(model), np.array([1.2, 1.9]), np.array([0.1, 0.2]), noise)
+    return Posterior(inputs, SerialEvaluate(model), np.array([1.2, 1.9]), Noise(np.array([0.1, 0.2]), factor=noise))
 
 
 @pytest.mark.unit
@@ -65,10 +66,10 @@ def test_evidence_of_linear_models_is_laplace():
     for kind, priors in LINEAR.items():
         posterior = on_treloar(kind, priors)
         here = posterior.at(np.zeros((1, len(priors))), derivatives=True)
-        A = (here.tangents[0] * posterior.inputs.std) / posterior.sigma[:, None]
-        r = (posterior.data - here.outputs[0]) / posterior.sigma
+        A = (here.tangents[0] * posterior.inputs.std) / posterior.noise.sigma[:, None]
+        r = (posterior.data - here.outputs[0]) / posterior.noise.sigma
         H = np.eye(len(priors)) + A.T @ A
-        constant = np.log(posterior.sigma).sum() + r.size / 2 * np.log(2 * np.pi)
+        constant = np.log(posterior.noise.sigma).sum() + r.size / 2 * np.log(2 * np.pi)
         rest = r - A @ np.linalg.solve(H, A.T @ r)
         exact = -(r @ rest) / 2 - np.linalg.slogdet(H)[1] / 2 - constant
         dense = np.eye(r.size) + A @ A.T
@@ -122,7 +123,7 @@ def test_where_there_is_no_answer():
 
     model = FunctionModel(refuse, ("a",), ("u",), lambda p: [[0.0]])
     inputs = Inputs({"a": Normal(mean=0.0, std=1.0)})
-    posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(1), np.ones(1))
+    posterior = Posterior(inputs, SerialEvaluate(model), np.zeros(1), Noise(np.ones(1)))
     assert posterior.at(np.zeros((1, 1))).log_likelihood[0] == -np.inf
     with pytest.raises(SolveError, match="no answer at any of the 4 starts"):
         laplace(posterior)
@@ -133,4 +134,4 @@ def test_mistakes_are_named():
     posterior = ridge()
     for sigma, told in ((np.ones(3), "2 data with 3 standard deviations"), (np.array([1.0, 0.0]), "expected positive")):
         with pytest.raises(ValueError, match=told):
-            Posterior(posterior.inputs, posterior.evaluate, posterior.data, sigma)
+            Posterior(posterior.inputs, posterior.evaluate, posterior.data, Noise(sigma))

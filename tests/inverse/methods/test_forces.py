@@ -11,9 +11,9 @@ from forward.conformance import check_derivatives
 from forward.model import SolveError
 from forward.specimen import Specimen
 from inverse.criticism.finer import NOT_LOOKED
-from inverse.data.approximation_error import uncertain
 from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
+from inverse.methods.mesh_correction import uncertain
 from tests.launch import on_kept_ranks
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load

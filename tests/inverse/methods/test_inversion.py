@@ -161,7 +161,7 @@ def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
     """Laplace's moments and draws where it can be trusted; else those of the weighted samples, with their evidence."""
     posterior = curved()
     n = len(posterior.data)
-    data = Measurements.of(posterior.data, posterior.sigma, [0] * n, [0] * n, places=np.zeros((n, 3)))
+    data = Measurements.of(posterior.data, posterior.noise.sigma, [0] * n, [0] * n, places=np.zeros((n, 3)))
     vertices = Vertices(np.full(posterior.size, 0.1), np.ones(posterior.size))
     method = Invert(samples=512, draws=100)
     plain = invert_field(posterior, Problem(data, method), vertices)

@@ -10,6 +10,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.pointwise import FunctionModel
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -40,7 +41,7 @@ def linear(matrix):
 def test_a_linear_chain_from_data_to_prediction_is_exact_for_fields():
     """Against dense linear algebra, to 1e-8; pairs of draws find nothing that the gradients leave out."""
     values = SEEN @ ROOT @ RNG.standard_normal(SIZE) + 1 + SIGMA * RNG.standard_normal(DATA)
-    posterior = FieldPosterior(linear(SEEN), values, np.full(DATA, SIGMA), PRIOR)
+    posterior = FieldPosterior(linear(SEEN), values, Noise(np.full(DATA, SIGMA)), PRIOR)
     found = LowRankPosterior.at(find_mode(posterior, tolerance=1e-12).point, cutoff=1e-12)
     before = before_field(linear(GOAL), PRIOR, SIZE, 4, 0)
     said = after_field(linear(GOAL), found, before, 4, 0, of_mesh=True)

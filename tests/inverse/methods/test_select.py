@@ -15,13 +15,14 @@ from inverse.criticism.assessment import weighted
 from inverse.criticism.comparison import Candidate, criticise, probabilities
 from inverse.criticism.weights import FEWEST, RULE, trustworthy
 from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
 from inverse.methods.record import Problem
-from inverse.methods.selection import Noise, Select, posterior
+from inverse.methods.selection import Select, StatedNoise, posterior
 from tests.launch import in_process, run_script, tissuq_on_two_ranks
 from tests.problems import bananas
 from tests.rubber import CONFIGS, FACTOR, treloar
@@ -62,7 +63,9 @@ def compare(values, kinds=tuple(FIVE), tests=TESTS, noise=None, **settings):
         values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in tests])
     )
     candidates = {kind: Candidate(Inputs(FIVE[kind])) for kind in kinds}
-    method = Select(samples=settings.pop("samples", 64), noise=noise or Noise(relative=0.1, absolute=5e3), **settings)
+    method = Select(
+        samples=settings.pop("samples", 64), noise=noise or StatedNoise(relative=0.1, absolute=5e3), **settings
+    )
     return method.run(candidates, {"all": data}, lambda kind, _: SerialEvaluate(model(kind, tests)))
 
 
@@ -126,7 +129,7 @@ def test_discrepancy_is_found_when_no_candidate_is_right():
     stress = model("yeoh", tests).stresses(point)[0]
     values = stress * (1 + 0.05 * rng.standard_normal(stress.size))
     for factor in (None, FACTOR):
-        noise = Noise(relative=0.05, absolute=1e3, factor=factor)
+        noise = StatedNoise(relative=0.05, absolute=1e3, factor=factor)
         wrong = compare(values, ("neo-hookean", "mooney-rivlin"), tests, noise)
         assert any(line.startswith("Best of bad models") for line in texts(wrong))
         right = compare(values, ("neo-hookean", "yeoh"), tests, noise)
@@ -139,7 +142,7 @@ def doubts(values, kind, noise=None, **priors):
     data = Measurements.of_tests(
         values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in TESTS])
     )
-    noise = noise or Noise(relative=0.05, absolute=5e3)
+    noise = noise or StatedNoise(relative=0.05, absolute=5e3)
     method = Select(samples=64, noise=noise)
     found = method.run({kind: Candidate(inputs)}, {"all": data}, lambda name, _: SerialEvaluate(model(name)))
     return doubts_of_selection(found, {kind: inputs}, noise.factor, {kind: dict.fromkeys(inputs.names, "Pa")})
@@ -160,10 +163,10 @@ def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
     assert doubt.severity == "error"
     doubt, *_ = doubts(values, "mooney-rivlin", C2=Uniform(lower=0.0, upper=1e3))
     assert "C2 is at the upper end of its range (1 kPa)" in doubt.text
-    noise = Noise(relative=1e-3, absolute=100, factor=LogUniform(lower=0.1, upper=1e3))
+    noise = StatedNoise(relative=1e-3, absolute=100, factor=LogUniform(lower=0.1, upper=1e3))
     found = doubts(values, "mooney-rivlin", noise)
     assert any(re.search(r"the inferred errors are [3-6]\d(\.\d)? times the stated ones", one.text) for one in found)
-    noise = Noise(absolute=5e5, factor=LogUniform(lower=0.1, upper=10.0))
+    noise = StatedNoise(absolute=5e5, factor=LogUniform(lower=0.1, upper=10.0))
     found = doubts(1e6 * rng.standard_normal(18), "neo-hookean", noise)
     assert any("the model does not explain these data" in one.text and one.severity == "error" for one in found)
 
@@ -182,7 +185,7 @@ def test_left_out_scores_of_a_linear_model():
         values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in tests])
     )
     inputs = Inputs(priors)
-    whole = posterior(Candidate(inputs), data, Noise(relative=0.1), SerialEvaluate(it))
+    whole = posterior(Candidate(inputs), data, StatedNoise(relative=0.1), SerialEvaluate(it))
     found = criticise(weighted(whole, evidence(whole, laplace(whole), 2048)), whole, data)
     A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
     r, sigma = values - it.stresses(inputs.mean[None])[0], 0.1 * np.abs(values)
@@ -206,7 +209,7 @@ def test_whole_tests_are_held_out():
     data = Measurements.of_tests(
         values, np.full(len(values), np.nan), labels, np.concatenate([test.at for test in TESTS])
     )
-    method = Select(samples=32, noise=Noise(relative=0.1), held_out=True)
+    method = Select(samples=32, noise=StatedNoise(relative=0.1), held_out=True)
     found = method.run({"one": Candidate(inputs)}, {"all": data}, lambda *pair: SerialEvaluate(it))
     A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
     r, sigma = values - it.stresses(inputs.mean[None])[0], 0.1 * np.abs(values)
@@ -230,7 +233,7 @@ def test_least_squares_are_modes_with_wide_priors():
     A = it.stresses_and_derivatives(np.zeros((1, 3)))[1][0]
     fitted = np.linalg.lstsq(A, data.values, rcond=None)[0]
     wide = {"C10": Normal(mean=0.0, std=1e8), "C20": Normal(mean=0.0, std=1e6), "C30": Normal(mean=0.0, std=1e5)}
-    found = Posterior(Inputs(wide), SerialEvaluate(it), data.values, sigma)
+    found = Posterior(Inputs(wide), SerialEvaluate(it), data.values, Noise(sigma))
     mode = found.physical(laplace(found).mode[None, :])[0]
     np.testing.assert_allclose(mode, fitted, rtol=1e-5)
     assert fitted[0] > 0 > fitted[1]
@@ -399,7 +402,7 @@ def test_the_order_of_rows_says_nothing_of_neighbours():
         it = HomogeneousModel("neo-hookean", {}, [_biaxial(grid[order])], ("C1",))
         data = Measurements.of_tests(values[order], values * np.nan, ("biaxial",) * 30, grid[order, 0], grid[order])
         candidate = Candidate(Inputs({"C1": LogNormal(mean=2e5, std=1e5)}))
-        one = posterior(candidate, data, Noise(absolute=2e4, factor=FACTOR), SerialEvaluate(it))
+        one = posterior(candidate, data, StatedNoise(absolute=2e4, factor=FACTOR), SerialEvaluate(it))
         found.append(criticise(weighted(one, evidence(one, laplace(one), 64)), one, data).correlation)
     assert found[0] < 0.01
     np.testing.assert_allclose(found[1:], found[0], atol=1e-12)
@@ -616,7 +619,7 @@ def test_probabilities_are_calibrated():
     said, happened = [], []
     for _ in range(20):
         for k, kind in enumerate(FIVE):
-            found = compare(measured(kind, rng, noise=0.15), noise=Noise(relative=0.15, absolute=5e3))
+            found = compare(measured(kind, rng, noise=0.15), noise=StatedNoise(relative=0.15, absolute=5e3))
             said.append(found["probability"].to_numpy())
             happened.append(np.arange(len(FIVE)) == k)
     P, true = np.concatenate(said), np.concatenate(happened)
@@ -676,7 +679,7 @@ def of_bananas(pairs, bend=0.7, **settings):
     model, curved, *truth = bananas(pairs, bend)
     d = 2 * pairs
     data = Measurements.of_tests(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
-    method = Select(noise=Noise(), **settings)
+    method = Select(noise=StatedNoise(), **settings)
     evaluate = SerialEvaluate(model)
     found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, model=lambda *_: model)
     named = tuple(f"z{k}" for k in range(d))

@@ -1,16 +1,24 @@
 """Noise of unknown size in the data of fields: closed forms of linear models, and coverage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.newton_cg import find_mode
-from inverse.fields.noise import Marginal, infer_noise
+from inverse.fields.noise_size import Marginal, infer_noise
 from tests.problems import DATA, Linear, N, curved, solved
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 
 PRIORS = [LogUniform(lower=0.1, upper=20.0), LogNormal(mean=1.5, std=1.0), Normal(mean=1.0, std=1.0)]
+
+
+def _of(posterior, prior):
+    """The same with errors of unknown size."""
+    return replace(posterior, noise=replace(posterior.noise, factor=prior))
 
 
 def density(problem, prior):
@@ -31,7 +39,7 @@ def density(problem, prior):
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.kind)
 def test_linear_models(prior):
     problem = Linear(holes=7)
-    found = infer_noise(problem.posterior, prior, tolerance=1e-6, cutoff=1e-12)
+    found = infer_noise(_of(problem.posterior, prior), tolerance=1e-6, cutoff=1e-12)
     assert found.converged
     log_density = density(problem, prior)
     start = max(np.linspace(-3, 3, 61), key=log_density)
@@ -46,7 +54,7 @@ def test_linear_models(prior):
     log_s = np.log(np.maximum(prior.from_normal(x)[0], 1e-300))
     w /= w.sum()
     assert found.log_std == pytest.approx(np.sqrt(w @ (log_s - w @ log_s) ** 2), rel=1e-4)
-    np.testing.assert_allclose(found.mode.point.posterior.sigma, found.factor * problem.sigma)
+    np.testing.assert_allclose(found.mode.point.posterior.noise.sigma, found.factor * problem.sigma)
 
 
 @pytest.mark.unit
@@ -73,8 +81,9 @@ def test_the_factor_lies_within_its_standard_deviations():
         truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
         s = float(np.exp(rng.uniform(-1, 1)))
         data = problem.G @ truth + s * problem.sigma * rng.standard_normal(DATA)
-        posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
-        found = infer_noise(posterior, prior)
+        noise = Noise(problem.sigma, factor=prior)
+        posterior = FieldPosterior(problem.posterior.model, data, noise, problem.posterior.prior, problem.m_0)
+        found = infer_noise(posterior)
         assert len(found.rounds) <= 4
         scores.append(np.log(found.factor / s) / found.log_std)
     assert (np.square(scores)).sum() == pytest.approx(25, abs=3 * np.sqrt(50))
@@ -84,8 +93,8 @@ def test_the_factor_lies_within_its_standard_deviations():
 def test_models_that_are_not_linear():
     exact = curved()
     truth_sigma = 0.05
-    posterior = FieldPosterior(exact.model, exact.data, np.full(25, 0.01), exact.prior)
-    found = infer_noise(posterior, LogUniform(lower=0.1, upper=100.0))
+    noise = Noise(np.full(25, 0.01), factor=LogUniform(lower=0.1, upper=100.0))
+    found = infer_noise(FieldPosterior(exact.model, exact.data, noise, exact.prior))
     assert found.converged
     assert abs(np.log(found.factor * 0.01 / truth_sigma)) < 3 * found.log_std
     again = find_mode(found.mode.point.posterior, tolerance=1e-8).point.whitened
@@ -96,4 +105,4 @@ def test_models_that_are_not_linear():
 def test_noise_that_cannot_be_is_refused():
     problem = Linear()
     with pytest.raises(ValueError, match="median of the prior of the noise is -100"):
-        infer_noise(problem.posterior, Normal(mean=-100.0, std=1.0))
+        infer_noise(_of(problem.posterior, Normal(mean=-100.0, std=1.0)))

@@ -6,8 +6,8 @@ from scipy import stats
 
 from forward.pointwise import FunctionModel
 from inverse.criticism.field_samples import weigh_field
-from inverse.data.errors import NormalErrors, StudentErrors
 from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise, NormalErrors, StudentErrors
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -33,7 +33,7 @@ NOISE = LogNormal(mean=1.2, std=0.6)
 
 
 def posterior(errors, noise=None):
-    return Posterior(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), VALUES, SIGMA, noise, errors=errors)
+    return Posterior(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), VALUES, Noise(SIGMA, errors, noise))
 
 
 @pytest.mark.parametrize("errors", [NormalErrors(), HEAVY, StudentErrors(degrees=1)])
@@ -136,7 +136,7 @@ def test_fields_have_the_same_errors():
     data = np.append(VALUES, np.nan)  # one that was not measured
     slopes = np.append(SLOPES, 1.0)
     model = FunctionModel(lambda p: slopes * p[0], ("a",), tuple(map(str, range(16))), lambda p: slopes[:, None])
-    field = FieldPosterior(model, data, np.full(16, 0.2), Line(), errors=HEAVY)
+    field = FieldPosterior(model, data, Noise(np.full(16, 0.2), HEAVY), Line())
     x = np.array([0.3])
     h = 1e-6
     slope = (field.at(x + h).cost - field.at(x - h).cost) / (2 * h)

@@ -7,25 +7,24 @@ from scipy.stats import multivariate_normal
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
-from inverse.data.approximation_error import (
-    OF_DATUM,
-    OF_DIFFERENCE,
-    OF_DIRECTION,
-    OF_ERROR,
-    ApproximationError,
-    Whitening,
-    along,
-    uncertain,
-)
-from inverse.data.errors import NORMAL, StudentErrors
 from inverse.data.measurements import Measurements
+from inverse.data.noise import ModelError, Noise, StudentErrors
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.mesh_correction import corrected_few, corrected_field
+from inverse.methods.mesh_correction import (
+    OF_DATUM,
+    OF_DIFFERENCE,
+    OF_DIRECTION,
+    OF_ERROR,
+    along,
+    corrected_few,
+    corrected_field,
+    uncertain,
+)
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
@@ -59,7 +58,7 @@ def covariance_of(error, rows=slice(None)):
 
 def posterior(**kwargs):
     model = FunctionModel(lambda p: COARSE @ p, ("a", "b"), tuple("qrstuvwxy"), lambda p: COARSE)
-    return Posterior(INPUTS, SerialEvaluate(model), DATA, SIGMA, **kwargs)
+    return Posterior(INPUTS, SerialEvaluate(model), DATA, Noise(SIGMA, **kwargs))
 
 
 def finer(point, tangents):
@@ -102,11 +101,11 @@ def test_corrected_posterior_and_evidence_are_exact():
 def test_without_the_sign_it_would_be_found():
     """A correction that is subtracted is far from the posterior of the model that meshes tend to."""
     given = posterior()
-    wrong = ApproximationError(np.zeros(2), -SHIFT, COARSE - FINE, uncertain(SHIFT, BETWEEN, PLACES), APART)
-    mode = posterior(mesh=wrong).physical(laplace(posterior(mesh=wrong), starts=1).mode[None])[0]
+    wrong = ModelError(np.zeros(2), -SHIFT, COARSE - FINE, uncertain(SHIFT, BETWEEN, PLACES), APART)
+    mode = posterior(model=wrong).physical(laplace(posterior(model=wrong), starts=1).mode[None])[0]
     right = exact(np.diag(SIGMA**2) + covariance_of(SHIFT))
     assert np.abs((mode - right[0]) / np.sqrt(np.diag(right[1]))).max() > 1
-    assert given.mesh is None
+    assert given.noise.model is None
 
 
 def test_what_is_small_is_left():
@@ -117,7 +116,7 @@ def test_what_is_small_is_left():
         return np.concatenate([COARSE @ point + 1e-3 * SHIFT, BETWEEN]), np.concatenate([COARSE, np.zeros((M, 2))])
 
     there, same, found = corrected_few(given, gaussian, Finer(near), PLACES, "correct")
-    assert there.mesh is None
+    assert there.noise.model is None
     assert same is gaussian
     assert not found.corrected
     assert found.settled
@@ -148,7 +147,7 @@ def test_failures_are_said():
         return finer(point, tangents)
 
     there, _, found = corrected_few(given, laplace(given, starts=1), Finer(fails), PLACES, "correct")
-    assert there.mesh is not None
+    assert there.noise.model is not None
     assert found.corrected
     assert not found.settled  # the mode that it was found at is not where it ended
 
@@ -158,28 +157,28 @@ def test_errors_of_unknown_size_and_subsets():
     plain = posterior()
     gaussian = laplace(plain, starts=1)
     _, right, _ = corrected_few(plain, gaussian, Finer(finer), PLACES, "correct")
-    given = posterior(noise=LogNormal(mean=1.0, std=1e-4))
+    given = posterior(factor=LogNormal(mean=1.0, std=1e-4))
     there, corrected, _ = corrected_few(given, laplace(given, starts=1), Finer(finer), PLACES, "correct")
-    assert there.mesh is not None
+    assert there.noise.model is not None
     assert corrected.log_evidence == pytest.approx(right.log_evidence, abs=1e-3)
     rows = np.array([0, 3, 4])
-    some = there.mesh.of(rows)
-    whole = there.mesh.root.T @ there.mesh.root
+    some, mesh = there.noise.of(rows).model, there.noise.model
+    whole = mesh.root.T @ mesh.root
     np.testing.assert_allclose(some.root.T @ some.root, whole[np.ix_(rows, rows)], atol=1e-14)
-    np.testing.assert_allclose(some.at(np.ones((1, 2)))[0], there.mesh.at(np.ones((1, 2)))[0, rows])
+    np.testing.assert_allclose(some.at(np.ones((1, 2)))[0], mesh.at(np.ones((1, 2)))[0, rows])
     np.testing.assert_allclose(some.apart, APART[rows])
 
 
 def test_whitening_is_the_root_of_the_inverse():
-    mesh = ApproximationError(np.zeros(2), SHIFT, np.zeros((M, 0)), uncertain(SHIFT, BETWEEN, PLACES), APART)
+    mesh = ModelError(np.zeros(2), SHIFT, np.zeros((M, 0)), uncertain(SHIFT, BETWEEN, PLACES), APART)
     gamma = np.diag(SIGMA**2) + covariance_of(SHIFT)
-    white = Whitening.of(SIGMA, mesh, NORMAL)
-    W = white(np.eye(M)) / white.sigma
+    white = Noise(SIGMA, model=mesh)
+    W = white.whitened(np.eye(M)) / white.scale
     np.testing.assert_allclose(W.T @ W, np.linalg.inv(gamma), rtol=1e-9, atol=1e-9)
     half_log_det = np.linalg.slogdet(gamma)[1] / 2
-    assert white.log_determinant + np.log(white.sigma).sum() == pytest.approx(half_log_det, rel=1e-9)
-    heavy = Whitening.of(SIGMA, mesh, StudentErrors())
-    np.testing.assert_allclose(heavy.sigma**2, np.diag(gamma), rtol=1e-12)
+    assert white.log_determinant + np.log(white.scale).sum() == pytest.approx(half_log_det, rel=1e-9)
+    heavy = Noise(SIGMA, StudentErrors(), model=mesh)
+    np.testing.assert_allclose(heavy.scale**2, np.diag(gamma), rtol=1e-12)
     assert heavy.log_determinant == 0
 
 
@@ -216,8 +215,8 @@ def test_what_is_uncertain_along_directions_knows_errors_that_data_share():
     A = RNG.standard_normal((M, 3))
     shared = SIGMA * RNG.standard_normal((2, M))
     gamma = np.diag(SIGMA**2) + shared.T @ shared
-    white = Whitening.of(SIGMA, None, NORMAL, shared)
-    images = (np.linalg.svd(white((A / SIGMA[:, None]).T).T, full_matrices=False)[0] * [3.0, 2.0, 1.0]).T
+    white = Noise(SIGMA, shared=shared)
+    images = (np.linalg.svd(white.whitened((A / SIGMA[:, None]).T).T, full_matrices=False)[0] * [3.0, 2.0, 1.0]).T
     rows = along(images, BETWEEN, white)
     root = np.linalg.cholesky(gamma)
     mixed = covariance_along(np.linalg.solve(root, A), np.ones(M), np.linalg.solve(root, BETWEEN))
@@ -238,7 +237,7 @@ def test_a_field_against_dense_algebra():
 
     tends = Finer(lambda point, tangents: (np.concatenate([A @ point + b, BETWEEN]), None))
     weights = np.full(6, 1 / 6)
-    given = FieldPosterior(model, data, SIGMA, Identity())
+    given = FieldPosterior(model, data, Noise(SIGMA), Identity())
     here, moved, found = corrected_field(given, solve, tends, PLACES, "correct", weights)
     uncertainty = covariance_of(b, seen) + covariance_along(A[seen], SIGMA[seen], BETWEEN[seen])
     gamma = np.diag(SIGMA[seen] ** 2) + uncertainty

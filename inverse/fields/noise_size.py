@@ -60,7 +60,6 @@ class SolvedField:
 
 def infer_noise(
     posterior: FieldPosterior,
-    prior: Distribution,
     *,
     start: FloatArray | None = None,
     tolerance: float = STANDS,
@@ -72,9 +71,7 @@ def infer_noise(
     Parameters
     ----------
     posterior
-        Its standard deviations are those for s = 1.
-    prior
-        Of s; its most probable value is that of the standard normal coordinate.
+        With the prior of s, whose most probable value is that of the standard normal coordinate.
     start
         ξ (N,) where the first search for the mode starts.
     tolerance
@@ -89,12 +86,14 @@ def infer_noise(
     ValueError
         If the median of the prior is not positive.
     """
+    prior, sigma = posterior.noise.factor, posterior.noise.sigma
+    assert prior is not None
     factor = float(prior.from_normal(np.zeros(1))[0][0])
     if factor <= 0:
         raise ValueError(f"the median of the prior of the noise is {factor:g}, expected a positive one")
     rounds: list[float] = []
     for _ in range(ROUNDS):
-        scaled = replace(posterior, sigma=factor * posterior.sigma)
+        scaled = replace(posterior, noise=replace(posterior.noise, sigma=factor * sigma))
         mode = find_mode(scaled, start)
         found = LowRankPosterior.at(mode.point, cutoff=cutoff, rank=rank)
         rounds.append(factor)
@@ -139,7 +138,7 @@ class Marginal:
         along = (spectrum.images @ gap) ** 2 / np.where(values > 0, values, 1.0)
         weights = mode.posterior.weights[mode.posterior.weights > 0]
         constant = len(weights) / 2 * float(np.log(2 * np.pi)) - float(np.log(weights).sum())
-        constant += mode.posterior.whitening.log_determinant
+        constant += mode.posterior.seen.log_determinant
         rest = max(float(gap @ gap) - float(along.sum()), 0.0)
         return cls(values, along, rest, len(weights), constant)
 

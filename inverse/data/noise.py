@@ -1,0 +1,239 @@
+"""Errors of measurement: their scales, heavy tails, what many data share, and what a model is known to miss.
+
+A model predicts ψ(ω) of data y, and what it misses is known to some extent:
+
+    y = ψ(ω) + δ(ω) + Uz + e,   δ(ω) = δ̂ + T (ω − ω̂),   z ~ N(0, I),   e independent of scales √(s²σ² + τ²),
+
+where s is 1 or unknown, U holds what data share (motions of a scan, patterns of an error of a mesh) and τ what else is
+uncertain of δ: approximation errors as in J. Kaipio, E. Somersalo, J. Comput. Appl. Math. 198 (2007) 493–504, and S. R.
+Arridge et al., Inverse Problems 22 (2006) 175–195, linearised at the mode in place of the mean of the prior. With τ in
+σ, the errors have the covariance σ(I + ŨŨᵀ)σ, Ũ = U/σ = VSQᵀ, and residuals over σ become independent again by
+W = (I + ŨŨᵀ)^(−1/2) = I − V (1 − (1 + S²)^(−1/2)) Vᵀ, symmetric and of low rank: whatever knows independent errors only
+goes on with W r and W A.
+
+With independent residuals r over the scale, −ln p = Σ ρ(r) + Σ ln scale. The score is ψ = ρ′; Gauss–Newton's matrix of
+Student's errors is AᵀWA with the weights w(r) (ν+1)/(ν+3), w = ψ/r: of a datum that fits they have the mean of ψ′,
+Fisher's information, and of one that does not belong they vanish (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am.
+Stat. Assoc. 84 (1989) 881–896).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from forward.model import FloatArray
+from forward.settings import Settings
+from uq.inputs.distributions import Distribution
+
+HALF_LOG = float(np.log(2 * np.pi) / 2)
+
+
+class NormalErrors(Settings):
+    """Normal errors, of which the scale is the standard deviation."""
+
+    kind: Literal["normal"] = "normal"
+
+    def minus_log(self, r: FloatArray) -> FloatArray:
+        """Return ρ, −ln of the density, of residuals over the scale, of any shape."""
+        return np.asarray(r**2 / 2 + HALF_LOG)
+
+    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
+        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
+        return np.asarray((r**2).sum(axis=1) / 2 + log_scale + r.shape[1] * HALF_LOG)
+
+    def score(self, r: FloatArray) -> FloatArray:
+        """Return ψ = ρ′."""
+        return r
+
+    def information(self, r: FloatArray) -> FloatArray:
+        """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""
+        return np.ones_like(r)
+
+    def turn(self, r: FloatArray) -> FloatArray:
+        """Return (rψ)′, for derivatives by the logarithm of the scale."""
+        return 2 * r
+
+    def normal_scores(self, r: FloatArray) -> FloatArray:
+        """Return standard normal values of the same probabilities."""
+        return r
+
+
+class StudentErrors(Settings):
+    """Student's t errors: a few that are far larger than the others do not decide.
+
+    Parameters
+    ----------
+    degrees
+        Degrees of freedom ν: the smaller, the heavier the tails. Standard deviations of the data are taken as scales;
+        those of the errors are √(ν/(ν−2)) times as large.
+    """
+
+    kind: Literal["student-t"] = "student-t"
+    degrees: Annotated[float, Field(ge=1, le=1000)] = 4.0
+
+    def minus_log(self, r: FloatArray) -> FloatArray:
+        """Return ρ, −ln of the density, of residuals over the scale, of any shape."""
+        from scipy.special import gammaln
+
+        nu = self.degrees
+        constant = gammaln(nu / 2) - gammaln((nu + 1) / 2) + np.log(nu * np.pi) / 2
+        return np.asarray((nu + 1) / 2 * np.log1p(r**2 / nu) + constant)
+
+    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
+        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
+        return np.asarray(self.minus_log(r).sum(axis=1) + log_scale)
+
+    def score(self, r: FloatArray) -> FloatArray:
+        """Return ψ = ρ′."""
+        return np.asarray((self.degrees + 1) * r / (self.degrees + r**2))
+
+    def information(self, r: FloatArray) -> FloatArray:
+        """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""
+        nu = self.degrees
+        return np.asarray((nu + 1) ** 2 / ((nu + 3) * (nu + r**2)))
+
+    def turn(self, r: FloatArray) -> FloatArray:
+        """Return (rψ)′, for derivatives by the logarithm of the scale."""
+        nu = self.degrees
+        return np.asarray(2 * nu * (nu + 1) * r / (nu + r**2) ** 2)
+
+    def normal_scores(self, r: FloatArray) -> FloatArray:
+        """Return standard normal values of the same probabilities."""
+        from scipy.special import ndtri, stdtr
+
+        return np.asarray(-np.sign(r) * ndtri(np.maximum(stdtr(self.degrees, -np.abs(r)), 1e-300)))
+
+
+Errors = Annotated[NormalErrors | StudentErrors, Field(discriminator="kind")]
+NORMAL = NormalErrors()
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """What a model misses of m data, in their units.
+
+    Attributes
+    ----------
+    point
+        Parameters ω̂ (d,) where it was found.
+    error
+        δ̂ (m,).
+    slopes
+        T (m, d), or none (m, 0): then δ is taken to be the same everywhere.
+    root
+        Uᵀ (k, m).
+    apart
+        τ (m,).
+    scale
+        Factor on σ at which it counts, where that is unknown.
+    """
+
+    point: FloatArray
+    error: FloatArray
+    slopes: FloatArray
+    root: FloatArray
+    apart: FloatArray
+    scale: float = 1.0
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Return δ (n, m) at parameters (n, d)."""
+        if not self.slopes.size:
+            return np.broadcast_to(self.error, (len(points), len(self.error)))
+        return self.error + (points - self.point) @ self.slopes.T
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Errors of m data.
+
+    Attributes
+    ----------
+    sigma
+        Stated standard deviations σ (m,) of independent errors; of heavy tails the scales.
+    errors
+        Distribution of the independent errors over their scales.
+    factor
+        Prior of s; None for s = 1.
+    shared
+        (k, m): what data share, a row for a standard deviation of each; None if there is nothing.
+    model
+        What the model misses; None where that is not known, or nothing.
+    """
+
+    sigma: FloatArray
+    errors: NormalErrors | StudentErrors = NORMAL
+    factor: Distribution | None = None
+    shared: FloatArray | None = None
+    model: ModelError | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.sigma > 0).all():
+            raise ValueError(f"standard deviation of the errors {self.sigma.min():g}, expected positive ones")
+
+    def of(self, rows: NDArray[np.intp]) -> Noise:
+        """Return that of some of the data, by number."""
+        shared, model = None if self.shared is None else self.shared[:, rows], self.model
+        if model is not None:
+            error, slopes, root, apart = model.error[rows], model.slopes[rows], model.root[:, rows], model.apart[rows]
+            model = replace(model, error=error, slopes=slopes, root=root, apart=apart)
+        return replace(self, sigma=self.sigma[rows], shared=shared, model=model)
+
+    def seen(self, measured: FloatArray) -> Noise:
+        """Return the same where those data that were not measured, zeros among ones (m,), share nothing."""
+        shared, model = None if self.shared is None else self.shared * measured, self.model
+        if model is not None:
+            model = replace(model, root=model.root * measured, apart=model.apart * measured)
+        return replace(self, shared=shared, model=model)
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """Standard deviations (m,) that residuals are divided by, for s = 1.
+
+        Errors with heavy tails are no multivariate ones: of what data share, their scales only become larger.
+        """
+        more = np.zeros(len(self.sigma))
+        if self.model is not None:
+            more = more + (self.model.apart / self.model.scale) ** 2
+        if self.errors.kind != "normal":
+            more = more + (self._rows**2).sum(axis=0)
+        return np.sqrt(self.sigma**2 + more) if self.model is not None or more.any() else self.sigma
+
+    @cached_property
+    def _rows(self) -> FloatArray:
+        """Uᵀ (k, m), of all that is shared."""
+        roots = [np.zeros((0, len(self.sigma))) if self.shared is None else self.shared]
+        return np.concatenate(roots if self.model is None else [*roots, self.model.root / self.model.scale])
+
+    @cached_property
+    def _basis(self) -> tuple[FloatArray, FloatArray]:
+        """S (k,) and Vᵀ (k, m)."""
+        if not len(self._rows) or self.errors.kind != "normal":
+            return np.zeros(0), np.zeros((0, len(self.sigma)))
+        _, sizes, basis = np.linalg.svd(self._rows / self.scale, full_matrices=False)
+        return sizes, basis
+
+    @cached_property
+    def _less(self) -> FloatArray:
+        """1 − (1 + S²)^(−1/2) (k,)."""
+        return np.asarray(1 - 1 / np.sqrt(1 + self._basis[0] ** 2))
+
+    @property
+    def log_determinant(self) -> float:
+        """½ ln det(I + ŨŨᵀ), which −ln of the likelihood has more."""
+        return float(np.log1p(self._basis[0] ** 2).sum() / 2)
+
+    def whitened(self, rows: FloatArray) -> FloatArray:
+        """Return W r (…, m) of rows over the scale (…, m); W is symmetric."""
+        if not len(self._less):
+            return rows
+        return np.asarray(rows - ((rows @ self._basis[1].T) * self._less) @ self._basis[1])
+
+    def coloured(self, rows: FloatArray) -> FloatArray:
+        """Return W⁻¹r (…, m)."""
+        return np.asarray(rows + ((rows @ self._basis[1].T) * (self._less / (1 - self._less))) @ self._basis[1])
