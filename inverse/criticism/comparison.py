@@ -16,18 +16,21 @@ Probabilities, averages and residual tests share this file because all come from
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.assessment import Assessment, Points, answer, quantiles
+from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
+from inverse.criticism.finer import MeshFound
 from inverse.criticism.stacking import stacking
-from inverse.criticism.verdict import Verdict
-from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
+from inverse.criticism.verdict import Verdict, verdict_on_points
+from inverse.criticism.weights import effective_sample_size, fewest, normalised, pareto_shape, trustworthy
 from inverse.data.measurements import Measurements
 from inverse.data.neighbours import DRAWS, agreement, neighbours
 from inverse.low_dimensional.posterior import Posterior
@@ -35,8 +38,6 @@ from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from inverse.criticism.finer import MeshFound
 
 QUANTILES = (0.05, 0.95)
 Pair = tuple[str, str]  # candidate and group
@@ -116,17 +117,57 @@ def criticise(found: Points, posterior: Posterior, data: Measurements) -> Critic
 # --- all together --------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What was found of a candidate for a group of data.
+
+    Attributes
+    ----------
+    posterior, data, assessment
+        The posterior, its data, and what was found around the mode.
+    mesh
+        What finer meshes have said; None where they were not asked.
+    """
+
+    posterior: Posterior
+    data: Measurements
+    assessment: Assessment
+    mesh: MeshFound | None
+
+    @cached_property
+    def points(self) -> Points:
+        """What stands for the posterior: chains, else points that were solved, which know what is predicted too.
+
+        Of solved points it is enough that many count: what is predicted from a tail that is not to be trusted is nearer
+        than what a linearised model predicts.
+        """
+        posterior, one = self.posterior, self.assessment
+        count = len(one.evidence.log_weights)
+        if one.source == "chains":
+            assert one.chains is not None
+            return of_chains(posterior, one.chains, count)
+        if one.evidence.ess >= fewest(len(one.gaussian.mode)):
+            return weighted(posterior, one.evidence)
+        return of_gaussian(posterior, one.gaussian, posterior.at(one.gaussian.mode[None], derivatives=True), count)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How far it can be trusted."""
+        return verdict_on_points(self.assessment.gaussian, self.assessment.evidence, self.assessment.chains)
+
+    @cached_property
+    def critic(self) -> Criticism:
+        """What the data say of it."""
+        return criticise(self.points, self.posterior, self.data)
+
+
 def comparison(
     candidates: Mapping[str, Candidate],
     data_groups: Mapping[str, Measurements],
-    posteriors: Mapping[Pair, Posterior],
-    stated: Mapping[Pair, Assessment],
-    points: Mapping[Pair, Points],
-    verdicts: Mapping[Pair, Verdict],
+    found: Mapping[Pair, Compared],
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
     checks: Mapping[Pair, tuple[float, float]],
     left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
-    meshes: Mapping[Pair, MeshFound],
 ) -> xr.Dataset:
     """Collect everything that is known about the candidates in a dataset.
 
@@ -134,38 +175,34 @@ def comparison(
     ----------
     candidates, data_groups
         By name.
-    posteriors, stated, points, verdicts
-        What was found, by candidate and group: around the mode, what stands for the posterior, and how far it is
-        trusted.
+    found
+        By candidate and group.
     variants
         ln Z and error by the name of the variant, beginning with the study as it is.
     checks
         ln Z and error by nested sampling, if requested.
     left_out
         ln Z and error without each test, if requested.
-    meshes
-        Effect of a finer mesh, if checked.
     """
     import xarray as xr
 
-    names = list(candidates)
-    found = {pair: assessment.evidence for pair, assessment in stated.items()}
-    whole = {pair: assessment.log_evidence for pair, assessment in stated.items()}
-    critics = {pair: criticise(points[pair], posteriors[pair], data_groups[pair[1]]) for pair in stated}
+    names, groups = list(candidates), list(data_groups)
+    whole = {pair: one.assessment.log_evidence for pair, one in found.items()}
     weights = np.array([candidate.weight for candidate in candidates.values()])
 
-    def table(value: Mapping[Pair, Any]) -> Any:
-        return (("model", "group"), np.array([[value[name, group] for group in data_groups] for name in names]))
+    def table(value: Callable[[Compared], Any]) -> Any:
+        return (("model", "group"), np.array([[value(found[name, group]) for group in groups] for name in names]))
 
     def totals(values: Mapping[Pair, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
-        parts = [[values[name, group] for group in data_groups if (name, group) in values] for name in names]
+        parts = [[values[name, group] for group in groups if (name, group) in values] for name in names]
         sums = np.array([sum(value for value, _ in part) for part in parts])
         return sums, np.array([np.sqrt(sum(error**2 for _, error in part)) for part in parts])
 
     sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)
     chances = np.array([probabilities(total, weights) for total in sums])
     P = chances[0]
-    scores = np.array([np.concatenate([critics[name, group].scores for group in data_groups]) for name in names])
+    of_model = {name: [found[name, group] for group in groups] for name in names}
+    scores = np.array([np.concatenate([one.critic.scores for one in several]) for several in of_model.values()])
     behind = scores - scores[scores.sum(axis=1).argmax()]
     count = scores.shape[1]
     stacked, stacked_errors = stacking(scores)
@@ -180,62 +217,53 @@ def comparison(
         "variant_log_evidence": (("variant", "model"), np.array(sums)),
         "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
         "variant_probability": (("variant", "model"), chances),
-        "group_log_evidence": table({pair: value for pair, (value, _) in whole.items()}),
-        "group_log_evidence_error": table({pair: error for pair, (_, error) in whole.items()}),
-        "laplace_log_evidence": table({pair: a.gaussian.log_evidence for pair, a in stated.items()}),
-        "converged": table({pair: a.gaussian.converged for pair, a in stated.items()}),
-        "route": table({pair: e.route for pair, e in found.items()}),
-        "why": table({pair: e.why for pair, e in found.items()}),
-        "effective": table({pair: e.ess for pair, e in found.items()}),
-        "tail": table({pair: e.pareto_k for pair, e in found.items()}),
-        "trusted": table({pair: a.known for pair, a in stated.items()}),
-        "trust": table({pair: verdict.trust for pair, verdict in verdicts.items()}),
-        "verdict": table({pair: verdict.why for pair, verdict in verdicts.items()}),
-        "misfit_probability": table({pair: c.misfit for pair, c in critics.items()}),
-        "correlation_probability": table({pair: c.correlation for pair, c in critics.items()}),
+        "group_log_evidence": table(lambda one: one.assessment.log_evidence[0]),
+        "group_log_evidence_error": table(lambda one: one.assessment.log_evidence[1]),
+        "laplace_log_evidence": table(lambda one: one.assessment.gaussian.log_evidence),
+        "converged": table(lambda one: one.assessment.gaussian.converged),
+        "route": table(lambda one: one.assessment.evidence.route),
+        "why": table(lambda one: one.assessment.evidence.why),
+        "effective": table(lambda one: one.assessment.evidence.ess),
+        "tail": table(lambda one: one.assessment.evidence.pareto_k),
+        "trusted": table(lambda one: one.assessment.known),
+        "trust": table(lambda one: one.verdict.trust),
+        "verdict": table(lambda one: one.verdict.why),
+        "misfit_probability": table(lambda one: one.critic.misfit),
+        "correlation_probability": table(lambda one: one.critic.correlation),
         "score": ("model", scores.sum(axis=1)),
         "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
         "score_behind": ("model", behind.sum(axis=1)),
         "score_behind_error": ("model", np.sqrt(count) * behind.std(axis=1)),
-        "score_tail": ("model", [max(critics[name, group].pareto_k.max() for group in data_groups) for name in names]),
+        "score_tail": ("model", [max(one.critic.pareto_k.max() for one in several) for several in of_model.values()]),
         "score_trusted": (
             "model",
             [
-                all(
-                    verdicts[name, group].trust != "neither" and critics[name, group].trusted.all()
-                    for group in data_groups
-                )
-                for name in names
+                all(one.verdict.trust != "neither" and one.critic.trusted.all() for one in several)
+                for several in of_model.values()
             ],
         ),
     }
-    if checks:
-        variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
-        variables["nested_log_evidence_error"] = table({pair: error for pair, (_, error) in checks.items()})
-    if left_out:
-        ours, theirs = zip(
-            *((totals({pair: whole[pair] for pair in rest}), totals(rest)) for rest in left_out.values()), strict=True
-        )
-        dims = ("left_out", "model")
-        variables["held_out_score"] = (dims, np.array([a[0] - b[0] for a, b in zip(ours, theirs, strict=True)]))
-        variables["held_out_score_error"] = (
-            dims,
-            np.array([np.hypot(a[1], b[1]) for a, b in zip(ours, theirs, strict=True)]),
-        )
-    columns = [_predictions(names, group, data, posteriors, points, P) for group, data in data_groups.items()]
+    for k, end in enumerate(("", "_error")):
+        if checks:
+            values = [[checks[name, group][k] for group in groups] for name in names]
+            variables[f"nested_log_evidence{end}"] = (("model", "group"), np.array(values))
+        if left_out:
+            pairs = [(totals({pair: whole[pair] for pair in rest})[k], totals(rest)[k]) for rest in left_out.values()]
+            rows = [np.hypot(ours, without) if k else ours - without for ours, without in pairs]
+            variables[f"held_out_score{end}"] = (("left_out", "model"), np.array(rows))
+    columns = [_predictions(group, [found[name, group] for name in names], P) for group in groups]
     for name, (dims, _) in columns[0].items():
         variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
-    parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
-    variables["point_log_likelihood"] = _pointwise(names, data_groups, critics)
-    variables |= _constants(names, list(data_groups), parameters, posteriors, stated, points)
-    chains = {pair: a.chains for pair, a in stated.items() if a.chains is not None}
-    if chains:
-        variables["chains"] = table({pair: len(one.draws) * one.mixed for pair, one in chains.items()})
-        variables["chain_rhat"] = table({pair: one.rhat.max() for pair, one in chains.items()})
-        variables["chain_effective"] = table({pair: one.ess for pair, one in chains.items()})
-    if meshes:
-        variables |= _meshes(names, data_groups, parameters, posteriors, meshes, variables["constant_std"][1])
-    coordinates = {"model": names, "group": list(data_groups), "variant": list(variants), "parameter": parameters}
+    parameters = list(dict.fromkeys(p for one in found.values() for p in one.posterior.names))
+    variables |= _by_point(names, groups, parameters, found)
+    variables |= _constants(names, groups, parameters, found)
+    if all(one.assessment.chains is not None for one in found.values()):
+        variables["chains"] = table(lambda one: len(one.assessment.chains.draws) * one.assessment.chains.mixed)
+        variables["chain_rhat"] = table(lambda one: one.assessment.chains.rhat.max())
+        variables["chain_effective"] = table(lambda one: one.assessment.chains.ess)
+    if all(one.mesh is not None for one in found.values()):
+        variables |= _meshes(names, data_groups, parameters, found)
+    coordinates = {"model": names, "group": groups, "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
 
@@ -252,20 +280,13 @@ def _chance_errors(P: FloatArray, errors: FloatArray) -> FloatArray:
     return np.sqrt((slopes**2) @ errors**2)
 
 
-def _predictions(
-    names: list[str],
-    group: str,
-    data: Measurements,
-    posteriors: Mapping[Pair, Posterior],
-    points: Mapping[Pair, Points],
-    P: FloatArray,
-) -> dict[str, tuple[Any, Any]]:
+def _predictions(group: str, models: Sequence[Compared], P: FloatArray) -> dict[str, Any]:
     """Outputs of one group without noise, by each model and by all, beside the data."""
+    data = models[0].data
     m, M = len(data.seen()), len(data)
-    mean, std = np.empty((2, len(names), M))
-    bands = np.empty((len(QUANTILES), len(names), M))
-    for k, name in enumerate(names):
-        found = points[name, group]
+    mean, std = np.empty((2, len(models), M))
+    bands = np.empty((len(QUANTILES), len(models), M))
+    for k, found in enumerate(one.points for one in models):
         used = found.weights > 0
         w, outputs = found.weights[used], found.everything[used].copy()
         outputs[:, :m] = found.outputs[used]  # corrected for the mesh, where that was done
@@ -273,14 +294,12 @@ def _predictions(
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
         bands[:, k] = np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T
     average = P @ mean
-    missing = np.full(M - m, np.nan)
-    sigma = next(posteriors[name, group].noise.sigma for name in names)
     return {
         "output_group": ("output", np.full(M, group)),
         "output_test": ("output", data.tests),
         "output_at": ("output", data.positions),
         "measured": ("output", data.values),
-        "sigma": ("output", np.concatenate([sigma, missing])),
+        "sigma": ("output", np.concatenate([models[0].posterior.noise.sigma, np.full(M - m, np.nan)])),
         "prediction_mean": (("model", "output"), mean),
         "prediction_std": (("model", "output"), std),
         "prediction_quantiles": (("quantile", "model", "output"), bands),
@@ -290,38 +309,29 @@ def _predictions(
     }
 
 
+Cells = Iterator[tuple[tuple[int, int], Compared, list[int]]]
+
+
+def _cells(names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]) -> Cells:
+    """Go through models and groups: their numbers, what was found, and the columns of its parameters."""
+    for (k, name), (g, group) in product(enumerate(names), enumerate(groups)):
+        one = found[name, group]
+        yield (k, g), one, [parameters.index(p) for p in one.posterior.names]
+
+
 def _constants(
-    names: list[str],
-    data_groups: list[str],
-    parameters: list[str],
-    posteriors: Mapping[Pair, Posterior],
-    stated: Mapping[Pair, Assessment],
-    points: Mapping[Pair, Points],
-) -> dict[str, tuple[Any, Any]]:
+    names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]
+) -> dict[str, Any]:
     """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
-    shape = (len(names), len(data_groups), len(parameters))
+    shape, dims = (len(names), len(groups), len(parameters)), ("model", "group", "parameter")
     mode, mean, std = np.full((3, *shape), np.nan)
     bands = np.full((len(QUANTILES), *shape), np.nan)
-    for k, name in enumerate(names):
-        for g, group in enumerate(data_groups):
-            posterior, assessment = posteriors[name, group], stated[name, group]
-            columns = [parameters.index(p) for p in posterior.names]
-            known = answer(posterior, assessment)
-            mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
-            mean[k, g, columns], std[k, g, columns] = known.mean, known.std
-            bands[:, k, g, columns] = known.quantiles(QUANTILES).T
-    count = max(found.weights.size for found in points.values())
-    places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
-    for k, name in enumerate(names):
-        for g, group in enumerate(data_groups):
-            found = points[name, group]
-            columns = [parameters.index(p) for p in posteriors[name, group].names]
-            places[k, g, : found.weights.size, columns] = found.values.T
-            shares[k, g, : found.weights.size] = found.weights
-    dims = ("model", "group", "parameter")
+    for (k, g), one, columns in _cells(names, groups, parameters, found):
+        known = answer(one.posterior, one.assessment)
+        mode[k, g, columns] = one.posterior.physical(one.assessment.gaussian.mode[None, :])[0]
+        mean[k, g, columns], std[k, g, columns] = known.mean, known.std
+        bands[:, k, g, columns] = known.quantiles(QUANTILES).T
     return {
-        "point": (("model", "group", "point", "parameter"), places),
-        "point_weight": (("model", "group", "point"), shares),
         "constant_mode": (dims, mode),
         "constant_mean": (dims, mean),
         "constant_std": (dims, std),
@@ -329,44 +339,41 @@ def _constants(
     }
 
 
-def _pointwise(
-    names: list[str], data_groups: Mapping[str, Measurements], critics: Mapping[Pair, Criticism]
-) -> tuple[Any, Any]:
-    """Ln of the density of every datum at every point of its group; NaN where nothing was measured."""
-    count = max(critic.pointwise.shape[0] for critic in critics.values())
-    parts = []
-    for group, data in data_groups.items():
-        part = np.full((len(names), count, len(data)), np.nan)
-        for k, name in enumerate(names):
-            found = critics[name, group].pointwise
-            part[k, : found.shape[0], : found.shape[1]] = found
-        parts.append(part)
-    return ("model", "point", "output"), np.concatenate(parts, axis=2)
+def _by_point(
+    names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]
+) -> dict[str, Any]:
+    """Points with their weights, and ln of the density of every datum at each; NaN where nothing was measured."""
+    count = max(one.points.weights.size for one in found.values())
+    ends = np.cumsum([0, *(len(found[names[0], group].data) for group in groups)])
+    logs = np.full((len(names), count, ends[-1]), np.nan)
+    places = np.full((len(names), len(groups), count, len(parameters)), np.nan)
+    shares = np.zeros(places.shape[:3])
+    for (k, g), one, columns in _cells(names, groups, parameters, found):
+        n, m = one.critic.pointwise.shape
+        logs[k, :n, ends[g] : ends[g] + m] = one.critic.pointwise
+        places[k, g, :n, columns] = one.points.values.T
+        shares[k, g, :n] = one.points.weights
+    return {
+        "point_log_likelihood": (("model", "point", "output"), logs),
+        "point": (("model", "group", "point", "parameter"), places),
+        "point_weight": (("model", "group", "point"), shares),
+    }
 
 
 def _meshes(
-    names: list[str],
-    data_groups: Mapping[str, Measurements],
-    parameters: list[str],
-    posteriors: Mapping[Pair, Posterior],
-    meshes: Mapping[Pair, MeshFound],
-    std: FloatArray,
-) -> dict[str, tuple[Any, Any]]:
+    names: list[str], data_groups: Mapping[str, Measurements], parameters: list[str], found: Mapping[Pair, Compared]
+) -> dict[str, Any]:
     """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations."""
-    shape = (len(names), len(data_groups))
+    shape, dims = (len(names), len(data_groups)), ("model", "group")
     whys, added, fixed = np.full(shape, "", dtype=object), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
-    shift, left, errors = np.full(std.shape, np.nan), np.full(std.shape, np.nan), []
-    for g, (group, data) in enumerate(data_groups.items()):
-        error = np.full((len(names), len(data)), np.nan)
-        for k, name in enumerate(names):
-            found = meshes[name, group]
-            whys[k, g], added[k, g] = found.why, found.log_evidence
-            error[k, : len(found.error)] = found.error
-            columns = [parameters.index(p) for p in posteriors[name, group].inputs.names]
-            shift[k, g, columns], left[k, g, columns] = found.shift, found.left
-            fixed[k, g] = found.corrected and found.settled
-        errors.append(error)
-    dims = ("model", "group")
+    shift, left = np.full((2, *shape, len(parameters)), np.nan)
+    errors = [np.full((len(names), len(data)), np.nan) for data in data_groups.values()]
+    for (k, g), one, columns in _cells(names, list(data_groups), parameters, found):
+        mesh, d = one.mesh, len(one.posterior.inputs.names)
+        assert mesh is not None
+        whys[k, g], added[k, g], fixed[k, g] = mesh.why, mesh.log_evidence, mesh.corrected and mesh.settled
+        errors[g][k, : len(mesh.error)] = mesh.error
+        shift[k, g, columns[:d]], left[k, g, columns[:d]] = mesh.shift, mesh.left
     return {
         "mesh_checked": (dims, whys == ""),
         "mesh_why": (dims, whys.astype(str)),

@@ -15,9 +15,9 @@ Candidates are arrays (c, k, r) for each draw: k rows for each of c candidates, 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,26 +27,26 @@ from forward.model import FloatArray
 IntArray = NDArray[np.int64]
 
 
-class Criterion(Protocol):
-    """What a growing set of observations is worth.
+class Criterion(ABC):
+    """What a growing set of observations is worth."""
 
-    Attributes
-    ----------
-    submodular
-        Whether what an observation adds never grows as others are added.
-    """
+    submodular: ClassVar[bool] = False  # whether what an observation adds never grows as others are added
 
-    submodular: ClassVar[bool]
-
-    @property
-    def count(self) -> int:
-        """Number of candidates."""
-
+    @abstractmethod
     def gains(self, which: IntArray) -> FloatArray:
         """Return what each of some candidates (w,), by number, would add (w,)."""
 
+    @abstractmethod
     def take(self, one: int) -> None:
         """Add a candidate to the set."""
+
+    def along(self, order: Sequence[int]) -> Iterator[float]:
+        """Go through what the first, the first two, … of candidates in an order are worth, and take them."""
+        worth = 0.0
+        for one in order:
+            worth += float(self.gains(np.array([one]))[0])
+            self.take(one)
+            yield worth
 
 
 def grouped(rows: FloatArray, which: IntArray, count: int) -> FloatArray:
@@ -93,17 +93,12 @@ def conditioned(root: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(root - (root @ turned.T * (a**2 / (1 + a))) @ turned)
 
 
-class _Conditioned:
+class _Conditioned(Criterion):
     """Candidates (c, k, r) of each draw, and roots of the covariances that the taken ones leave."""
 
     def __init__(self, candidates: Sequence[FloatArray]) -> None:
         self._candidates = candidates
         self.roots = [np.eye(one.shape[-1]) for one in candidates]
-
-    @property
-    def count(self) -> int:
-        """Number of candidates."""
-        return len(self._candidates[0])
 
     def take(self, one: int) -> None:
         """Add a candidate to the set."""
@@ -112,13 +107,7 @@ class _Conditioned:
 
 
 class Information(_Conditioned):
-    """D-optimality: the mean over draws of what observations tell (nat).
-
-    Parameters
-    ----------
-    candidates
-        Of each draw (c, k, r).
-    """
+    """D-optimality: the mean over draws of what observations tell (nat), of candidates (c, k, r) of each draw."""
 
     submodular: ClassVar[bool] = True
 
@@ -143,8 +132,6 @@ class Variance(_Conditioned):
         GᵀG (r, r) of each draw, with the goals G in units in which their prior variances add up to one.
     """
 
-    submodular: ClassVar[bool] = False
-
     def __init__(self, candidates: Sequence[FloatArray], goals: Sequence[FloatArray]) -> None:
         super().__init__(candidates)
         self._goals = goals
@@ -165,42 +152,6 @@ class Variance(_Conditioned):
             taken = np.linalg.solve(within, seen @ (root.T @ goal @ root) @ across)
             found += np.trace(taken, axis1=-2, axis2=-1)
         return found / len(self._goals)
-
-
-def along(criterion: Criterion, order: Sequence[int]) -> Iterator[float]:
-    """Go through what the first, the first two, … of candidates in an order are worth together."""
-    worth = 0.0
-    for one in order:
-        worth += float(criterion.gains(np.array([one]))[0])
-        criterion.take(one)
-        yield worth
-
-
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Candidates and goals at draws.
-
-    Attributes
-    ----------
-    rows
-        (c, k, r) of each draw, over the standard deviations of the errors.
-    goals
-        GᵀG (r, r) of each draw, with prior variances that add up to one.
-    """
-
-    rows: Sequence[FloatArray]
-    goals: Sequence[FloatArray]
-
-    def along(self, order: IntArray) -> FloatArray:
-        """Return what the first, the first two, … of candidates (n,) in an order tell together (draws, n)."""
-        return np.array([told_along(rows[order]) for rows in self.rows])
-
-    def roots(self, chosen: Sequence[int]) -> list[FloatArray]:
-        """Return roots (r, r) of the covariances once all chosen observations were made, of each draw."""
-        criterion = Information(self.rows)
-        for one in chosen:
-            criterion.take(one)
-        return criterion.roots
 
 
 def scaled(goals: FloatArray) -> list[FloatArray]:

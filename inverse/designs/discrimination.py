@@ -15,12 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 
 from forward.model import FloatArray
-from inverse.designs.criteria import IntArray
+from inverse.designs.criteria import Criterion, IntArray
 
 TOGETHER = 256  # candidates that are looked at at once
 NEGLIGIBLE = 1e-3  # of the standard deviation of the errors: what the unknowns of a model change less
@@ -61,7 +60,7 @@ def expected_log_bayes_factor(
     return np.asarray((spread + distance + volumes) / 2)
 
 
-class Discrimination:
+class Discrimination(Criterion):
     """The expected ln Bayes factor of the true model against another, by their probabilities before (nat).
 
     Parameters
@@ -75,8 +74,6 @@ class Discrimination:
     count
         Number of candidates.
     """
-
-    submodular: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -97,11 +94,6 @@ class Discrimination:
         self._rows = [order[a:b] for a, b in pairwise(starts)]
         self._sum = np.zeros((self._columns.shape[1],) * 2)
         self._worth = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of candidates."""
-        return len(self._rows)
 
     def _products(self, one: int) -> FloatArray:
         mine = self._columns[self._rows[one]]

@@ -71,9 +71,9 @@ def greedy(
     spare = np.inf if budget is None else budget * (1 + ROUNDING)
     order: list[int] = []
     gains: list[float] = []
-    free = np.ones(criterion.count, dtype=bool)
-    bounds, looks = criterion.gains(np.arange(criterion.count)), criterion.count
-    while len(order) < (criterion.count if number is None else number):
+    free, looks = np.ones(len(costs), dtype=bool), len(costs)
+    bounds = criterion.gains(np.arange(looks))
+    while len(order) < (len(costs) if number is None else number):
         open_ = np.flatnonzero(free & (costs <= spare))
         if len(open_) == 0:
             break

@@ -20,11 +20,10 @@ from inverse.designs.criteria import (
     Criterion,
     Information,
     IntArray,
-    Linearised,
     Variance,
-    along,
     grouped,
     scaled,
+    told_along,
 )
 from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.fields import left_out
@@ -149,14 +148,12 @@ class Design(Settings):
         mesh = self._mesh_errors(inputs, of_mesh) if self.mesh_error and of_mesh is not None else None
         sigma = self._with_mesh(self.sigma(values, found.outputs[ok]), mesh)
         whitened = found.tangents[ok] @ slopes[ok]  # (draws, m, d)
-        told = Linearised(
-            [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened],
-            scaled(whitened[:, goals] if goals.any() else slopes[ok]),
-        )
-        result = self.chosen(told, candidates, costs)
-        spread = np.linalg.norm(slopes[ok], axis=2)  # prior standard deviations (draws, d)
-        pairs = zip(slopes[ok], told.roots(result["chosen"].to_numpy().tolist()), strict=True)
-        left = [np.linalg.norm(slope @ root, axis=1) for slope, root in pairs]
+        rows = [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened]
+        result = self.chosen(rows, scaled(whitened[:, goals] if goals.any() else slopes[ok]), candidates, costs)
+        spread, after = np.linalg.norm(slopes[ok], axis=2), Information(rows)  # prior standard deviations (draws, d)
+        for one in result["chosen"].to_numpy().tolist():
+            after.take(one)
+        left = [np.linalg.norm(slope @ root, axis=1) for slope, root in zip(slopes[ok], after.roots, strict=True)]
         result = result.assign(
             prior_std=("parameter", spread.mean(axis=0)),
             posterior_std=("parameter", np.mean(left, axis=0)),
@@ -189,10 +186,10 @@ class Design(Settings):
         goals = [one["field_goal"].to_numpy() for one in draws]
         if self.criterion == "predictions":
             goals = [row.T @ row / len(row) for row in (one["goal_row"].to_numpy() for one in draws)]
-        told = Linearised([grouped(one, candidates.which, len(candidates.names)) for one in rows], goals)
-        result = self.chosen(told, candidates, costs)
-        taken = Variance(told.rows, [one["field_goal"].to_numpy() for one in draws])
-        share = list(along(taken, result["chosen"].to_numpy().tolist()))
+        told = [grouped(one, candidates.which, len(candidates.names)) for one in rows]
+        result = self.chosen(told, goals, candidates, costs)
+        taken = Variance(told, [one["field_goal"].to_numpy() for one in draws])
+        share = list(taken.along(result["chosen"].to_numpy().tolist()))
         chosen = np.isin(candidates.which, result["chosen"].to_numpy())
         scale = [one["sigma"].to_numpy()[chosen] / sigma[chosen] for one in draws]
         beyond = [one["beyond"].to_numpy()[:, chosen] * factor for one, factor in zip(draws, scale, strict=True)]
@@ -334,22 +331,32 @@ class Design(Settings):
             add(result, Finding("design-few-draws", "warning", {"models": ", ".join(few), "least": least}))
         return with_values(result, values, sigma, candidates)
 
-    def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
-        """Choose among candidates (c,) with costs (c,), and compare with random choices."""
+    def chosen(
+        self, rows: Sequence[FloatArray], goals: Sequence[FloatArray], candidates: Candidates, costs: FloatArray
+    ) -> xr.Dataset:
+        """Choose among candidates (c,) with costs (c,), and compare with random choices.
+
+        Of each draw are given rows (c, k, r) over the standard deviations of the errors, and GᵀG (r, r) of goals with
+        prior variances that add up to one.
+        """
+
+        def told(order: IntArray) -> FloatArray:
+            return np.array([told_along(one[order]) for one in rows])
+
         if self.criterion == "information":
-            make = partial(Information, told.rows)
-            choice, found = self._compared(make, candidates, costs, lambda order: told.along(order).mean(axis=0))
+            make = partial(Information, rows)
+            choice, found = self._compared(make, candidates, costs, lambda order: told(order).mean(axis=0))
         else:
-            choice, found = self._compared(lambda: Variance(told.rows, told.goals), candidates, costs)
-        known = told.along(np.array(choice.order))
-        alone = Information(told.rows).of_draws(np.arange(len(costs))).mean(axis=0)
+            choice, found = self._compared(partial(Variance, rows, goals), candidates, costs)
+        known = told(np.array(choice.order))
+        alone = Information(rows).gains(np.arange(len(costs)))
         found = found.assign(
             gain=("choice", np.diff(np.concatenate([[0.0], known.mean(axis=0)]))),
             information=("choice", known.mean(axis=0)),
             information_of_draw=(("draw_number", "choice"), known),
             candidate_information=("candidate", alone),
         )
-        add(found, *self._doubts(told, choice, found))
+        add(found, *self._doubts(rows, choice, found))
         return found
 
     def _compared(
@@ -361,13 +368,13 @@ class Design(Settings):
     ) -> tuple[Choice, xr.Dataset]:
         """Choose by a criterion, and compare with random choices as `inverse.designs.compared` does."""
         choice = choose(make, costs, number=self.number, budget=self.budget)
-        short = worth_along or (lambda order: np.array(list(along(make(), order.tolist()))))
+        short = worth_along or (lambda order: np.array(list(make().along(order.tolist()))))
         return choice, compared(choice, candidates, costs, short, self.random, self.seed)
 
-    def _doubts(self, told: Linearised, choice: Choice, found: xr.Dataset) -> list[Finding]:
+    def _doubts(self, rows: Sequence[FloatArray], choice: Choice, found: xr.Dataset) -> list[Finding]:
         """Say where draws disagree, and where observations add little."""
         doubts = []
-        lost = self.draws - len(told.rows)
+        lost = self.draws - len(rows)
         if lost:
             doubts.append(Finding("design-no-answer", "warning", {"lost": lost, "draws": self.draws}))
         gain, n = found["gain"].to_numpy(), len(choice.order)
@@ -375,11 +382,11 @@ class Design(Settings):
         if len(little) and n > 1:
             values = {"first": little[0] + 1, "n": n, "least": LITTLE * gain.sum() / n}
             doubts.append(Finding("design-repeats", "note", values))
-        if self.criterion == "information" and len(told.rows) > 1:
+        if self.criterion == "information" and len(rows) > 1:
             shared = found["information_of_draw"].to_numpy()[:, -1]
             costs = found["candidate_cost"].to_numpy()
-            alone = (partial(Information, [rows]) for rows in told.rows)
-            own = [choose(one, costs, number=self.number, budget=self.budget).worth for one in alone]
+            alone = (partial(Information, [one]) for one in rows)
+            own = [choose(make, costs, number=self.number, budget=self.budget).worth for make in alone]
             shares = shared / np.maximum(own, shared)
             worst = int(shares.argmin())
             if shares[worst] < ALIKE:

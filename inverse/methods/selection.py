@@ -19,11 +19,9 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import Settings
-from inverse.criticism.assessment import Assessment, Kind, Points, of_chains, of_gaussian, solves_of, weighted
-from inverse.criticism.comparison import Candidate, comparison
+from inverse.criticism.assessment import Kind, solves_of
+from inverse.criticism.comparison import Candidate, Compared, comparison
 from inverse.criticism.finer import Finer
-from inverse.criticism.verdict import verdict_on_points
-from inverse.criticism.weights import fewest
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.data.shared_motion import Shared, determined
@@ -206,7 +204,6 @@ class Select(Settings):
                 )
         posteriors = {pair: one.posterior for pair, one in found.items()}
         stated = {pair: one.assessment for pair, one in found.items()}
-        meshes = {pair: one.mesh for pair, one in found.items() if one.mesh is not None}
 
         def value(changed: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
             with _of(pair):
@@ -238,11 +235,11 @@ class Select(Settings):
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
         tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
         left_out = {test: _without(test, data_groups, posteriors, value) for test in dict.fromkeys(tests_of)}
-        points = {pair: _standing(posteriors[pair], one) for pair, one in stated.items()}
-        verdicts = {pair: verdict_on_points(one.gaussian, one.evidence, one.chains) for pair, one in stated.items()}
-        result = comparison(
-            candidates, data_groups, posteriors, stated, points, verdicts, variants, checks, left_out, meshes
-        )
+        compared = {
+            (name, group): Compared(one.posterior, data_groups[group], one.assessment, one.mesh)
+            for (name, group), one in found.items()
+        }
+        result = comparison(candidates, data_groups, compared, variants, checks, left_out)
         if not shared:
             return result
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
@@ -315,21 +312,6 @@ def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatAr
     x = points[:, : len(inputs.names)]
     change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
     return np.asarray(change + np.log(inputs.admitted / inputs.admitted_at(width)))
-
-
-def _standing(posterior: Posterior, one: Assessment) -> Points:
-    """Return what stands for a posterior: chains, else points that were solved, which know what is predicted too.
-
-    Of solved points it is enough that many count: what is predicted from a tail that is not to be trusted is nearer
-    than what a linearised model predicts.
-    """
-    count = len(one.evidence.log_weights)
-    if one.source == "chains":
-        assert one.chains is not None
-        return of_chains(posterior, one.chains, count)
-    if one.evidence.ess >= fewest(len(one.gaussian.mode)):
-        return weighted(posterior, one.evidence)
-    return of_gaussian(posterior, one.gaussian, posterior.at(one.gaussian.mode[None], derivatives=True), count)
 
 
 @contextmanager

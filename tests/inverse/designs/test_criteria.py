@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from inverse.designs.criteria import Information, Variance, along, conditioned, grouped, told, told_along
+from inverse.designs.criteria import Information, Variance, conditioned, grouped, told, told_along
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
@@ -28,7 +28,7 @@ def test_what_a_set_tells_is_the_determinant(scale):
     rows = scale * problem(draws=1)[0]
     criterion, order = Information([rows]), [3, 0, 5, 1]
     expected = np.array([information(rows, order[: n + 1]) for n in range(4)])
-    np.testing.assert_allclose(list(along(criterion, order)), expected, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(list(criterion.along(order)), expected, rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(told_along(rows[order]), expected, rtol=1e-7, atol=1e-14)
     np.testing.assert_allclose(told(rows[order].reshape(-1, 4)), expected[-1], rtol=1e-7, atol=1e-14)
 
@@ -60,7 +60,7 @@ def test_variances_of_goals_are_those_of_the_posterior():
     rows, G = problem(draws=2), np.random.default_rng(2).standard_normal((3, 4))
     goals = [G.T @ G, 4 * np.eye(4)]
     criterion = Variance(rows, goals)
-    worth = list(along(criterion, [1, 6, 2]))
+    worth = list(criterion.along([1, 6, 2]))
     taken = []
     for A, Q in zip(rows, goals, strict=True):
         chosen = A[[1, 6, 2]].reshape(-1, 4)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from inverse.designs.criteria import along
 from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.greedy import choose
 
@@ -34,7 +33,7 @@ def divergence(k, l, rows):
 @pytest.mark.unit
 def test_expected_ln_bayes_factors_are_divergences_of_dense_predictions():
     one = criterion()
-    worth = list(along(one, [4, 0, 1]))
+    worth = list(one.along([4, 0, 1]))
     rows = np.flatnonzero(np.isin(WHICH, [4, 0, 1]))
     pairs = np.array([[0 if k == l else divergence(k, l, rows) for l in range(3)] for k in range(3)])
     np.testing.assert_allclose(one.pairs(), pairs, rtol=1e-9)
