@@ -106,18 +106,9 @@ def assess(
     model: ForwardModel | None = None,
     seed: int = 0,
 ) -> Assessment:
-    """Correct Laplace's Gaussian by weighted points, and by chains if they are asked for.
+    """Correct Laplace's Gaussian by so many solves for weighted points, and by chains if they are asked for.
 
-    Parameters
-    ----------
-    posterior, gaussian
-        What is looked at, around its mode.
-    samples
-        Solves for weighted points.
-    chains, model
-        Kind of chains; "hmc" follows the gradients of the model, point by point.
-    seed
-        Of all draws.
+    Those by "hmc" follow the gradients of the model, point by point.
 
     Raises
     ------
@@ -160,12 +151,7 @@ def solves_of(kind: Kind | None, size: int) -> int:
 def own_seconds(size: int, outputs: int, samples: int, chains: Kind | None = None) -> float:
     """Predict the most processor time (s) that an assessment takes besides solves: of polynomials, and steps of chains.
 
-    Parameters
-    ----------
-    size, outputs
-        Unknown parameters, and data.
-    samples, chains
-        As of `assess`.
+    It is that of `size` unknown parameters and so many data; others as of `assess`.
     """
     return operations(size, outputs, samples) / RATE + (BUDGET * SECONDS_PER_STEP if chains == "hmc" else 0.0)
 

@@ -217,15 +217,8 @@ def chains_of_few(
 ) -> Chains:
     """Run chains for few parameters, kept in physical units.
 
-    Parameters
-    ----------
-    posterior, gaussian
-        What is sampled, and Laplace's Gaussian.
-    points
-        Weighted points, whose mean and (slightly widened) covariance are used in its place: if the posterior is curved,
-        Laplace's is too narrow, and chains get stuck in its tails.
-    lengths, seed
-        As in `crank_nicolson`.
+    Proposals are of Laplace's Gaussian, or of that of weighted points, slightly widened: if the posterior is curved,
+    Laplace's is too narrow, and chains get stuck in its tails.
     """
     centre, root = gaussian.mode, gaussian.root
     if points is not None:
@@ -250,14 +243,7 @@ def in_units(posterior: Posterior, chains: Chains) -> Chains:
 def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = None, *, seed: int = 0) -> Chains:
     """Run emcee's ensemble for few parameters, kept in physical units; its walkers are the chains.
 
-    Parameters
-    ----------
-    posterior, gaussian
-        What is sampled, and where the walkers start.
-    lengths
-        By default those of `walkers`.
-    seed
-        Of all draws.
+    They start as Laplace's Gaussian says, and are as long as those of `walkers` by default.
 
     Raises
     ------

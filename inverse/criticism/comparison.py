@@ -171,18 +171,9 @@ def comparison(
 ) -> xr.Dataset:
     """Collect everything that is known about the candidates in a dataset.
 
-    Parameters
-    ----------
-    candidates, data_groups
-        By name.
-    found
-        By candidate and group.
-    variants
-        ln Z and error by the name of the variant, beginning with the study as it is.
-    checks
-        ln Z and error by nested sampling, if requested.
-    left_out
-        ln Z and error without each test, if requested.
+    Estimates of ln Z are given with their errors by candidate and group: of each variant, by name, of which the first
+    is the study as it is; by nested sampling (`checks`), and without each test (`left_out`), where these were asked
+    for.
     """
     import xarray as xr
 

@@ -57,19 +57,10 @@ def far_from_prior(
     degrees: float,
     units: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Finding]:
-    """Doubt parameters whose mode or mean is far from the prior, each by name, and all of them together.
+    """Doubt parameters whose mode or mean (d,) is far from the prior, each by name, and all of them together.
 
-    Parameters
-    ----------
-    priors
-        By name, in the order of the values.
-    mode, mean
-        Of the posterior (d,).
-    square, degrees
-        Squared distance of the mode from the centre in the directions that the data determine, over its expectation,
-        and their number: χ² distributed if the truth is drawn from the prior.
-    units
-        SI units by name, of those that have one.
+    The squared distance of the mode from the centre, in so many directions that the data determine, is χ² distributed
+    if the truth is drawn from the prior. SI units are given by name, of those that have one.
     """
     from scipy.special import chdtrc
 
@@ -137,17 +128,7 @@ def at_an_end(
 
 
 def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatArray) -> list[Finding]:
-    """Doubt an inferred size of the errors.
-
-    Parameters
-    ----------
-    factor
-        On the stated standard deviations.
-    expected
-        The median of its prior.
-    sigma, values
-        Stated standard deviations (n,), and data (n,).
-    """
+    """Doubt an inferred factor on the stated deviations sigma (n,) of data (n,), where so much is expected."""
     size = float(np.sqrt((sigma**2).mean()) * factor / np.sqrt((values**2).mean())) if (values != 0).any() else np.inf
     if size >= NOTHING_SEEN:
         return [Finding("model-explains-nothing", "error", {"size": 100 * size, "factor": factor})]
@@ -171,20 +152,9 @@ REMEDY = 'or allow for them: data.errors = { kind = "student-t" }'
 def strangers(
     residual: FloatArray, resolution: FloatArray, labels: Sequence[str], *, heavy: bool, remedy: str = REMEDY
 ) -> list[Finding]:
-    """Doubt outliers among the data.
+    """Doubt outliers, by residuals over the errors (n,) and the share (n,) of each datum in its own prediction.
 
-    Parameters
-    ----------
-    residual
-        Over the errors (n,).
-    resolution
-        Share (n,) of each datum in its own prediction.
-    labels
-        What each datum is.
-    heavy
-        Whether heavy tails of the errors are allowed for already: then it is a note.
-    remedy
-        What can be done besides looking at them.
+    Where heavy tails of the errors are allowed for already, it is a note. A remedy is what can be done besides looking.
     """
     from scipy.special import log_ndtr
 
@@ -212,14 +182,9 @@ def strangers(
 
 
 def expansion_off(error: float, solves: int) -> list[Finding]:
-    """Doubt an expansion that misses left-out samples by a large part of the errors of the data.
+    """Doubt an expansion, of so many solves, that misses left-out samples by a large part of the errors of the data.
 
-    Parameters
-    ----------
-    error
-        Root mean square error of the datum that it misses most, over the standard deviation of its error.
-    solves
-        Number of solves that it was fitted to.
+    The error is that of the datum that it misses most (root mean square), over the standard deviation of its error.
     """
     if not error > EXPANDED:
         return []
@@ -227,16 +192,10 @@ def expansion_off(error: float, solves: int) -> list[Finding]:
 
 
 def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[Finding]:
-    """Say how alike the posteriors by a reduced model and by the body are.
+    """Say how alike the posteriors by a reduced model and by the body are, after so many full solves.
 
-    Parameters
-    ----------
-    share
-        Of the draws, that their weights are worth.
-    shift
-        By name, how far the mean moves by the weights, in standard deviations.
-    solves
-        Full solves so far.
+    The share is what weights of draws are worth; by them the mean of a parameter, by name, shifts by so many
+    deviations.
     """
     name = max(shift, key=lambda one: abs(shift[one]))
     values = {"solves": solves, "share": 100 * share, "name": name, "shift": abs(shift[name])}
@@ -256,16 +215,13 @@ def of_mesh(
     Parameters
     ----------
     one
-        Results: whether finer meshes were looked at and the mesh is corrected; shifts of unknowns by that, and what is
-        uncertain of them, over their posterior deviations.
+        Results: whether finer meshes were looked at, whether the mesh is corrected, and what that does to unknowns.
     error
         What finer meshes add to the measured data (n,), over the noise.
     settled
         Whether the error at the mode is the one that was corrected.
-    counted
-        Whether it was counted how often intervals of fields of such bodies hold.
-    from_file
-        Whether the mesh is that of a file.
+    counted, from_file
+        Whether it was counted how often intervals of fields of such bodies hold; whether the mesh is that of a file.
     """
     corrected = bool(one["mesh_corrected"])
     if not corrected and not bool(one["mesh_checked"]):
@@ -324,16 +280,10 @@ def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
 def meshes_too_coarse(
     log_evidence: Mapping[str, float], added: Mapping[str, float], shifts: Mapping[str, float]
 ) -> list[Finding]:
-    """Doubt the meshes of candidates, judging by the effect of finer ones on their evidences.
+    """Doubt the meshes of candidates, by what finer ones add to their ln Z (with the prior odds), all by name.
 
-    Parameters
-    ----------
-    log_evidence
-        With the prior odds, by name.
-    added
-        What a finer mesh adds to that, to first order; NaN where unknown, which counts as zero.
-    shifts
-        The resulting largest shift of an unknown, in posterior deviations.
+    That is to first order, and counts as zero where it is NaN; an unknown shifts by so many posterior deviations at
+    most.
     """
     known = {name: change for name, change in added.items() if np.isfinite(change)}
     if not known:

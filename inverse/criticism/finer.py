@@ -134,10 +134,7 @@ class MeshFound:
 def parameters_moved(posterior: Posterior, gaussian: Laplace, A: FloatArray, error: FloatArray) -> FloatArray:
     """Return how far the most probable parameters (d,) move if predictions are larger by `error` (m,).
 
-    Parameters
-    ----------
-    A
-        Derivatives (m, d) of the data by the normal coordinates; as `error`, over the errors of the data.
+    The derivatives A (m, d) by the normal coordinates are over the errors of the data, as the error is.
     """
     d = len(posterior.inputs.names)
     slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
@@ -147,12 +144,7 @@ def parameters_moved(posterior: Posterior, gaussian: Laplace, A: FloatArray, err
 def evidence_moved(A: FloatArray, data: FloatArray, error: FloatArray, noise: Distribution | None) -> float:
     """Return what predictions that are larger by `error` (m,) add to ln Z of the linear model A x of data (m,).
 
-    Parameters
-    ----------
-    A, data, error
-        Over the stated standard deviations of the errors.
-    noise
-        Prior of the factor on these, if it is unknown.
+    All are over the stated standard deviations, of which a factor with the prior `noise` may be unknown.
     """
     s, log_prior = np.ones(1), np.zeros(1)
     if noise is not None:

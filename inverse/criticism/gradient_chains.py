@@ -67,20 +67,9 @@ def gradient_chains(
 ) -> Chains:
     """Run chains for few parameters, kept in physical units, with the evidence that follows from them.
 
-    As many draws again follow until the chains have mixed, as long as the budget allows for them.
-
-    Parameters
-    ----------
-    posterior, gaussian
-        What is sampled, and the Gaussian in whose coordinates.
-    model
-        Solved for values and adjoints, one point after another; collective over its ranks.
-    lengths
-        Number of chains, draws and burn-in.
-    budget
-        Gradients that are not exceeded, unless the first draws alone take more.
-    seed
-        Of all draws.
+    The model is solved for values and adjoints, one point after another; collective over its ranks. As many draws again
+    follow until the chains have mixed, as long as the budget of gradients allows for them: only the first may exceed
+    it.
 
     Raises
     ------
@@ -142,16 +131,8 @@ def bridge(
 ) -> tuple[float, float]:
     """Return ln of the integral of a density and its standard error by bridge sampling from chains.
 
-    Parameters
-    ----------
-    log_density
-        ln of it (n,) at points (n, c).
-    z, levels
-        Draws (chains, draws, c), and ln of the density (chains, draws) there.
-    ess
-        Effective number of draws.
-    rng
-        Of the draws of the Gaussians.
+    The density is given by ln of it (n,) at points (n, c), and (chains, draws) at draws (chains, draws, c) that are
+    worth `ess` independent ones.
     """
     half = z.shape[1] // 2
     parts = (slice(half), slice(half, 2 * half))

@@ -45,16 +45,9 @@ class ResidualTest:
 
 
 def examine(residual: FloatArray, spectrum: Spectrum, neighbours: Neighbours | None = None) -> ResidualTest:
-    """Test residuals at a mode.
+    """Test residuals r (n,) at a mode, given the eigenpairs of AᵀA, of which neglected ones count as λ = 0.
 
-    Parameters
-    ----------
-    residual
-        r (n,).
-    spectrum
-        Eigenpairs of AᵀA; neglected ones count as λ = 0.
-    neighbours
-        Numbers of data that are expected to agree if the model is wrong, as in `inverse.data.neighbours`.
+    Neighbours are data that are expected to agree if the model is wrong (`inverse.data.neighbours`).
     """
     from scipy.special import chdtrc
 

@@ -47,12 +47,7 @@ class Mixture(NamedTuple):
 def mixture(log_evidence: FloatArray, weights: FloatArray) -> Mixture:
     """Compare that specimens are of two materials with that they are of one.
 
-    Parameters
-    ----------
-    log_evidence
-        ln Z of at least two candidates for each specimen (K, G).
-    weights
-        Prior probabilities (K,) of the candidates, π.
+    Given are ln Z of at least two candidates for each specimen (K, G), and their prior probabilities (K,), π.
     """
     count, specimens = log_evidence.shape
     nodes, parts = gauss_legendre(specimens // 2 + 1)

@@ -89,16 +89,7 @@ def verdict_on_field(
 ) -> Verdict:
     """Judge means and standard deviations of the values of a field by other solves, if any, and the residuals.
 
-    Parameters
-    ----------
-    mode, gaussian
-        What is judged.
-    found
-        Weighted samples.
-    test
-        Of the residuals.
-    chains
-        Judged chains, and `values` (n, N), the values of the field that they drew.
+    Other solves are weighted samples, and chains with the values of the field (n, N) that they drew.
     """
     objection = _objection(mode.converged, test)
     if objection is not None:

@@ -34,18 +34,7 @@ COLUMNS = (*AXES, *MOTION, "sigma", *ERRORS, "case")
 def of_table(
     path: Path, known: Mapping[str, Units], unit: float | None = None, reader: Reader | None = None
 ) -> Measurements:
-    """Read a table of displacements, and of other outputs.
-
-    Parameters
-    ----------
-    path
-        The table.
-    known
-        Names of the load cases, and what is measured in them beside displacements.
-    unit
-        m per unit of the file, if it does not state that.
-    reader
-        What reads files of another kind.
+    """Read a table of displacements in m, unless it or `unit` says otherwise, and of other outputs of known load cases.
 
     Raises
     ------

@@ -18,14 +18,8 @@ SCANS = (".toml",)  # that say what files belong together
 def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     """Return the files given by names, folders (all data files in them) and patterns such as ``*.csv``.
 
-    Missing files are included too, so that the others of a batch go on: they cannot be read.
-
-    Parameters
-    ----------
-    patterns
-        Names, folders and patterns.
-    folders
-        Where to look for them: the first folder with a match counts.
+    They are looked for in several folders, of which the first with a match counts. Missing files are included too, so
+    that the others of a batch go on: they cannot be read.
 
     Raises
     ------

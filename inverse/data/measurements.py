@@ -287,20 +287,9 @@ class Measurements:
         surface: bool = False,
         leave_out: bool = False,
     ) -> Measurements:
-        """Move the points onto a body.
+        """Move the points onto a body of some extent (m), to its places (n, 3), or its surface's, that are nearest.
 
-        Parameters
-        ----------
-        nearest_place
-            Places (n, 3) of the body, or of its surface, that are nearest to points (n, 3).
-        extent
-            Size of the body (m).
-        tolerance
-            Largest distance (m) from the body, or from its surface.
-        surface
-            Whether the surface is meant.
-        leave_out
-            Whether points that are farther away are left out.
+        Points that are farther away than the tolerance (m) may be left out.
 
         Raises
         ------

@@ -20,15 +20,7 @@ SAME = 1e-9  # relative difference of distances that counts as rounding
 
 
 def neighbours(places: FloatArray, kinds: NDArray[np.int64]) -> Neighbours:
-    """Pair neighbouring data, each pair once.
-
-    Parameters
-    ----------
-    places
-        (n, k).
-    kinds
-        Numbers (n,) of what can be compared: of tests and stresses, or of load cases and components.
-    """
+    """Pair neighbouring data at places (n, k), each pair once; only those of the same kind (n,) can be compared."""
     pairs: set[tuple[int, int]] = set()
     for kind in np.unique(kinds):
         members = np.flatnonzero(kinds == kind)

@@ -26,18 +26,7 @@ COLUMNS = ("output", "value", "sigma")
 def read_outputs(
     path: Path, outputs: Sequence[str], steps: Steps | None = None, reader: Reader | None = None
 ) -> Measurements:
-    """Read a table of measured outputs.
-
-    Parameters
-    ----------
-    path
-        The table.
-    outputs
-        Names of the outputs of the model.
-    steps
-        Of a path, where the table may be a curve.
-    reader
-        What reads files of another kind.
+    """Read a table of measured outputs of a model, or of a path with these steps, where it may be a curve.
 
     Raises
     ------

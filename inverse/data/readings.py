@@ -26,21 +26,10 @@ Units = Mapping[str, str]  # SI units of the outputs of a load case, by their na
 
 
 def split(table: Table, name: str, cases: Mapping[str, Units]) -> tuple[Table, Measurements]:
-    """Take the rows of outputs out of a table.
+    """Take the rows of outputs out of a table, of displacements, of outputs or of both, in a file of some name.
 
-    Parameters
-    ----------
-    table
-        A table of displacements, of outputs, or of both.
-    name
-        Of its file.
-    cases
-        Load cases, by name, with what is measured in them.
-
-    Returns
-    -------
-    tuple
-        The table of the displacements alone, which may have no rows, and the outputs.
+    Load cases are given by name, with what is measured in them. Returned are the table of the displacements alone,
+    which may have no rows, and the outputs.
 
     Raises
     ------

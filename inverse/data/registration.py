@@ -202,10 +202,8 @@ class ToSurface(_Motion):
 
         Parameters
         ----------
-        places
-            Points (n, 3) of the file (m).
-        unit
-            m per unit of the file.
+        places, unit
+            Points (n, 3) of the file (m), and m per unit of the file.
         surface
             Of the body; needed for points on it only.
         extent

@@ -167,16 +167,7 @@ class Scan(Reading):
 
 
 def read(folder: Path, scan: Scan, known: Mapping[str, Units]) -> Measurements:
-    """Read the files of a scan.
-
-    Parameters
-    ----------
-    folder
-        Where they are.
-    scan
-        The scan.
-    known
-        Names of the load cases, and what is measured in them beside displacements.
+    """Read the files of a scan, in a folder, of known load cases with what is measured in them beside displacements.
 
     Raises
     ------

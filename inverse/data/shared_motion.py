@@ -149,14 +149,8 @@ def said(values: FloatArray) -> Finding:
 def determined(spectrum: Spectrum, noise: Noise, root: FloatArray) -> FloatArray:
     """Return eigenvalues (k,), descending, of what the data say about shared errors, over what is known of them before.
 
-    Parameters
-    ----------
-    spectrum
-        Of the data at the mode: what the unknowns explain cannot be told from a motion.
-    noise
-        Of the data, with these errors in it.
-    root
-        √ (m,) of the weights of the data.
+    What the unknowns explain, by the spectrum at the mode, cannot be told from a motion; `root` is √ (m,) of the
+    weights of the data.
     """
     assert noise.shared is not None
     G = root * noise.shared / noise.scale

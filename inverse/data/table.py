@@ -113,16 +113,7 @@ def read_table(path: Path) -> Table:
 
 
 def numeric(text: str, name: str, *, positive: bool = False) -> float:
-    """Return the number in a cell; NaN for an empty one.
-
-    Parameters
-    ----------
-    text
-        The cell.
-    name
-        Of its column, for the message.
-    positive
-        Whether only numbers above 0 are allowed.
+    """Return the number in a cell, by the name of its column, maybe a positive one only; NaN for an empty one.
 
     Raises
     ------

@@ -44,24 +44,18 @@ def _table(path: Path) -> tuple[Columns, FloatArray | None]:
         raise ValueError(str(error.args[0])) from None
     columns: Columns = {}
     for name in table.columns:
-        cells = [row[name] for row in table.rows]
-        try:
-            columns[name] = np.array([float(cell) for cell in cells])
-        except ValueError:
-            if _beside(name):
-                continue
-            n = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-            message = f"{path.name}: line {table.lines[n]}: '{cells[n]}' in column '{name}', expected a number"
-            raise ValueError(message) from None
+        values = []
+        for line, row in zip(table.lines, table.rows, strict=True):
+            try:
+                values.append(float(row[name]))
+            except ValueError:
+                if _beside(name):
+                    break
+                message = f"{path.name}: line {line}: '{row[name]}' in column '{name}', expected a number"
+                raise ValueError(message) from None
+        else:
+            columns[name] = np.array(values)
     return columns, columns.get("chain", columns.get("chain__"))
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _netcdf(path: Path) -> tuple[Columns, FloatArray | None]:

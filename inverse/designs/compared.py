@@ -31,20 +31,9 @@ def compared(
     random: int,
     seed: int,
 ) -> xr.Dataset:
-    """Return what chosen candidates are worth, and random ones.
+    """Return what chosen candidates, which cost so much (c,), are worth, and random ones.
 
-    Parameters
-    ----------
-    choice
-        The chosen ones.
-    candidates
-        All of them.
-    costs
-        What they cost (c,).
-    worth
-        What the first, the first two, … of candidates in an order (n,) are worth (n,).
-    random, seed
-        Number of random orders, and of their seed.
+    In an order (n,) the first, the first two, … are worth (n,); so many random orders follow from the seed.
     """
     import xarray as xr
 
@@ -82,16 +71,8 @@ def with_values(
 ) -> xr.Dataset:
     """Add what the values of the candidates are, and say of which candidates errors of the mesh exceed the noise.
 
-    Parameters
-    ----------
-    found
-        The design.
-    values, sigma, candidates
-        All values, the standard deviations (m,) of their errors, and what is measured together.
-    mesh
-        What the mesh is said to take away from all values (m,), NaN where that is not known; None if it is of none.
-    noise
-        Whether this counts as noise already.
+    The standard deviations (m,) are of the errors of all values. What the mesh is said to take away from them (m,) is
+    NaN where that is not known, and may count as noise already.
     """
     which, names = candidates.which, candidates.names
     found = found.assign(

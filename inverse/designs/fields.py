@@ -43,28 +43,18 @@ def of_field(
     rank: int,
     seed: int,
 ) -> xr.Dataset:
-    """Linearise at one draw of a field.
+    """Linearise a model, whose parameters are the N values of a field, at one draw.
 
     Parameters
     ----------
-    model
-        The model; its parameters are the N values of the field.
-    solution
-        Its solution at the draw.
-    whitened
-        The draw ξ (N,).
-    prior
-        Prior of the field.
+    solution, whitened
+        At the draw ξ (N,).
     mass
         Volume (N,) of each vertex.
-    sigma
-        Standard deviations (m,) of the errors of its outputs.
-    goals
-        Which outputs (m,) are not measured but predicted.
-    rank
-        Largest number of directions.
-    seed
-        Of the search for them.
+    sigma, goals
+        Standard deviations (m,) of the errors of the outputs, and which of these (m,) are not measured but predicted.
+    rank, seed
+        Largest number of directions, and seed of the search for them.
 
     Returns
     -------

@@ -46,17 +46,7 @@ class Choice(NamedTuple):
 
 
 def choose(make: Callable[[], Criterion], costs: FloatArray, *, number: int | None, budget: float | None) -> Choice:
-    """Choose a number of candidates, or as many as a budget pays for.
-
-    Parameters
-    ----------
-    make
-        Makes the criterion, of no observations yet.
-    costs
-        Of the candidates (c,).
-    number, budget
-        How many, and how much they may cost together; None without limit.
-    """
+    """Choose a number of candidates with costs (c,), or as many as a budget pays for, by a criterion made anew."""
     found = greedy(make(), costs, costs, number=number, budget=budget)
     if budget is not None and np.ptp(costs) > 0:
         other = greedy(make(), costs, np.ones(len(costs)), number=number, budget=budget)

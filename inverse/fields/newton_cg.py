@@ -94,16 +94,9 @@ class Mode:
 
 
 def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tolerance: float = CLOSE) -> Mode:
-    """Find the mode.
+    """Find the mode of a posterior whose model has derivatives, from ξ (N,) or the centre of the prior.
 
-    Parameters
-    ----------
-    posterior
-        Its model must have derivatives.
-    start
-        ξ (N,) where the search starts; by default zero, the centre of the prior.
-    tolerance
-        Distance to the mode, in standard deviations of the posterior, at which the search ends.
+    The search ends where the distance to the mode, in standard deviations of the posterior, is below the tolerance.
 
     Raises
     ------

@@ -68,16 +68,8 @@ def infer_noise(
 ) -> SolvedField:
     """Find the most probable size of the noise, with the mode and the Gaussian of the field there.
 
-    Parameters
-    ----------
-    posterior
-        With the prior of s, whose most probable value is that of the standard normal coordinate.
-    start
-        ξ (N,) where the first search for the mode starts.
-    tolerance
-        Change of ln s, over its standard deviation, that ends the rounds.
-    cutoff, rank
-        Of the pairs, as in `leading_pairs`.
+    The most probable value of its prior is that of the standard normal coordinate; the first search starts at ξ (N,).
+    Rounds end where ln s changes by less than the tolerance, over its standard deviation; others as of `leading_pairs`.
 
     Raises
     ------
@@ -151,15 +143,7 @@ class Marginal:
         return np.where(square[:, 0] > 0, -(misfit + spread) / 2 - self.constant, -np.inf)
 
     def integrated(self, prior: Distribution, unit: float) -> tuple[float, float, float]:
-        """Return the most probable s, the standard deviation of ln s, and ln p(y) with s integrated out.
-
-        Parameters
-        ----------
-        prior
-            Of s.
-        unit
-            s at the mode.
-        """
+        """Return the most probable s, the deviation of ln s, and ln p(y) without s; at the mode s is the unit."""
         low, high = -FARTHEST, FARTHEST
         for _ in range(ZOOMS):
             x = np.linspace(low, high, GRID)

@@ -103,14 +103,7 @@ class Evidence:
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
     """Estimate the evidence by `samples` solves around a Gaussian, by the route that the first of them suggest.
 
-    Parameters
-    ----------
-    posterior, gaussian
-        The density that is integrated, and its approximation.
-    samples
-        Number of solves, at least 32, rounded down to a multiple of 32.
-    seed
-        Of all draws.
+    They are at least 32, rounded down to a multiple of 32.
 
     Raises
     ------

@@ -101,15 +101,11 @@ def laplace(
     ----------
     posterior
         Its model must have derivatives.
-    starts
-        Number of starts: the first, and points of a scrambled Sobol' sequence.
-    seed
-        Of that sequence.
+    starts, seed
+        Number of starts: the `first`, by default the centre of the prior, and points of a scrambled Sobol' sequence.
     exact
         Take second derivatives by central differences of the gradient (two solves for each coordinate), or those of
         Gauss–Newton.
-    first
-        The first start (c,); by default the centre of the prior.
 
     Raises
     ------

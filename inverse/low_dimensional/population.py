@@ -216,22 +216,9 @@ def fitted(
     steps: int = 600,
     covariates: FloatArray | None = None,
 ) -> Fit:
-    """Sample the distribution of a population.
+    """Sample the distribution of a population of at least two specimens, and keep so many draws.
 
-    Parameters
-    ----------
-    specimens
-        At least two.
-    prior
-        That of a specimen.
-    draws
-        Number A of draws that are kept.
-    seed
-        Of the walkers.
-    steps
-        Of each walker; the first third is left out.
-    covariates
-        x (n, q) of the specimens, less their means.
+    Each walker makes so many steps, of which the first third is left out. Covariates x (n, q) are less their means.
     """
     few = tuple(thinned(one, seed) for one in specimens)
     d = len(prior.mean)

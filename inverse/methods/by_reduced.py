@@ -104,16 +104,7 @@ class Agreement:
 
 
 def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel, problem: Problem) -> xr.Dataset:
-    """Invert a data set with a reduced model of a body.
-
-    Parameters
-    ----------
-    inputs, problem
-        As of `inverse.methods.invert_few`.
-    evaluate
-        The body.
-    reduced
-        Its reduced model, with the same parameters and outputs.
+    """Invert a data set with a reduced model of a body, which has the same parameters and outputs.
 
     Raises
     ------

@@ -118,18 +118,9 @@ class Design(Settings):
     def run(
         self, inputs: Inputs, evaluate: Evaluate, values: Measurements, of_mesh: Evaluate | None = None
     ) -> xr.Dataset:
-        """Linearise the model at draws, and choose.
+        """Linearise the model, which must have derivatives, at draws of the unknowns, and choose among its outputs.
 
-        Parameters
-        ----------
-        inputs
-            The unknowns, with their prior.
-        evaluate
-            The model; it must have derivatives.
-        values
-            What its outputs are.
-        of_mesh
-            The same for an estimate of the error of its mesh; None if it has none.
+        The same model estimates the error of its mesh; None if it has none.
 
         Raises
         ------
@@ -280,18 +271,9 @@ class Design(Settings):
         models: Mapping[str, Evaluate],
         values: Measurements,
     ) -> xr.Dataset:
-        """Choose the observations that tell models apart.
+        """Choose the observations, of values that are the outputs of all models, that tell these apart.
 
-        Parameters
-        ----------
-        inputs
-            The unknowns of each model, by its name.
-        weights
-            Their probabilities before the observations, up to a common factor.
-        models
-            The models, by their names.
-        values
-            What the outputs of all of them are.
+        By the name of each model are given its unknowns, and its probability before, up to a common factor.
 
         Raises
         ------

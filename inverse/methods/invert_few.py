@@ -114,16 +114,8 @@ def invert_few(
 ) -> Inverted:
     """Invert a data set for few parameters.
 
-    Parameters
-    ----------
-    inputs, evaluate, problem
-        The unknowns, the model, and what is inverted.
-    look
-        The stiffness of the interior as a function of the parameters; None if there is none.
-    start
-        Predicts states from a solution at parameters (d,); by default by tangents there.
-    model
-        The model itself, whose gradients chains follow.
+    The stiffness of the interior is looked at as a function of the parameters, if there is one; states are predicted
+    from a solution at parameters (d,), by default by tangents there; chains follow the gradients of the model itself.
 
     Raises
     ------
@@ -160,19 +152,18 @@ def invert_few(
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
     log_evidence, error = one.log_evidence
-    drawn = _drawn(posterior, one, at, method)
-    moments = _moments(posterior, gaussian, known, drawn, look)
+    points, *drawn = _drawn(posterior, one, at, method)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
         **of_motions(spectrum, posterior.noise, root),
-        **moments,
+        **_moments(posterior, one, known, points, look),
         **_alone(posterior, gaussian, spectrum, data),
-        **_draws(posterior, drawn.draws, drawn.outputs),
-        "point": drawn.points.values,
-        "point_weight": drawn.points.weights,
+        **_draws(posterior, *drawn),
+        "point": points.values,
+        "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
         **diagnosed(chains, used=known.source == "chains"),
         "mode": best,
@@ -194,37 +185,27 @@ def invert_few(
     return Inverted(as_dataset(record), posterior, found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Draws (n, c) of a posterior with their outputs (n, m), and points that stand for it."""
+def _drawn(posterior: Posterior, one: Assessment, at: Density, method: Invert) -> tuple[Points, FloatArray, FloatArray]:
+    """Return points that stand for what is printed, and draws (n, c) of it with their outputs (n, m).
 
-    draws: FloatArray
-    outputs: FloatArray
-    points: Points
-    spread: FloatArray  # points that the stiffness is looked at, with weights
-    shares: FloatArray
-
-
-def _drawn(posterior: Posterior, one: Assessment, at: Density, method: Invert) -> _Drawn:
-    """Draw from what is printed; solves at draws of chains, whose outputs were not kept."""
+    Draws of chains are solved, since their outputs were not kept.
+    """
     match one.source:
         case "points":
             found = weighted(posterior, one.evidence)
-            chosen, used = resampled(found.weights, method.draws, method.seed), found.weights > 0
-            return _Drawn(found.values[chosen], found.outputs[chosen], found, found.values[used], found.weights[used])
+            chosen = resampled(found.weights, method.draws, method.seed)
+            return found, found.values[chosen], found.outputs[chosen]
         case "chains":
             assert one.chains is not None
             found = of_chains(posterior, one.chains, method.draws)
-            return _Drawn(found.values, found.outputs, found, one.chains.flat, even(len(one.chains.flat)))
         case "laplace":
             found = of_gaussian(posterior, one.gaussian, at, max(method.draws, len(one.evidence.log_weights)))
-            drawn, outputs = found.values[: method.draws], found.outputs[: method.draws]
-            return _Drawn(drawn, outputs, found, found.values, found.weights)
+    return found, found.values[: method.draws], found.outputs[: method.draws]
 
 
-def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Drawn, look: Look | None) -> Record:
+def _moments(posterior: Posterior, one: Assessment, known: Answer, points: Points, look: Look | None) -> Record:
     """Moments and quantiles of the parameters, of the stiffness by weighted points; widths of the Gaussian."""
-    ends = known.quantiles(ENDS)
+    ends, gaussian = known.quantiles(ENDS), one.gaussian
     record: Record = {
         "mean": known.mean,
         "std": known.std,
@@ -235,13 +216,16 @@ def _moments(posterior: Posterior, gaussian: Laplace, known: Answer, drawn: _Dra
     }
     if look is None:
         return record
+    values, weights = points.values[points.weights > 0], points.weights[points.weights > 0]
+    if known.source == "chains" and one.chains is not None:
+        values, weights = one.chains.flat, even(len(one.chains.flat))
     d = len(posterior.inputs.names)
-    stiffness = look(drawn.spread[:, :d])
-    average = drawn.shares @ stiffness
+    stiffness = look(values[:, :d])
+    average = weights @ stiffness
     return record | {
         "stiffness_mode": look(posterior.physical(gaussian.mode[None])[:, :d])[0],
         "stiffness_mean": average,
-        "stiffness_std": np.sqrt(np.maximum(drawn.shares @ (stiffness - average) ** 2, 0)),
+        "stiffness_std": np.sqrt(np.maximum(weights @ (stiffness - average) ** 2, 0)),
     }
 
 

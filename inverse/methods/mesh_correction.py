@@ -98,19 +98,10 @@ def error_of(
 
 
 def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> FloatArray:
-    """Return Uᵀ (k, m): what finer meshes still miss, of the patterns of the error and of the difference between them.
+    """Return Uᵀ (k, m): what finer meshes still miss, by the error (m,) and by the difference (m,) between them.
 
-    The rest is extrapolated by one factor; in truth the factor is another in each load case, for each component, and
-    varies slowly over the body.
-
-    Parameters
-    ----------
-    error
-        δ (m,).
-    between
-        Difference (m,) between the two finer meshes.
-    data
-        What the data are, and where.
+    Both are patterns, of which the rest is extrapolated by one factor; in truth it is another in each load case, for
+    each component, and varies slowly over the body: the data say which of these they are, and where.
     """
     somewhere, points, groups = np.isfinite(data.places).all(axis=1), data.places, data.kinds
     seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
@@ -130,16 +121,9 @@ def along(images: FloatArray, between: FloatArray, noise: Noise) -> FloatArray:
     """Return rows (r, m) of what is uncertain along the directions of a field, in addition to `uncertain`.
 
     What the data determine best is what few patterns of all data determine, and a rest that is small in every datum may
-    lie along these: there it counts as much as the difference between the finer meshes.
-
-    Parameters
-    ----------
-    images
-        A u (r, m) of orthogonal directions u of the field: orthogonal patterns in independent errors.
-    between
-        Difference (m,) between the two finer meshes.
-    noise
-        The errors without those of the mesh.
+    lie along these: there it counts as much as the difference (m,) between the finer meshes. The images A u (r, m) of
+    orthogonal directions u of the field are orthogonal patterns in independent errors, those without the errors of the
+    mesh.
     """
     patterns = images / np.maximum(np.linalg.norm(images, axis=1, keepdims=True), 1e-300)
     seen = OF_DIRECTION * np.abs(patterns @ noise.whitened(between / noise.scale))
@@ -242,16 +226,8 @@ def corrected_field(
 ) -> tuple[SolvedField, FloatArray, MeshFound]:
     """Do the same for a field of N values: what was solved last, how far its mode moves (N,), and what was found.
 
-    Parameters
-    ----------
-    posterior
-        Not corrected.
-    solve
-        Finds the mode of a posterior, from ξ (N,) or from the centre of the prior, and the Gaussian there.
-    finer, data, treatment
-        As of few parameters.
-    weights
-        Of the vertices (N,) in the mean over the body.
+    The mode of a posterior, here not corrected, is found from ξ (N,) or from the centre of the prior, with the Gaussian
+    there. Weights of the vertices (N,) are those in the mean over the body.
     """
     first = solve(posterior, None)
     images, moved = first.found.spectrum.images, np.full(len(weights), np.nan)

@@ -75,19 +75,8 @@ class Population(Settings):
     def run(self, posteriors: Mapping[str, Draws], prior: Inputs, again: Again | None = None) -> xr.Dataset:
         """Fit the population, without solving anything but for specimens whose draws do not reach it.
 
-        Parameters
-        ----------
-        posteriors
-            Draws of the specimens, all of the same parameters.
-        prior
-            The prior of every specimen.
-        again
-            Draws a specimen again under another prior; None if that cannot be done.
-
-        Returns
-        -------
-        xarray.Dataset
-            The variables of docs/results.md.
+        All draws are of the same parameters, with the same prior. Specimens are drawn again under another prior; None
+        if that cannot be done. The variables are those of docs/results.md.
 
         Raises
         ------

@@ -75,16 +75,10 @@ class Band:
 
 
 def record(before: Band, after: Band, mesh_error: FloatArray, share: FloatArray | None = None) -> Record:
-    """Return what results hold of predictions.
+    """Return what results hold of predictions, by the prior, and by the posterior.
 
-    Parameters
-    ----------
-    before, after
-        By the prior, and by the posterior.
-    mesh_error
-        What the mesh takes away from the outputs (k,); NaN where that is not estimated.
-    share
-        Of their variance by the prior (k,) what the data have removed; by default as both bands say.
+    What the mesh takes away from the outputs (k,) is NaN where it is not estimated. The share of their variance by the
+    prior (k,) that the data have removed is by default what both bands say.
     """
     if share is None:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -245,22 +239,9 @@ def after_field(
 ) -> Record:
     """Return what the posterior of a field says on the outputs of a model, beside what was known before the data.
 
-    Parameters
-    ----------
-    model
-        The model; all of its parameters are values of the field.
-    found
-        The posterior.
-    before
-        What the prior says.
-    pairs
-        Of draws, with which it is seen what gradients leave out.
-    seed
-        Of these.
-    weighted
-        Values (n, N) with weights (n,) that correct the normal distribution; None where it is right.
-    of_mesh
-        Whether the error of the mesh is estimated.
+    All parameters of the model are values of the field. Pairs of draws show what gradients leave out. Values (n, N)
+    with weights (n,) correct the normal distribution; None where it is right. The error of the mesh is estimated if
+    asked for.
     """
     drawn = deviations(found.prior, len(found.mean), pairs, seed, found)
     after, gradients, mesh = _of_field(model, found.mean, found.covariance, drawn, weighted, of_mesh=of_mesh)

@@ -128,14 +128,9 @@ def with_record(found: xr.Dataset, record: Record) -> xr.Dataset:
 def stacked(
     found: Sequence[xr.Dataset | None], least: Mapping[str, int]
 ) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
-    """Stack the numbers of several data sets, along the dimension `data_set`.
+    """Stack the numbers of several data sets, of which some may be missing, along the dimension `data_set`.
 
-    Parameters
-    ----------
-    found
-        Datasets, some of which may be missing.
-    least
-        Smallest sizes of dimensions, by name; shorter ones are filled with NaN.
+    Dimensions are at least as long as is said by name; shorter ones are filled with NaN.
     """
     there = [one for one in found if one is not None]
     sizes = dict(least)

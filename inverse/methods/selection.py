@@ -8,7 +8,7 @@ that were solved already (in standard normal coordinates, N(0, s²I) instead of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -223,18 +223,27 @@ class Select(Settings):
                 pair: value(replace(one, noise=noise.of(data_groups[pair[1]].seen(), one.noise)), pair)
                 for pair, one in posteriors.items()
             }
-        for label, tests in self.subsets.items():
-            variants[label] = {
-                pair: value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
-                for pair in pairs
-                if set(tests) & set(data_groups[pair[1]].measured_tests)
+
+        def some(wanted: Callable[[tuple[str, ...]], set[str]]) -> dict[tuple[str, str], tuple[float, float]]:
+            """Return ln Z and errors by the data of wanted ones of the tests of a group, in groups that have any."""
+            tests = {pair: wanted(data_groups[pair[1]].measured_tests) for pair in pairs}
+            return {
+                pair: value(_only(posteriors[pair], data_groups[pair[1]], those), pair)
+                for pair, those in tests.items()
+                if those
             }
+
+        for label, tests in self.subsets.items():
+            variants[label] = some(set(tests).intersection)
         checks = {}
         if self.check is not None:
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
         tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
-        left_out = {test: _without(test, data_groups, posteriors, value) for test in dict.fromkeys(tests_of)}
+        left_out = {
+            test: some(lambda those, test=test: {*those} - {test} if test in those else set())  # type: ignore[misc]
+            for test in dict.fromkeys(tests_of)
+        }
         compared = {
             (name, group): Compared(one.posterior, data_groups[group], one.assessment, one.mesh)
             for (name, group), one in found.items()
@@ -276,22 +285,6 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
     return Posterior(candidate.inputs, evaluate, seen.values, noise.of(seen), which)
 
 
-def _without(
-    test: str,
-    data_groups: Mapping[str, Measurements],
-    posteriors: Mapping[tuple[str, str], Posterior],
-    value: Callable[[Posterior, tuple[str, str]], tuple[float, float]],
-) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return ln Z and its error without a test, in the groups that have it and others."""
-    found = {}
-    for pair, posterior in posteriors.items():
-        rest = data_groups[pair[1]].measured_tests
-        if test in rest and len(rest) > 1:
-            others = tuple(other for other in rest if other != test)
-            found[pair] = value(_only(posterior, data_groups[pair[1]], others), pair)
-    return found
-
-
 def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
     """What the data say about rigid motions that are uncertain, at the mode, as `determined`."""
     from inverse.criticism.predictive import spectrum_of
@@ -300,9 +293,9 @@ def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
     return determined(spectrum_of(posterior, at), posterior.noise, np.ones(posterior.data.size))
 
 
-def _only(posterior: Posterior, data: Measurements, tests: tuple[str, ...]) -> Posterior:
+def _only(posterior: Posterior, data: Measurements, tests: Collection[str]) -> Posterior:
     """The same with the data of some tests only."""
-    which = np.flatnonzero(np.isin(data.seen().tests, tests))
+    which = np.flatnonzero(np.isin(data.seen().tests, list(tests)))
     return replace(posterior, data=posterior.data[which], noise=posterior.noise.of(which), which=which)
 
 

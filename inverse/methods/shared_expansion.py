@@ -84,19 +84,9 @@ class _Expansion:
 def shared_expansion(
     inputs: Inputs, evaluate: Evaluate, finer: Evaluate | None, samples: int, why: str = ""
 ) -> SharedExpansion:
-    """Solve a model, and on finer meshes, at points of the prior, and expand both; collective over the groups.
+    """Solve a model, and on finer meshes, at so many points of the prior, and expand both; collective over the groups.
 
-    Parameters
-    ----------
-    inputs
-        The prior.
-    evaluate
-        The model.
-    finer
-        The same on finer meshes (`forward.fem.finer`); None where there is nothing to look at, or where `why` says
-        why not.
-    samples
-        Number of solves.
+    Finer meshes (`forward.fem.finer`) are None where there is nothing to look at, or where `why` says why not.
 
     Raises
     ------
@@ -122,25 +112,11 @@ def shared_expansion(
 def expanded_finer(
     inputs: Inputs, finer: Evaluate, points: FloatArray, own: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 ) -> tuple[Finer, FloatArray]:
-    """Expand what finer meshes add to a model, from points (n, d); collective over the groups.
+    """Expand what finer meshes add to a model, by solves at points (n, d) of the prior; collective over the groups.
 
-    Parameters
-    ----------
-    inputs
-        The prior.
-    finer
-        The model on finer meshes (`forward.fem.finer`).
-    points
-        Where it is solved.
-    own
-        Outputs (m,) and derivatives (m, d) of the model itself at parameters (d,).
-
-    Returns
-    -------
-    Finer
-        What finer meshes say anywhere: the model, and the expansion of the difference.
-    FloatArray
-        Root mean square (m,) of the errors of that expansion at samples that are left out.
+    Outputs (m,) and derivatives (m, d) of the model itself are given at parameters (d,). Returned are what finer meshes
+    say anywhere, the model and the expansion of the difference, and the root mean square (m,) of the errors of the
+    expansion at samples that are left out.
     """
     there = finer(Request(points, tangents=True))
     assert there.tangents is not None

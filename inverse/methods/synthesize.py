@@ -99,15 +99,9 @@ class Synthesize(Settings):
     ) -> xr.Dataset:
         """Solve for every data set, and measure.
 
-        Parameters
-        ----------
-        inputs
-            The parameters that are drawn anew for every data set; may be empty.
-        evaluate
-            The specimen.
-        cases, points
-            Number of the group of each output (m,), whose root mean square relative errors are shares of, such as the
-            load case; and of its point, -1 of those that every data set has.
+        Parameters, of which there may be none, are drawn anew for every data set. Relative errors are shares of the
+        root mean square of a group of outputs (m,), such as the load case; those at no point (-1) are in every data
+        set.
 
         Raises
         ------

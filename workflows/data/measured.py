@@ -246,14 +246,7 @@ def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
 def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     """Read a scan, and put it on the body of a specimen; standard deviations may still be unknown.
 
-    Parameters
-    ----------
-    path
-        Its file, or its description.
-    specimen
-        What is measured.
-    usual
-        What is so where the description says nothing else.
+    What its description does not say is as usual.
 
     Raises
     ------

@@ -134,16 +134,9 @@ def _described(
     frame: FloatArray,
     truth: Mapping[str, float],
 ) -> dict[str, str]:
-    """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are.
+    """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are, and what is true.
 
-    Parameters
-    ----------
-    label
-        With which names begin.
-    data, frame
-        Displacements, and where (m, 3) they are in the frame of the files, both in their unit.
-    truth
-        What is known, by path.
+    Displacements, and where (m, 3) they are in the frame of the files, are in their unit.
     """
     number, arrays = _arrays(specimen, method, data)
     on_body, places = data.places[number], frame[number]
@@ -206,18 +199,10 @@ def surfaces(
     facets: NDArray[np.int64],
     more: Mapping[str, Any],
 ) -> dict[str, str]:
-    """Return the texts of the files of a pair of surfaces for each load case, by their names.
+    """Return the texts of the files of a pair of surfaces for each load case, by their names, which begin with a label.
 
-    Parameters
-    ----------
-    label
-        With which names begin.
-    places, motions
-        Undeformed places (k, 3), and displacements (k, 3) by load case, in the unit of the files.
-    facets
-        Triangles (n, 3), as rows of these.
-    more
-        What else the description says.
+    Triangles (n, 3) are rows of the undeformed places (k, 3), which displacements (k, 3) by load case move, all in the
+    unit of the files; the description says more.
     """
     names = {case: f"{label}-{case}.stl" for case in motions}
     texts = {names[case]: _stl((places + motion)[facets]) for case, motion in motions.items()}
