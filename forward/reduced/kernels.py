@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike
 from forward.graph import CODES, SELECT, Tape
 from forward.model import FloatArray
 from forward.native import library
-from forward.reduced.data import Points, Written
+from forward.reduced.data import Points
 
 _INFIX = {"add": "+", "mul": "*", "div": "/"}
 _NAMES = {"ln": "log", "abs": "fabs"}
@@ -83,13 +83,9 @@ def spread(H: FloatArray, B: FloatArray) -> FloatArray:
     return out
 
 
-_found: dict[str, Any] = {}
-
-
+@cache
 def _spread() -> Any | None:
-    if "spread" not in _found:
-        _found["spread"] = _compiled(_SPREAD, "", "spread")
-    return _found["spread"]
+    return _compiled(_SPREAD, "", "spread")
 
 
 def _in_lanes(real: str, end: str) -> str:
@@ -130,19 +126,12 @@ def _source(tape: Tape, varying: int, real: str, end: str) -> tuple[str, str]:
         (inside if varies else outside).append(f"const {real} t{k} = {value};")
         names.append(f"t{k}")
     inside += [f"out[{m} * n + q] = {names[i]};" for m, i in enumerate(tape.outputs.tolist())]
-    head = f"void at_points(long n, const {real} *restrict p, const {real} *restrict c, {real} *restrict out)"
     in_lanes = _in_lanes(real, end)
     lines = [
         "#include <math.h>",
         *in_lanes.splitlines(),
-        head,
-        "{",
-        *outside,
-        _APART,
-        "for (long q = 0; q < n; ++q) {",
-        *inside,
-        "}",
-        "}",
+        f"void at_points(long n, const {real} *restrict p, const {real} *restrict c, {real} *restrict out)",
+        *("{", *outside, _APART, "for (long q = 0; q < n; ++q) {", *inside, "}", "}"),
     ]
     return "\n".join(lines) + "\n", in_lanes
 
@@ -164,7 +153,7 @@ class Integrand:
 
     Parameters
     ----------
-    written, points
+    tape, points
         What it is, and where.
     numbers
         How many numbers it takes.
@@ -172,8 +161,8 @@ class Integrand:
         In what precision it is evaluated.
     """
 
-    def __init__(self, written: Written, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:
-        self._written, self.points, self.real = written, points, real
+    def __init__(self, tape: Tape, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:
+        self._tape, self.points, self.real = tape, points, real
         m, n, count = points.fields.shape
         self.components, self._varying = m, m + len(points.given) + len(points.logs)
         self.fields = points.fields.astype(real, copy=False)
@@ -186,7 +175,7 @@ class Integrand:
 
     def _derived(self, along: Sequence[int]) -> Kernel:
         """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
-        graph, outputs = self._written.tape.graph()
+        graph, outputs = self._tape.graph()
         slopes = [graph.tangent(outputs, i) for i in along]
         by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
         return Kernel(graph.tape([*outputs, *by_output]), self._varying, self.real)
@@ -198,7 +187,7 @@ class Integrand:
     @cached_property
     def dead(self) -> bool:
         """Whether its outputs do not depend on the state."""
-        graph, outputs = self._written.tape.graph()
+        graph, outputs = self._tape.graph()
         slopes = (one for i in range(self.components) for one in graph.tangent(outputs, i))
         return all(graph.value(one) == 0 for one in slopes)
 

@@ -14,7 +14,6 @@ from forward.model import FloatArray, ModelError
 from forward.observables.functionals import Integral
 from forward.reduced.data import Output
 from forward.reduced.integrands import Sampler, of_density
-from forward.reduced.kernels import Kernel
 from forward.reduced.reduced_equations import LENGTH
 
 NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
@@ -97,15 +96,15 @@ class Outputs:
             elif kind == "peak":
                 sampler = self._of_output[name]
                 near = self._near_peak(sampler, states, parameters, kept)
-                found.append(output(density=sampler.integrand.written, points=sampler.points(rows, near)))
+                found.append(output(density=sampler.integrand.tape, points=sampler.points(rows, near)))
             elif kind == "linear":
                 found.append(output(row=rows @ functional.gradient()))
             elif name in self._of_output:
                 sampler = self._of_output[name]
-                density, points = sampler.integrand.written, sampler.points(rows)
+                density, points = sampler.integrand.tape, sampler.points(rows)
                 found.append(output(size=functional.size, density=density, points=points))
             else:
-                density = self.densities[integrals][0].integrand.written
+                density = self.densities[integrals][0].integrand.tape
                 found.append(output(which=integrals, size=functional.size, density=density))
                 integrals += 1
         return tuple(found)
@@ -137,8 +136,7 @@ class Outputs:
         if kept is not None:
             near |= np.repeat(kept, sampler.count // len(kept))
         everywhere = sampler.points(np.zeros((0, states.shape[1])))
-        tape = sampler.integrand.written.tape
-        kernel = Kernel(tape, tape.inputs - len(self._numbers))
+        kernel = sampler.kernel(len(self._numbers))
         for state, point in zip(states, parameters, strict=True):
             inputs = sampler.inputs(sampler.components(state), everywhere, point)
             values = kernel(inputs, point[self._numbers])[0]

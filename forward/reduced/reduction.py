@@ -83,7 +83,7 @@ class Reduction:
         self._dead_rows: list[tuple[int, float, FloatArray]] = []
         self.equations.at_load(1.0)  # constants are read as they are now, and loads count in full
         works, whole = self._works(names)
-        self._written = tuple(one.written for one in works)
+        self._tapes = tuple(one.tape for one in works)
         self._rules = Rules(self.equations, works, whole, self._outputs.densities, self._numbers)
 
     # --- loads -------------------------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ class Reduction:
             lifts=tuple((number, value) for number, value, _ in self._rest.lifts),
             tests=len(tests),
             dead=tuple((number, value, rows @ force) for number, value, force in self._dead_rows),
-            works=self._written,
+            works=self._tapes,
             levels=(),
             outputs=outputs,
             fields=whole,

@@ -20,7 +20,7 @@ from forward.model import FloatArray
 from forward.observables.functionals import Integral
 from forward.reduced.data import LevelData, Points
 from forward.reduced.integrands import Integrand, Sampler
-from forward.reduced.kernels import Kernel, spread
+from forward.reduced.kernels import spread
 
 CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
 STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
@@ -192,8 +192,8 @@ class Rules:
         missed do to an output, to its spread. Mixed at random, a few hundred sums stand for all of them.
         """
         equations, numbers, sampler = self._equations, self._numbers, self._samplers[number]
-        kernel = self._kernel(sampler)
-        of_densities = [self._kernel(one) for one, _ in self._densities] if densities else []
+        kernel = sampler.kernel(len(numbers))
+        of_densities = [one.kernel(len(numbers)) for one, _ in self._densities] if densities else []
         tests, tested = training.tests, training.tested(sizes[-1])
         whole = len(points.weights) == sampler.count
         outputs = training.adjoints.shape[1]
@@ -236,10 +236,6 @@ class Rules:
         if whole and rule.missed > missed * share:  # then all points are needed
             return Rule(np.arange(len(points.weights)), points.weights, 0.0)
         return rule._replace(missed=rule.missed / share)
-
-    def _kernel(self, sampler: Sampler) -> Kernel:
-        tape = sampler.integrand.written.tape
-        return Kernel(tape, tape.inputs - len(self._numbers))
 
 
 def _candidates(sampler: Sampler, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
