@@ -102,34 +102,18 @@ class StiffnessMatrix:
             self.matrix.setValuesIJV(each, columns.astype(np.int32), values, addv=True, rowmap=rows.astype(np.int32))
         self.matrix.assemble()
 
-    def assembled(self) -> Any:
-        """Assemble; return a copy of PETSc's matrix, for `products`."""
-        self.assemble()
-        return self.matrix.copy()
-
     def sparse(self) -> csr_matrix:
         """Assemble; return SciPy's sparse matrix (n, n), of one process."""
         from scipy.sparse import csr_matrix
 
-        matrix = self.assembled().convert("aij")
+        self.assemble()
+        matrix = self.matrix.copy().convert("aij")
         starts, columns, values = matrix.getValuesCSR()
         matrix.destroy()
         n = len(starts) - 1
         ours = np.round(self.unknowns.reorder(np.arange(n, dtype=float))).astype(np.int64)
         rows = ours[np.repeat(np.arange(n), np.diff(starts))]
         return csr_matrix((values, (rows, ours[columns])), shape=(n, n))
-
-    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
-        """Return the products (k, n) of such a copy with rows (k, n)."""
-        x, y = matrix.createVecs()
-        found = np.empty_like(rows)
-        for row, product in zip(rows, found, strict=True):
-            x.array[:] = self.unknowns.reorder(row)
-            matrix.mult(x, y)
-            product[:] = self.unknowns.take(y.array_r)
-        x.destroy()
-        y.destroy()
-        return found
 
 
 class BoundaryBlocks:
@@ -396,10 +380,5 @@ class NodalBlocks:
         parts = (local.reshape(-1, 9) @ self._products).reshape(len(K), 9, -1).swapaxes(0, 1)
         count = len(self._carrier.x.array) // 3
         sums = [np.bincount(self._nodes, weights=part.ravel(), minlength=count) for part in parts]
-        rows = [self._owned(np.array(sums[i : i + 3])) for i in (0, 3, 6)]
+        rows = [spaces.sum_rows(self._carrier, np.array(sums[i : i + 3])) for i in (0, 3, 6)]
         return np.asarray(np.stack(rows, axis=1))
-
-    def _owned(self, rows: FloatArray) -> FloatArray:
-        """Return values (3, n) of nodes at the n_owned of this rank, with what others hold of them, as (n_owned, 3)."""
-        self._carrier.x.array[:] = rows.T.ravel()
-        return spaces.sum_ghosts(self._carrier).reshape(-1, 3)
