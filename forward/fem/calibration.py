@@ -194,7 +194,7 @@ class FinerMesh:
         factor has negative eigenvalues, only the equilibrium can tell whether it is stable.
         """
         other = self._untested
-        there = _moved(self._model.enriched.equations, other.equations, richer)
+        there = moved(self._model.enriched.equations, other.equations, richer)
         start = other.equations.layout.scatter(there[:1])[0]
         near = ReferenceSolution(parameters, start)
         if other.reference.at(near).indefinite():
@@ -234,7 +234,7 @@ def _everywhere(equations: Discretisation, rows: FloatArray) -> FloatArray:
     return np.asarray(equations.comm.bcast(equations.layout.gather(rows)))
 
 
-def _moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> FloatArray:
+def moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> FloatArray:
     """Return rows (k, U_local), interpolated at the nodes of another mesh, as (k, U') on every rank; collective."""
     whole, start, parts = _everywhere(here, rows), 0, []
     pairs = (
