@@ -119,12 +119,7 @@ Body = DiscreteBody[FiniteElementSolution]
 class FinerMesh:
     """A body on a finer mesh, made when it is first solved on.
 
-    Parameters
-    ----------
-    model
-        The body.
-    spare
-        How many solves it may cost (`forward.fem.mesh_error_cost.allowance`).
+    It may cost `spare` solves (`forward.fem.mesh_error_cost.allowance`).
     """
 
     def __init__(self, model: Body, spare: float = math.inf) -> None:

@@ -134,15 +134,7 @@ def nonlinearity(energy: float, stored: float, after: float) -> float:
 
 
 class Enriched(EnrichedEquations):
-    """What the equations of a body in an enriched space say of the error of its solutions.
-
-    Parameters
-    ----------
-    equations, spec
-        As of `EnrichedEquations`.
-    functionals
-        The outputs of the body.
-    """
+    """What the equations of a body in an enriched space say of the error of its solutions and of its outputs."""
 
     def __init__(self, equations: Discretisation, spec: LoadedBody, functionals: Sequence[Functional]) -> None:
         super().__init__(equations, spec)

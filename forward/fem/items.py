@@ -26,11 +26,6 @@ class Items:
 
     Vectors hold this rank's part (U_local,), as those of the equations.
 
-    Parameters
-    ----------
-    equations
-        The discrete equations.
-
     Raises
     ------
     ModelError

@@ -28,15 +28,7 @@ LOGS = 8
 
 
 class Reader:
-    """Reads expressions into a graph.
-
-    Parameters
-    ----------
-    graph
-        Where they go.
-    known
-        The nodes of terminals and of gradients of functions.
-    """
+    """Reads expressions into a graph, in which the nodes of terminals and of gradients of functions are known."""
 
     def __init__(self, graph: Graph, known: Known) -> None:
         self._graph, self._known = graph, known
@@ -239,15 +231,7 @@ def _with_inputs(tape: Tape, kept: list[int]) -> Tape:
 
 
 class Sampler:
-    """Values of functions of a body at the points of an integrand, of a part of them if that is enough.
-
-    Parameters
-    ----------
-    equations
-        The body, in one process.
-    integrand
-        What is evaluated.
-    """
+    """Values of functions of a body at the points of an integrand, of a part of them if that is enough."""
 
     def __init__(self, equations: Discretisation, integrand: Integrand) -> None:
         self._equations, self.integrand = equations, integrand

@@ -42,17 +42,7 @@ void spread(long rows, long columns, long n, long modes, const double *H, const 
 
 
 class Kernel:
-    """A tape whose first inputs vary from point to point and whose others are the same at all of them.
-
-    Parameters
-    ----------
-    tape
-        The operations.
-    varying
-        How many of its inputs vary.
-    real
-        In what precision it calculates.
-    """
+    """A tape whose first inputs vary from point to point and whose others are the same at all of them."""
 
     def __init__(self, tape: Tape, varying: int, real: DTypeLike = np.float64) -> None:
         self.tape, self._varying, self._real = tape, varying, np.dtype(real)
@@ -151,14 +141,7 @@ def _compiled(source: str, spare: str, name: str) -> Any | None:
 class Integrand:
     """An integrand at points, and its derivatives by what it takes.
 
-    Parameters
-    ----------
-    tape, points
-        What it is, and where.
-    numbers
-        How many numbers it takes.
-    real
-        In what precision it is evaluated.
+    It takes so many numbers, and is evaluated in the precision `real`.
     """
 
     def __init__(self, tape: Tape, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:

@@ -222,15 +222,7 @@ def _in_order(rows: FloatArray, inner: Callable[[FloatArray], FloatArray]) -> Fl
 
 
 class AtRest:
-    """A body at rest, in one process.
-
-    Parameters
-    ----------
-    model
-        The body.
-    nominal
-        Means (d,) of its parameters.
-    """
+    """A body at rest, in one process, at the means (d,) of its parameters."""
 
     def __init__(self, model: HyperelasticModel, nominal: FloatArray) -> None:
         self.model, self._nominal = model, nominal

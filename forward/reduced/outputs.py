@@ -20,14 +20,7 @@ NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points 
 
 
 class Outputs:
-    """The outputs of a body that is being reduced.
-
-    Parameters
-    ----------
-    model
-        The body.
-    names
-        Paths of the numbers that integrands take.
+    """The outputs of a body that is being reduced; integrands take numbers of it by their paths.
 
     Attributes
     ----------

@@ -31,18 +31,9 @@ class At(NamedTuple):
 
 
 class ReducedEquations:
-    """A reduced model with so many modes at its points.
+    """One of the levels of a reduced model: so many modes at its points.
 
-    Parameters
-    ----------
-    data
-        The model.
-    level
-        Which of its levels.
-    which
-        Numbers (m,) of the outputs; None for all.
-    real
-        In what precision integrands are evaluated.
+    Outputs are all, or those of these numbers (m,); integrands are evaluated in the precision `real`.
     """
 
     def __init__(

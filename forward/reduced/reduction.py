@@ -62,12 +62,7 @@ class Sizes:
 class Reduction:
     """A body that is being reduced: what does not change from one round of snapshots to the next.
 
-    Parameters
-    ----------
-    model
-        The body, in this process alone.
-    nominal, spread
-        Means and standard deviations (d,) of its parameters.
+    The body is in this process alone; `nominal` and `spread` are means and standard deviations (d,) of its parameters.
     """
 
     def __init__(self, model: HyperelasticModel, nominal: FloatArray, spread: FloatArray) -> None:

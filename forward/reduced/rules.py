@@ -398,15 +398,6 @@ class Mixture:
     """Sums of many rows at random, a few hundred in place of all: norms stay the same on average.
 
     Each row goes to a few of the sums with random signs (sparse embedding: J. Nelson, H. L. Nguyễn, FOCS 2013).
-
-    Parameters
-    ----------
-    size
-        Number of sums.
-    points
-        Number of columns.
-    seed
-        Of the signs.
     """
 
     def __init__(self, size: int, points: int, seed: int) -> None:

@@ -103,14 +103,7 @@ class Frame(NamedTuple):
 
 
 class Stream:
-    """Frames of a reduced model.
-
-    Parameters
-    ----------
-    model
-        The model, of all its parameters.
-    at
-        Where it begins.
+    """Frames of a reduced model, of all its parameters.
 
     Attributes
     ----------

@@ -183,17 +183,7 @@ class FacetValues:
 
 
 class NodalAverages:
-    """An expression of a space of displacements at its nodes: averages over the cells that meet there.
-
-    Parameters
-    ----------
-    expression
-        UFL expression.
-    shape
-        Its shape.
-    often
-        As of `PointValues`.
-    """
+    """An expression of a space of displacements at its nodes: averages over the cells that meet there."""
 
     def __init__(self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any, *, often: bool = False) -> None:
         nodes = cell_element(space).points

@@ -117,15 +117,7 @@ class StiffnessMatrix:
 
 
 class BoundaryBlocks:
-    """The 3×3 blocks on the diagonal of a stiffness of displacements on boundaries, without the rest of it.
-
-    Parameters
-    ----------
-    form, comm
-        As of `StiffnessMatrix`.
-    space
-        The space of displacements.
-    """
+    """The 3×3 blocks on the diagonal of a stiffness of displacements on boundaries, without the rest of it."""
 
     def __init__(self, form: Any, space: Any, comm: Any) -> None:
         self._form = form
@@ -153,14 +145,7 @@ class SaddleBlocks:
     S = −C + B A_d⁻¹ Bᵀ, then displacements, u = A_d⁻¹ (r_u − Bᵀ p): A_d are the 3×3 blocks on the diagonal of A, and
     in S their diagonal (M. Benzi, G. H. Golub, J. Liesen, Acta Numerica 14 (2005) 1–137, section 10).
 
-    Parameters
-    ----------
-    stiffness
-        The matrix, which is assembled and then freed.
-    nodes
-        Number of nodes of this rank.
-    fixed
-        Prescribed unknowns.
+    The matrix is assembled and then freed; `nodes` are how many this rank has, `fixed` its prescribed unknowns.
     """
 
     def __init__(self, stiffness: StiffnessMatrix, nodes: int, fixed: NDArray[np.int64]) -> None:
@@ -350,11 +335,6 @@ class NodalBlocks:
     Of a cell with moduli 𝔸 = ∂P/∂F and shape functions φ_i, the block of node i is ∫ 𝔸_{akbl} ∂_kφ_i ∂_lφ_i dX. Here 𝔸
     and the Jacobian are means over the cell: for what only preconditions. An element matrix of cubic hexahedra has
     36 864 entries, of which these are 576.
-
-    Parameters
-    ----------
-    space
-        The space.
     """
 
     def __init__(self, space: Any) -> None:
