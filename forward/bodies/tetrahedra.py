@@ -91,12 +91,7 @@ class MeshInMemory(MeshFile):
 def packed(mesh: Loaded, indicators: FloatArray | None = None) -> bytes:
     """Return a mesh as a file (.npz) that a `MeshFile` can name; equal meshes give equal bytes.
 
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    indicators
-        How much each cell (c,) adds to errors.
+    It holds how much each cell (c,) adds to errors too, where that is known.
     """
     facets = {f"{BOUNDARY}{name}": facets for name, facets in mesh.boundaries.items()}
     shares = {} if indicators is None else {INDICATORS: indicators}

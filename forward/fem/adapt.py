@@ -108,16 +108,7 @@ def adapt(
 ) -> Adapted:
     """Refine the mesh of a body at a point (d,) of its parameters; collective over `comm`.
 
-    Parameters
-    ----------
-    spec
-        The body, with `adapt`.
-    comm
-        Communicator of the ranks that share the body.
-    parameters, point
-        Paths of the random parameters, and their values.
-    say
-        On the first rank: called with a line after each solve.
+    After each solve, `say` is called with a line on the first rank.
 
     Raises
     ------

@@ -121,12 +121,7 @@ def nonlinearity(energy: float, stored: float, after: float) -> float:
 
     The work of the imbalance after the step along it, over that before; ∞ where the stiffness is not positive along it.
 
-    Parameters
-    ----------
-    energy, stored
-        As of `EnrichedState`.
-    after
-        Work (J) of the imbalance after the step along it.
+    `energy` and `stored` are those of `EnrichedState`, `after` is the work (J) of the imbalance after the step.
     """
     if abs(energy) <= NEGLIGIBLE**2 * stored:
         return 0.0

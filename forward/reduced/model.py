@@ -129,14 +129,7 @@ class ReducedModel(OneByOne):
     def with_rows(self, seen: FloatArray, rows: Observation, names: tuple[str, ...]) -> ReducedModel:
         """Return the same model with what is observed of it as outputs.
 
-        Parameters
-        ----------
-        seen
-            What is observed (n, N) of its coordinate fields.
-        rows
-            Which outputs of the body are observed besides.
-        names
-            Of what is observed.
+        That is (n, N) of its coordinate fields, and outputs of the body besides.
         """
         other = copy(self)
         other.outputs, other.observed = names, (seen, rows)

@@ -121,10 +121,7 @@ def partition(
 ) -> Partition:
     """Share nodes at places (n, 3) among blocks, from the block of each cell (n_cells, k).
 
-    Parameters
-    ----------
-    full
-        Places (f, 3): the blocks with the nearest cells are kept in full.
+    The blocks with the cells nearest to places `full` (f, 3) are kept in full.
     """
     names, block = np.unique(labels, return_inverse=True)
     touched = np.zeros((len(places), len(names)), dtype=bool)

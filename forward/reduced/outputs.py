@@ -65,16 +65,9 @@ class Outputs:
     def made(
         self, rows: FloatArray, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
     ) -> tuple[Output, ...]:
-        """Return them for coordinate fields (N, U_local).
+        """Return them for coordinate fields (N, U_local) and snapshots (s, U_local) at parameters (s, d).
 
-        Parameters
-        ----------
-        rows
-            The fields.
-        states, parameters
-            Snapshots (s, U_local), and where (s, d).
-        kept
-            Which cells are kept in full; None for none.
+        `kept` says which cells are kept in full; None for none.
         """
         found: list[Output] = []
         tests = integrals = 0

@@ -260,16 +260,7 @@ def chosen(values: FloatArray, integrals: FloatArray, tolerance: float, most: in
     The active set method (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23) with the normal
     equations of the points that are in; several points enter at once, a part of those that are in.
 
-    Parameters
-    ----------
-    values
-        Integrands (rows, n) at n points.
-    integrals
-        Their integrals (rows,).
-    tolerance
-        Of the residual, relative to the integrals.
-    most
-        Largest number of points.
+    Values (rows, n) are those of integrands at n points; the tolerance is relative to the integrals (rows,).
     """
     scale = np.linalg.norm(values, axis=0)
     scale[scale == 0] = 1.0

@@ -90,10 +90,7 @@ def load_steps(
     load, if `unstable` says so), the branch is expected to end: only `REFUSALS` attempts may find others, and each has
     `LATE` iterations. It need not end: a body that is pushed aside a little bends much where without that it buckles.
 
-    Parameters
-    ----------
-    beyond
-        A stable equilibrium at full load, which is the answer if the branch from rest ends before.
+    `beyond` is a stable equilibrium at full load, the answer if the branch from rest ends before.
 
     Raises
     ------

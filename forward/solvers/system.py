@@ -37,14 +37,7 @@ class LinearSolver(Protocol):
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
         """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides.
 
-        Parameters
-        ----------
-        right
-            The right-hand sides.
-        transpose
-            Whether to solve with Kᵀ.
-        tolerance
-            Error, relative to the solution in the norm of the energy, that a solver that iterates may leave.
+        One that iterates may leave an error of the tolerance, relative to the solution in the norm of the energy.
 
         Raises
         ------

@@ -54,11 +54,6 @@ class StiffnessMatrix:
     items
         What else acts: its entries by the rows (U_local,) of the matrix that the unknowns are.
 
-    Attributes
-    ----------
-    matrix
-        PETSc's matrix.
-
     Raises
     ------
     StopError

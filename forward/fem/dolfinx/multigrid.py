@@ -27,16 +27,8 @@ class MultigridSolver:
     Where conjugate gradients meet a direction of negative energy, or the stiffness is not symmetric, generalised
     conjugate residuals take their place.
 
-    Parameters
-    ----------
-    stiffness
-        The matrix K of displacements, stored by blocks.
-    coarse
-        Solver for the same form with test and trial functions that are linear.
-    transfer
-        From linear elements into those of the body.
-    fixed, coarse_fixed
-        Prescribed unknowns of this rank in both.
+    The stiffness is stored by blocks; the coarse solver is for the same form in linear elements, from which `transfer`
+    leads into those of the body. Prescribed unknowns are those of this rank.
     """
 
     def __init__(
