@@ -193,14 +193,11 @@ class Sample:
 
 def dense_inertia(model: HyperelasticModel, state: FloatArray, point: FloatArray) -> tuple[int, float]:
     """Negative eigenvalues of the dense stiffness, those of pressures apart, and the smallest over the largest."""
-    from scipy.sparse import csr_matrix
-
     equations = model.equations
     equations.set_parameters(point)
     equations.at_load(1.0)
     equations.set_state(state)
-    indptr, indices, entries = equations.assembled_stiffness().getValuesCSR()
-    dense = csr_matrix((entries, indices, indptr)).toarray()
+    dense = equations.sparse_stiffness().toarray()
     values = np.linalg.eigvalsh((dense + dense.T) / 2)
     return int((values < 0).sum()) - equations.unknowns.pressures, float(np.abs(values).min() / values.max())
 

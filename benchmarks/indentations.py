@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import ufl
 from mpi4py import MPI
-from scipy.sparse import csr_matrix
 
 from forward.bodies.hexahedra import CORNERS
 from forward.bodies.mesh import FACES, TETRAHEDRA
@@ -170,11 +169,7 @@ class Kind:
         on_top = np.abs(nodes[:, 2] - SIDE) < 1e-9
         record["between"] = float(max(0.0, -self.tool.gaps(moved[on_top], **own).min() / depth))
         equations.set_state(found.state)
-        matrix = equations.assembled_stiffness()
-        rows, columns, values = matrix.getValuesCSR()
-        matrix.destroy()
-        dense = csr_matrix((values, columns, rows)).toarray()
-        dense = np.triu(dense) + np.triu(dense, 1).T if not np.tril(dense, -1).any() else dense
+        dense = equations.sparse_stiffness().toarray()
         scale = 1 / np.sqrt(np.abs(dense.diagonal()))  # forces and volumes differ by many orders of magnitude
         dense = scale[:, None] * dense * scale
         negative = int((np.linalg.eigvalsh(dense) < 0).sum()) - equations.unknowns.pressures

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -18,6 +18,7 @@ from forward.settings import Settings, nearest
 from forward.solid import Solid
 
 if TYPE_CHECKING:
+    from forward.bodies.geometry import Body
     from forward.bodies.mesh import Contents
     from forward.observables.observable import Output
 
@@ -69,18 +70,6 @@ class Adapt(Settings):
         )
 
 
-@dataclass(frozen=True)
-class _Grown:
-    """A body with so many nodes, for predictions."""
-
-    cell: str
-    degree: int
-    cell_count: int
-    nodes: int
-    vertex_count: int
-    bounds: tuple[tuple[float, float], ...]
-
-
 class Refinable(Solid):
     """A body whose mesh can be refined where that matters for its outputs."""
 
@@ -115,9 +104,10 @@ class Refinable(Solid):
         times_as_many = self.adapt.unknowns / self.unknowns
         mixed, symmetric = self.mixed, self.symmetric
 
-        def grown(body: Any) -> _Grown:
-            cells, nodes, vertices = (int(times_as_many * n) for n in (body.cell_count, body.nodes, body.vertex_count))
-            return _Grown(body.cell, body.degree, cells, nodes, vertices, body.bounds)
+        def grown(body: Body) -> Any:
+            counts = {"cell_count": body.cell_count, "nodes": body.nodes, "vertex_count": body.vertex_count}
+            more = {name: int(times_as_many * count) for name, count in counts.items()}
+            return SimpleNamespace(cell=body.cell, degree=body.degree, bounds=body.bounds, **more)
 
         own, enriched = grown(self.body), grown(self.enriched().body)
         of_estimate = estimate(own, enriched, mixed=mixed, symmetric=symmetric)

@@ -94,13 +94,7 @@ class Tape:
 
 
 class Graph:
-    """Nodes: first the inputs, then constants and operations as they come.
-
-    Parameters
-    ----------
-    inputs
-        How many there are.
-    """
+    """Nodes: first so many inputs, then constants and operations as they come."""
 
     def __init__(self, inputs: int) -> None:
         self.inputs = inputs
@@ -292,15 +286,7 @@ class Graph:
 
 
 class Scalar:
-    """A node of a graph as a number in formulas.
-
-    Parameters
-    ----------
-    graph
-        The graph.
-    node
-        The node.
-    """
+    """A node of a graph as a number in formulas."""
 
     def __init__(self, graph: Graph, node: Node) -> None:
         self.graph, self.node = graph, node

@@ -221,12 +221,7 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 def reason_to_stop(error: BaseException, needed: float | None = None) -> str | None:
     """Say in a line why an exception ends the run, if the cause is not a bug of the program; otherwise None.
 
-    Parameters
-    ----------
-    error
-        What was raised.
-    needed
-        Memory (bytes) that this process was expected to need in all.
+    It tells the memory (bytes) that this process was expected to need in all.
     """
     match error:
         case StopError():

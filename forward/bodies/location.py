@@ -43,12 +43,7 @@ class Located(NamedTuple):
 def locate(corners: FloatArray, points: FloatArray) -> Located:
     """Find the cells in which points lie, or else the nearest ones.
 
-    Parameters
-    ----------
-    corners
-        (n_cells, 4 or 8, 3) of tetrahedra or hexahedra, x first, then y, then z.
-    points
-        (n, 3).
+    Corners (n_cells, 4 or 8, 3) are those of tetrahedra or hexahedra, x first, then y, then z.
     """
     n = len(points)
     if not len(corners) or not n:

@@ -19,7 +19,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
-from forward.bodies.location import nearest_of
+from forward.bodies.location import locate, nearest_of
 from forward.bodies.mesh import (
     CLOSE,
     TETRAHEDRA,
@@ -232,21 +232,13 @@ class MeshFile(Settings):
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
-        mesh = self.load()
-        tetrahedra = mesh.points[mesh.cells[:, TETRAHEDRA[mesh.cell]].reshape(-1, 4)]
-        outer = self.surface
+        mesh, outer = self.load(), self.surface
         triangles = np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
-        lows, highs = tetrahedra.min(axis=1), tetrahedra.max(axis=1)
-        slack = CLOSE * max(high - low for low, high in self.bounds)
         found = np.array(points, dtype=float)
-        for i, point in enumerate(found):
-            near = ((lows <= point + slack) & (point - slack <= highs)).all(axis=1)
-            a, b, c, d = np.moveaxis(tetrahedra[near], 1, 0)
-            shares = np.linalg.solve(np.stack([b - a, c - a, d - a], axis=2), (point - a)[..., None])[..., 0]
-            if ((shares >= -CLOSE).all(axis=1) & (shares.sum(axis=1) <= 1 + CLOSE)).any():
-                continue
-            places = nearest_of(triangles, point)
-            found[i] = places[((places - point) ** 2).sum(axis=1).argmin()]
+        located = locate(mesh.points[mesh.cells[:, TETRAHEDRA[mesh.cell]].reshape(-1, 4)], found)
+        for i in np.flatnonzero(located.distances > CLOSE * max(high - low for low, high in self.bounds)):
+            places = nearest_of(triangles, found[i])
+            found[i] = places[((places - found[i]) ** 2).sum(axis=1).argmin()]
         return found
 
     @property

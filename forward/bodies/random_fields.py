@@ -10,9 +10,10 @@ Vertices are in canonical order (`forward.fem.layout`). Nothing here depends on 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, assert_never
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Gt
@@ -100,93 +101,39 @@ class RandomField(Settings):
     def on(self, body: Body) -> Expansion:
         """Expand the field on the vertices of a body, in this process."""
         offset = np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2)
-        match self.basis:
-            case "nodes":
-                return Nodal(offset)
-            case "noise":
-                return WhiteNoise(offset, Matern.on(body, self.length, self.smoothness), self.log_std)
-            case "modes":
-                matern = Matern.on(body, self.length, self.smoothness)
-                modes = self.log_std * matern.modes(self.modes or 0)
-                kept = (matern.mass @ modes**2).sum() / (self.log_std**2 * matern.mass.sum())
-                return Modes(np.log(self.mean) - (modes**2).sum(axis=1) / 2, modes, float(kept))
-            case _:
-                assert_never(self.basis)
+        if self.basis == "nodes":
+            return Expansion(offset, lambda values: values, lambda slopes: slopes)
+        prior = self.prior(body)
+        if self.basis == "noise":
+            return Expansion(offset, prior.root, prior.root_transposed)
+        mass, modes = prior.matern.mass, self.log_std * prior.matern.modes(self.modes or 0)
+        kept = (mass @ modes**2).sum() / (self.log_std**2 * mass.sum())
+        offset = np.log(self.mean) - (modes**2).sum(axis=1) / 2
+        return Expansion(offset, lambda c: modes @ c, lambda slopes: slopes @ modes, float(kept), modes)
 
 
-class Expansion(Protocol):
-    """The logarithm of a factor at the N vertices, as an affine function of k coefficients."""
+class Expansion(NamedTuple):
+    """The logarithm of a factor at the N vertices, as an affine function of k coefficients.
 
-    @property
-    def offset(self) -> FloatArray:
-        """Its values (N,) where all coefficients are zero."""
-
-    @property
-    def kept(self) -> float:
-        """Fraction of the variance of the field, averaged over the body, that the coefficients represent."""
-
-    @property
-    def modes(self) -> FloatArray | None:
-        """Modes (N, k) of which it consists; None if it is none of these."""
-
-    def values(self, coefficients: FloatArray) -> FloatArray:
-        """Return the linear part (N,) at coefficients (k,)."""
-
-    def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return derivatives (k,) with respect to the coefficients from those (N,) with respect to vertex values."""
-
-
-@dataclass(frozen=True)
-class Modes:
-    """Scaled Karhunen–Loève modes (N, k)."""
+    Attributes
+    ----------
+    offset
+        Its values (N,) where all coefficients are zero.
+    values
+        Returns the linear part (N,) at coefficients (k,).
+    vjp
+        Returns derivatives (k,) by the coefficients from those (N,) by vertex values.
+    kept
+        Fraction of the variance of the field, averaged over the body, that the coefficients represent.
+    modes
+        Scaled Karhunen–Loève modes (N, k) of which it consists; None if it is none of these.
+    """
 
     offset: FloatArray
-    modes: FloatArray
-    kept: float
-
-    def values(self, coefficients: FloatArray) -> FloatArray:
-        """Return the sum (N,) of the modes."""
-        return np.asarray(self.modes @ coefficients)
-
-    def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return the products (k,) with the modes."""
-        return np.asarray(slopes @ self.modes)
-
-
-@dataclass(frozen=True)
-class WhiteNoise:
-    """The square root of the covariance: coefficients are independent and standard normal."""
-
-    offset: FloatArray
-    matern: Matern
-    std: float
+    values: Callable[[FloatArray], FloatArray]
+    vjp: Callable[[FloatArray], FloatArray]
     kept: float = 1.0
-    modes: None = None
-
-    def values(self, coefficients: FloatArray) -> FloatArray:
-        """Return the field (N,) of independent standard normal numbers."""
-        return self.std * self.matern.root(coefficients)
-
-    def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return derivatives (N,) by these numbers."""
-        return self.std * self.matern.root_transposed(slopes)
-
-
-@dataclass(frozen=True)
-class Nodal:
-    """The values at the vertices themselves."""
-
-    offset: FloatArray
-    kept: float = 1.0
-    modes: None = None
-
-    def values(self, coefficients: FloatArray) -> FloatArray:
-        """Return the coefficients."""
-        return coefficients
-
-    def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return the slopes."""
-        return slopes
+    modes: FloatArray | None = None
 
 
 @dataclass(frozen=True)

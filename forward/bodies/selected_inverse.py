@@ -33,14 +33,9 @@ class _Front(NamedTuple):
 
 
 class Dissection:
-    """The order of elimination of a symmetric matrix, used again for every matrix with the same pattern.
+    """The order of elimination of a symmetric matrix, used again for every matrix with the same pattern (N, N).
 
-    Parameters
-    ----------
-    pattern
-        The matrix, or one with entries where it has some (N, N).
-    places
-        Coordinates (N, 3) of its vertices.
+    `places` are the coordinates (N, 3) of its vertices.
     """
 
     def __init__(self, pattern: csr_matrix, places: FloatArray) -> None:

@@ -70,13 +70,7 @@ def _pierced(corners: FloatArray, start: FloatArray, along: FloatArray) -> Float
 
 
 class Surface:
-    """The whole surface of a body.
-
-    Parameters
-    ----------
-    triangles
-        Corners (n, 3, 3) of its triangles (m).
-    """
+    """The whole surface of a body: corners (n, 3, 3) of its triangles (m)."""
 
     def __init__(self, triangles: FloatArray) -> None:
         from scipy.spatial import cKDTree

@@ -35,19 +35,28 @@ def tetrahedra(body: Body) -> tuple[Loaded, Callable[[FloatArray], FloatArray]]:
     """
     if body.kind == "mesh":
         return body.load(), lambda points: points
-    lattice = np.stack(np.meshgrid(*(np.arange(n + 1) for n in body.cells), indexing="ij"), axis=-1).reshape(-1, 3)
-    stride = np.array([(body.cells[1] + 1) * (body.cells[2] + 1), body.cells[2] + 1, 1])
-    first = (lattice[(lattice < body.cells).all(axis=1)] @ stride)[:, None]
+    lattice, stride, first = _lattice(np.array(body.cells) + 1)
     ways = [np.cumsum([0, *(stride[axis] for axis in way)]) for way in permutations(range(3))]
     cells = np.concatenate([first + way for way in ways])
-    faces = np.concatenate([np.delete(cells, k, axis=1) for k in range(4)])
-    boundaries = {
-        f"{name}-{end}": faces[(lattice[faces][:, :, axis] == at).all(axis=1)]
-        for axis, name in enumerate(AXES)
-        for end, at in (("min", 0), ("max", body.cells[axis]))
-    }
+    boundaries = _ends(lattice, np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]))
     points = lattice / np.array(body.cells) * np.array(body.meshed)
     return Loaded(points, cells, "tetrahedron", boundaries, ("body",), np.zeros(len(cells), dtype=np.int64)), body.place
+
+
+def _lattice(counts: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return a lattice (n, 3) of so many points along each axis, the steps between their numbers, and first corners."""
+    lattice = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    stride = np.array([counts[1] * counts[2], counts[2], 1])
+    return lattice, stride, (lattice[(lattice < counts - 1).all(axis=1)] @ stride)[:, None]
+
+
+def _ends(lattice: IntArray, faces: IntArray) -> dict[str, IntArray]:
+    """Return which faces (k, 3 or 4) of cells on a lattice lie at its ends, by the names of the boundaries there."""
+    return {
+        f"{name}-{end}": faces[(lattice[faces][..., axis] == at).all(axis=1)]
+        for axis, name in enumerate(AXES)
+        for end, at in (("min", 0), ("max", lattice[-1, axis]))
+    }
 
 
 class MeshInMemory(MeshFile):
@@ -82,12 +91,7 @@ class MeshInMemory(MeshFile):
 def packed(mesh: Loaded, indicators: FloatArray | None = None) -> bytes:
     """Return a mesh as a file (.npz) that a `MeshFile` can name; equal meshes give equal bytes.
 
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    indicators
-        How much each cell (c,) adds to errors.
+    It holds how much each cell (c,) adds to errors too, where that is known.
     """
     facets = {f"{BOUNDARY}{name}": facets for name, facets in mesh.boundaries.items()}
     shares = {} if indicators is None else {INDICATORS: indicators}
@@ -149,16 +153,9 @@ def _hexahedra(body: Box | Block, parts: int, towards: Collection[str], layers: 
         first = RATIO ** np.arange(1, extra + 1) / parts  # of the length of a cell
         ends = [first * (f"{axis}-min" in thin), n - first * (f"{axis}-max" in thin)]
         lines.append(np.unique(np.concatenate([np.arange(n * parts + 1) / parts, *ends])) / n)
-    counts = np.array([len(line) for line in lines])
-    lattice = np.stack(np.meshgrid(*(np.arange(k) for k in counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    stride = np.array([counts[1] * counts[2], counts[2], 1])
-    cells = (lattice[(lattice < counts - 1).all(axis=1)] @ stride)[:, None] + CORNERS @ stride
-    faces = cells[:, FACES].reshape(-1, 4)
-    boundaries = {
-        f"{name}-{end}": faces[(lattice[faces][..., axis] == at).all(axis=1)]
-        for axis, name in enumerate(AXES)
-        for end, at in (("min", 0), ("max", counts[axis] - 1))
-    }
+    lattice, stride, origins = _lattice(np.array([len(line) for line in lines]))
+    cells = origins + CORNERS @ stride
+    boundaries = _ends(lattice, cells[:, FACES].reshape(-1, 4))
     shares = np.column_stack([line[lattice[:, axis]] for axis, line in enumerate(lines)])
     points = body.place(shares * np.array(body.meshed))
     return Loaded(points, cells, "hexahedron", boundaries, ("body",), np.zeros(len(cells), dtype=np.int64))

@@ -203,16 +203,7 @@ def search(folders: Iterable[Path]) -> None:
 
 
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:
-    """Let Python find modules in some folders too, after all other places.
-
-    Parameters
-    ----------
-    modules
-        Their dotted names.
-    folders
-        Where they may be found.
-    place
-        Where the study names them, for the message.
+    """Let Python find modules in some folders too, after all other places; `place` is where the study names them.
 
     Raises
     ------

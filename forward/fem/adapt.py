@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.bisection import Bisected
-from forward.bodies.location import locate, shapes
 from forward.bodies.mesh import Contents, IntArray, Loaded, contents
 from forward.bodies.tetrahedra import MeshInMemory, tetrahedra
+from forward.fem.calibration import moved
 from forward.fem.dolfinx import meshes
 from forward.fem.mesh_error_cost import own_estimate
 from forward.fem.model import HyperelasticModel
@@ -108,16 +108,7 @@ def adapt(
 ) -> Adapted:
     """Refine the mesh of a body at a point (d,) of its parameters; collective over `comm`.
 
-    Parameters
-    ----------
-    spec
-        The body, with `adapt`.
-    comm
-        Communicator of the ranks that share the body.
-    parameters, point
-        Paths of the random parameters, and their values.
-    say
-        On the first rank: called with a line after each solve.
+    After each solve, `say` is called with a line on the first rank.
 
     Raises
     ------
@@ -147,7 +138,8 @@ def adapt(
         begin = time.process_time()
         try:
             model = HyperelasticModel(finer, comm, parameters)
-            solution = model.solve(point, None if before is None else before.on(model))
+            start = None if before is None else moved(before[0], model.equations, before[1])
+            solution = model.solve(point, None if start is None else Guess(model.space.scatter(start)[0]))
             cycle = _cycle(() if found is None else found.cycles, finer, solution)
             relative = cycle.relative[list(settings.named(spec))]
             indicators = _indicators(model, solution, cycle, mesh)
@@ -158,61 +150,12 @@ def adapt(
         cycle = replace(cycle, seconds=time.process_time() - begin)
         cycles = (*(() if found is None else found.cycles), cycle)
         found = Adapted(mesh, indicators, held, cycles, None)
-        before = None if finer.mixed else _Solved.of(model, solution, mesh)
+        before = None if finer.mixed else (model.equations, solution.state[None])
         say(_line(spec, cycle))
         if (relative <= settings.tolerance).all():
             return found
         if marked is not None and indicators is not None:
             marked = marked.refined(largest(indicators), TIMES)
-
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Displacements on a mesh, from which those on the next one are found.
-
-    Attributes
-    ----------
-    mesh, displacements
-        The mesh, and the displacements (N, 3) of its nodes; on the first rank.
-    nodes
-        Places (N, 3) of the nodes.
-    quadratic
-        Whether there are nodes on the edges.
-    """
-
-    mesh: Loaded | None
-    displacements: FloatArray | None
-    nodes: FloatArray
-    quadratic: bool
-
-    @classmethod
-    def of(cls, model: HyperelasticModel, solution: FiniteElementSolution, mesh: Loaded | None) -> _Solved:
-        """Collect them; collective."""
-        whole = model.space.gather(solution.state[None])
-        nodes, quadratic = model.space.coordinates, model.spec.body.degree > 1
-        return cls(mesh, None if whole is None else whole[0].reshape(-1, 3), nodes, quadratic)
-
-    def on(self, model: HyperelasticModel) -> Guess:
-        """Interpolate them on another mesh of the same body; collective."""
-        found = None
-        if self.mesh is not None and self.displacements is not None:
-            found = self._interpolated(self.mesh, self.displacements, model.space.coordinates)
-        whole = model.equations.comm.bcast(found)
-        return Guess(model.space.scatter(whole.ravel()[None])[0])
-
-    def _interpolated(self, mesh: Loaded, displacements: FloatArray, places: FloatArray) -> FloatArray:
-        """Return displacements (n, 3) at places (n, 3)."""
-        from scipy.spatial import cKDTree
-
-        corners = mesh.points[mesh.cells]
-        located = locate(corners, places)
-        weights, at = shapes(located.local, 4), corners[located.cells]
-        if self.quadratic:  # O. C. Zienkiewicz et al., The Finite Element Method (2013), section 6.3
-            first, second = np.triu_indices(4, 1)
-            at = np.concatenate([at, (at[:, first] + at[:, second]) / 2], axis=1)
-            weights = np.hstack([weights * (2 * weights - 1), 4 * weights[:, first] * weights[:, second]])
-        _, node = cKDTree(self.nodes).query(at.reshape(-1, 3))
-        return np.asarray(np.einsum("nk,nka->na", weights, displacements[node].reshape(*weights.shape, 3)))
 
 
 def _cycle(before: tuple[Cycle, ...], spec: LoadedBody, solution: FiniteElementSolution) -> Cycle:

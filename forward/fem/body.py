@@ -37,14 +37,7 @@ def not_estimated(what: str) -> SolveError:
 class DiscreteBody(Generic[S]):
     """A body on one mesh, with one set of forms and one solver for every realisation, and solutions of one kind.
 
-    Parameters
-    ----------
-    spec
-        The body.
-    comm
-        Communicator of the ranks that share it.
-    parameters
-        Paths of the random parameters, in the order of the parameter vectors.
+    Ranks of a communicator share it; parameter vectors hold the numbers of these paths.
 
     Raises
     ------

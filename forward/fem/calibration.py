@@ -119,12 +119,7 @@ Body = DiscreteBody[FiniteElementSolution]
 class FinerMesh:
     """A body on a finer mesh, made when it is first solved on.
 
-    Parameters
-    ----------
-    model
-        The body.
-    spare
-        How many solves it may cost (`forward.fem.mesh_error_cost.allowance`).
+    It may cost `spare` solves (`forward.fem.mesh_error_cost.allowance`).
     """
 
     def __init__(self, model: Body, spare: float = math.inf) -> None:
@@ -194,7 +189,7 @@ class FinerMesh:
         factor has negative eigenvalues, only the equilibrium can tell whether it is stable.
         """
         other = self._untested
-        there = _moved(self._model.enriched.equations, other.equations, richer)
+        there = moved(self._model.enriched.equations, other.equations, richer)
         start = other.equations.layout.scatter(there[:1])[0]
         near = ReferenceSolution(parameters, start)
         if other.reference.at(near).indefinite():
@@ -234,7 +229,7 @@ def _everywhere(equations: Discretisation, rows: FloatArray) -> FloatArray:
     return np.asarray(equations.comm.bcast(equations.layout.gather(rows)))
 
 
-def _moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> FloatArray:
+def moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> FloatArray:
     """Return rows (k, U_local), interpolated at the nodes of another mesh, as (k, U') on every rank; collective."""
     whole, start, parts = _everywhere(here, rows), 0, []
     pairs = (

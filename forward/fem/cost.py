@@ -14,26 +14,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import cache
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from forward.machine import MIB
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from forward.bodies.geometry import Body
+
 ENTRIES = 1.4  # of MUMPS over those of the model
 OPERATIONS = 1.6
-# Displacements coupled with each one, on average, inside a large body.
-ROW = {
-    ("hexahedron", 1): 81.0,
-    ("hexahedron", 2): 192.0,
-    ("hexahedron", 3): 380.0,
-    ("hexahedron", 4): 700.0,
-    ("tetrahedron", 1): 45.0,
-    ("tetrahedron", 2): 84.0,
-    ("tetrahedron", 3): 140.0,
-    ("tetrahedron", 4): 220.0,
-}
+# Displacements coupled with each one, on average, inside a large body; here and below by the degree, from 1.
+ROW = {"hexahedron": (81.0, 192.0, 380.0, 700.0), "tetrahedron": (45.0, 84.0, 140.0, 220.0)}
 SMALLEST = 3.0  # nodes across a part of the lattice that is not cut further
 BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, including room for pivoting
 BYTES_PER_NONZERO = 16.0  # of the matrix
@@ -42,26 +35,8 @@ SPARE = 64 * MIB  # for allocations of libraries that do not check
 BYTES_OF_PROGRAM = 2.5e8  # Python with all libraries
 ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never touched
 # Processor times (s).
-ASSEMBLY = {
-    ("hexahedron", 1): 1.4e-5,
-    ("hexahedron", 2): 2.4e-4,
-    ("hexahedron", 3): 1.7e-3,
-    ("hexahedron", 4): 1.1e-2,
-    ("tetrahedron", 1): 2.9e-6,
-    ("tetrahedron", 2): 2.3e-5,
-    ("tetrahedron", 3): 1.1e-4,
-    ("tetrahedron", 4): 5e-4,
-}
-RESIDUAL = {
-    ("hexahedron", 1): 1.2e-6,
-    ("hexahedron", 2): 5e-6,
-    ("hexahedron", 3): 1.3e-5,
-    ("hexahedron", 4): 3.5e-5,
-    ("tetrahedron", 1): 2e-7,
-    ("tetrahedron", 2): 8e-7,
-    ("tetrahedron", 3): 2e-6,
-    ("tetrahedron", 4): 5e-6,
-}
+ASSEMBLY = {"hexahedron": (1.4e-5, 2.4e-4, 1.7e-3, 1.1e-2), "tetrahedron": (2.9e-6, 2.3e-5, 1.1e-4, 5e-4)}
+RESIDUAL = {"hexahedron": (1.2e-6, 5e-6, 1.3e-5, 3.5e-5), "tetrahedron": (2e-7, 8e-7, 2e-6, 5e-6)}
 HIGHEST = 4  # degree of these; of higher ones they are taken
 OF_PRESSURES = 1.25  # of an assembly with pressures over one without
 PER_ENTRY, PER_OPERATION = 1.6e-8, 4.4e-11  # of a factorisation
@@ -112,34 +87,6 @@ class Linear(StrEnum):
     FACTOR = "factor"
     BOTH = "both"
     MULTIGRID = "multigrid"
-
-
-class Meshed(Protocol):
-    """What a body must tell."""
-
-    @property
-    def cell(self) -> str:
-        """Kind of the cells."""
-
-    @property
-    def degree(self) -> int:
-        """Of the displacement."""
-
-    @property
-    def cell_count(self) -> int:
-        """Number of cells."""
-
-    @property
-    def nodes(self) -> int:
-        """Number of nodes of displacements."""
-
-    @property
-    def vertex_count(self) -> int:
-        """Number of vertices."""
-
-    @property
-    def bounds(self) -> tuple[tuple[float, float], ...]:
-        """Extent along each axis (m)."""
 
 
 @dataclass(frozen=True)
@@ -260,7 +207,7 @@ class Times:
 
 
 def times(
-    body: Meshed,
+    body: Body,
     *,
     mixed: bool,
     symmetric: bool = True,
@@ -274,16 +221,17 @@ def times(
     If the stiffness is not symmetric, each comes with a factor of the symmetric part, for the stability test.
     """
     extents = [high - low for low, high in body.bounds]
-    kind, more = (body.cell, min(body.degree, HIGHEST)), OF_PRESSURES if mixed else 1.0
+    more, degree = OF_PRESSURES if mixed else 1.0, min(body.degree, HIGHEST) - 1
     slender = max(extents) > SLENDER * min(extents)
     found = factor(body, mixed=mixed, symmetric=symmetric)
     size = found.bytes if symmetric else found.bytes + factor(body, mixed=mixed).bytes
-    assembly, setup = CALL + more * ASSEMBLY[kind] * body.cell_count, CALL + PER_NONZERO * found.nonzeros
+    assembly = CALL + more * ASSEMBLY[body.cell][degree] * body.cell_count
+    setup = CALL + PER_NONZERO * found.nonzeros
     factorisation = CALL + PER_ENTRY * found.entries + PER_OPERATION * found.operations
     substitution = CALL + PER_ENTRY_SOLVED * found.entries
     stepping, counting, deriving = factorisation + substitution, 0.0, 2 * TOGETHER * substitution
     if linear != Linear.FACTOR:
-        below = factor(_Linear(body), mixed=False, symmetric=symmetric)
+        below = factor(body.model_copy(update={"degree": 1}), mixed=False, symmetric=symmetric)
         of_coarse = CALL + PER_NONZERO * below.nonzeros + PER_ENTRY * below.entries + PER_OPERATION * below.operations
         product = CALL + PER_PRODUCT * found.nonzeros
         iteration = PRODUCTS * product + CALL + PER_ENTRY_SOLVED * below.entries
@@ -297,7 +245,7 @@ def times(
             setup, factorisation, substitution = CALL, stepping, iteration
     return Times(
         assembly,
-        CALL + RESIDUAL[kind] * body.cell_count,
+        CALL + RESIDUAL[body.cell][degree] * body.cell_count,
         setup,
         factorisation,
         substitution,
@@ -312,7 +260,7 @@ def times(
     )
 
 
-def linear_solver(body: Meshed, *, symmetric: bool) -> Linear:
+def linear_solver(body: Body, *, symmetric: bool) -> Linear:
     """Choose what linear systems of displacements are solved with, by sizes only.
 
     Both, where a first solve and a few derivatives take much less time than with factors; no factor of the whole
@@ -327,17 +275,6 @@ def linear_solver(body: Meshed, *, symmetric: bool) -> Linear:
         cost = times(body, mixed=False, symmetric=symmetric, linear=linear)
         seconds[linear] = cost.textbook + DERIVATIVES * cost.deriving
     return Linear.BOTH if seconds[Linear.BOTH] < WORTH * seconds[Linear.FACTOR] else Linear.FACTOR
-
-
-class _Linear:
-    """A body in linear elements."""
-
-    degree = 1
-
-    def __init__(self, body: Meshed) -> None:
-        self.cell, self.cell_count, self.bounds = body.cell, body.cell_count, body.bounds
-        self.nodes = self.vertex_count = body.vertex_count
-        self.cells = getattr(body, "cells", None)
 
 
 def together(unknowns: int) -> int:
@@ -359,7 +296,7 @@ def sum_of(parts: Sequence[Summed]) -> Summed:
     return replace(parts[0], **totals)
 
 
-def factor(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Factor:
+def factor(body: Body, *, mixed: bool, symmetric: bool = True) -> Factor:
     """Predict the factor of a body's stiffness: LDLᵀ or, without symmetry, LU, which is two triangles."""
     triangles = 1 if symmetric else 2
     cells = getattr(body, "cells", None)
@@ -374,7 +311,7 @@ def factor(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Factor:
     return Factor(
         triangles * ENTRIES * entries,
         triangles * OPERATIONS * operations,
-        ROW[body.cell, min(body.degree, HIGHEST)] * 3 * body.nodes * (1 + pressures / 3) ** 2,
+        ROW[body.cell][min(body.degree, HIGHEST) - 1] * 3 * body.nodes * (1 + pressures / 3) ** 2,
     )
 
 

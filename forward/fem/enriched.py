@@ -121,12 +121,7 @@ def nonlinearity(energy: float, stored: float, after: float) -> float:
 
     The work of the imbalance after the step along it, over that before; ∞ where the stiffness is not positive along it.
 
-    Parameters
-    ----------
-    energy, stored
-        As of `EnrichedState`.
-    after
-        Work (J) of the imbalance after the step along it.
+    `energy` and `stored` are those of `EnrichedState`, `after` is the work (J) of the imbalance after the step.
     """
     if abs(energy) <= NEGLIGIBLE**2 * stored:
         return 0.0
@@ -134,15 +129,7 @@ def nonlinearity(energy: float, stored: float, after: float) -> float:
 
 
 class Enriched(EnrichedEquations):
-    """What the equations of a body in an enriched space say of the error of its solutions.
-
-    Parameters
-    ----------
-    equations, spec
-        As of `EnrichedEquations`.
-    functionals
-        The outputs of the body.
-    """
+    """What the equations of a body in an enriched space say of the error of its solutions and of its outputs."""
 
     def __init__(self, equations: Discretisation, spec: LoadedBody, functionals: Sequence[Functional]) -> None:
         super().__init__(equations, spec)

@@ -43,17 +43,12 @@ class Linearised(Protocol):
 class EnrichedEquations:
     """The equations of a body in an enriched space, and its transfer to and from the space of the body.
 
-    Parameters
-    ----------
-    equations
-        Those of the body.
-    spec
-        Specification of the body in elements of a higher degree.
+    Made from those of the body, and its specification in elements of a higher degree.
 
     Attributes
     ----------
     equations
-        The equations of the body in the enriched space.
+        The equations in the enriched space.
     way
         How they are solved; depends only on sizes, form and degree.
     """

@@ -36,6 +36,23 @@ class Forms:
         As in `HyperelasticModel`.
     beside
         Forms of the same body in other elements, whose mesh and random fields these share.
+
+    Attributes
+    ----------
+    scalars
+        Which of the parameters (s,) are numbers of the model rather than coefficients of random fields.
+    fields
+        Random fields.
+    mesh, facets, space, layout
+        Mesh, facets of each boundary, space of the displacements, order of the nodes.
+    nodes_owned, size
+        Numbers of this rank's nodes and unknowns.
+    dx
+        Measure of the undeformed body.
+    u, test, F, J
+        Displacement, virtual displacement, deformation gradient and its determinant.
+    stored_energy, dilation
+        Densities of the stored energy and of the change of volume.
     """
 
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:

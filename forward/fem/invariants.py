@@ -114,13 +114,6 @@ class Invariants:
 
         which is smooth, free of cancellation at J = 1, and has the sign of J−1. The integral uses `POINTS` Gauss
         points, exact to 1e-12 for J from ½ to 2 if U has no singularity but J = 0.
-
-        Parameters
-        ----------
-        factor
-            Factor on every modulus.
-        values
-            Constants of the energy.
         """
         j = self.measures.get("j", self.deformation.dilation)
         volume = volumetric(self._energy)

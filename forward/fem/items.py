@@ -26,11 +26,6 @@ class Items:
 
     Vectors hold this rank's part (U_local,), as those of the equations.
 
-    Parameters
-    ----------
-    equations
-        The discrete equations.
-
     Raises
     ------
     ModelError
@@ -121,12 +116,7 @@ class Items:
     def entries(self, numbers: FloatArray, *, symmetric: bool) -> Entries:
         """Entries of their stiffness in rows of this rank, by rows and columns of a matrix; collective.
 
-        Parameters
-        ----------
-        numbers
-            The rows (U_local,) of the matrix that the unknowns are. Prescribed ones have none.
-        symmetric
-            Whether the symmetric part is asked for.
+        `numbers` are the rows (U_local,) that the unknowns are; prescribed ones have none.
         """
         free = np.array(numbers)
         free[self._equations.fixed] = -1
@@ -220,10 +210,7 @@ class Items:
     def kept_along(self, states: FloatArray, before: FloatArray, directions: FloatArray) -> FloatArray:
         """Return the changes (k, M_local) of what is kept; collective.
 
-        Parameters
-        ----------
-        states, before, directions
-            Changes of the state (k, U_local), of what was kept before (k, M_local) and of the parameters (k, d).
+        By those of the state (k, U_local), of what was kept before (k, M_local) and of the parameters (k, d).
         """
         by_state, by_past, by_number = self._derivatives()
         moved = np.array([self._taken(row) for row in states])

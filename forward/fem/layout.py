@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 class Layout:
     """Positions of this rank's nodes and unknowns in the canonical order (by x, then y, then z).
 
-    Parameters
-    ----------
-    space
-        The space of displacements.
-    comm
-        Communicator of the ranks that share the mesh.
-    pressure
-        The space of pressures, if they are unknowns.
-
     Attributes
     ----------
     positions

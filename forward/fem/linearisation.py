@@ -357,11 +357,6 @@ class Linearisation(Forms):
         y[:, self.fixed] = x[:, self.fixed]
         return y
 
-    def assembled_stiffness(self) -> Any:
-        """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
-        self.linearisation_point.factorised = None
-        return self._matrix.assembled()
-
     def sparse_stiffness(self) -> csr_matrix:
         """The stiffness (U, U) at the state that is set, in one process; the factor of `factorise` is lost."""
         self.linearisation_point.factorised = None

@@ -6,9 +6,12 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from forward.fem.cost import BYTES_PER_NONZERO, BYTES_PER_UNKNOWN, MOST_BYTES, REPORT, START, Meshed, factor, times
+from forward.fem.cost import BYTES_PER_NONZERO, BYTES_PER_UNKNOWN, MOST_BYTES, REPORT, START, factor, times
+
+if TYPE_CHECKING:
+    from forward.bodies.geometry import Body
 
 BLOCKS = 9  # residuals, for the blocks of the nodes
 ACTION = 2  # a product with the stiffness, over a residual
@@ -63,7 +66,7 @@ class Estimate:
     alone: bool = False
 
 
-def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) -> Estimate:
+def estimate(body: Body, enriched: Body, *, mixed: bool, symmetric: bool) -> Estimate:
     """Predict an estimate for a body, and the same in elements of one degree more.
 
     Steps miss too much of the error of linear elements, which may lock.

@@ -17,7 +17,6 @@ import numpy as np
 from forward.fem.body import DiscreteBody
 from forward.fem.calibration import FinerMesh
 from forward.fem.cost import Linear, together
-from forward.fem.reference import WayFromReference
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import Observation
 from forward.loaded import LoadedBody
@@ -27,6 +26,7 @@ from forward.pointwise import OneByOne
 from forward.solvers.equilibrium import solve, solving
 from forward.solvers.steps import Task, failed, finish_all
 from forward.solvers.system import Found
+from forward.solvers.way import Way
 
 AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
 UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
@@ -119,7 +119,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         """Return the body on a finer mesh, which may cost so many solves."""
         return FinerMesh(self, spare)
 
-    def way(self, parameters: FloatArray, guess: Guess) -> WayFromReference | None:
+    def way(self, parameters: FloatArray, guess: Guess) -> Way | None:
         """Return the path from the reference of a guess, whose factor is computed if it is another's; None without."""
         if self.spec.solver.kind == "newton" or self.equations.linear == Linear.MULTIGRID:
             return None
@@ -127,10 +127,10 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             return None
         self.reference.prepare(guess.reference)
         screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
-        return WayFromReference(self.equations, self.reference, guess.reference, parameters, screen=screen)
+        return Way(self.equations, self.reference, guess.reference, parameters, screen=screen)
 
     def solution(
-        self, parameters: FloatArray, found: Found, work: Work, way: WayFromReference | None, stiffer: float = 1.0
+        self, parameters: FloatArray, found: Found, work: Work, way: Way | None, stiffer: float = 1.0
     ) -> FiniteElementSolution:
         """Return what was found at `parameters` (d,) as a solution."""
         # If Newton's method had to take over, the reference is too far away for the derivatives too.
@@ -162,7 +162,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
 
     def _solve_together(self, starts: Iterable[tuple[FloatArray, Guess]]) -> Iterator[Solution | SolveError]:
         equations, zero = self.equations, np.zeros(self.equations.size)
-        begun: deque[tuple[FloatArray, WayFromReference | None, Work]] = deque()
+        begun: deque[tuple[FloatArray, Way | None, Work]] = deque()
 
         def tasks() -> Iterator[Task[Found]]:
             for point, guess in starts:

@@ -15,12 +15,12 @@ from forward.model import FloatArray, ReferenceSolution, SolveError, Work
 from forward.solvers.anderson import Inverse
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.rotations import Turned, rotations, turn
-from forward.solvers.stability import BLOCK, NOT_SCREENED, SMOOTH, Rows, Screened, draw, screen, screening_vectors
-from forward.solvers.steps import Corrector, Steps, finished, through
-from forward.solvers.system import ROUGH, TIGHT, LinearSolver, Residual
+from forward.solvers.stability import BLOCK, SMOOTH, Rows, Screened, screen, screening_vectors
+from forward.solvers.steps import Steps, finished, through
+from forward.solvers.system import ROUGH, TIGHT, LinearSolver
+from forward.solvers.way import MANY
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
-MANY = 16  # parameters, beyond which no derivatives by all of them are found
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
 
 
@@ -233,10 +233,6 @@ class ReferenceFactor:
         """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
         return Turned(R, self._equations.fixed).by(self._counted(self._solver, transpose=transpose, tolerance=ROUGH))
 
-    def corrector(self, R: FloatArray) -> Corrector:
-        """Return the same, asking for what `solve` does."""
-        return Turned(R, self._equations.fixed)
-
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve with the factor at the reference; (n,) or (k, n)."""
         return self._counted(self._solver, tolerance=ROUGH)(right)
@@ -251,89 +247,3 @@ class ReferenceFactor:
             return solver.solve(right, transpose=transpose, tolerance=tolerance)
 
         return inverse
-
-
-class WayFromReference:
-    """The straight line in parameters from a reference.
-
-    Attributes
-    ----------
-    reference
-        Its start.
-    joined
-        Whether the reference is joined to rest.
-    length
-        What the parameters move the state by, one by one; 0 if that is not known.
-    reversed_from
-        As of `Way`.
-    state
-        Of the reference.
-    rotation
-        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
-    draw
-        A number in [0, 1) that depends on the requested parameters.
-    """
-
-    def __init__(
-        self,
-        equations: Discretisation,
-        factor: ReferenceFactor,
-        reference: ReferenceSolution,
-        parameters: FloatArray,
-        *,
-        screen: bool,
-    ) -> None:
-        self._screen, self._fraction = screen, 1.0
-        self._slopes = factor.slopes() if screen and len(parameters) <= MANY else None
-        self.length = float(np.linalg.norm((parameters - reference.parameters) * factor.lengths())) if screen else 0.0
-        turned = (reference.parameters * parameters < 0) & equations.pushing
-        self.reversed_from = factor.from_rest() if screen and turned.any() else 0.0
-        self.draw = draw(parameters)
-        self._equations, self._factor = equations, factor
-        self._from, self._to = reference.parameters, parameters
-        self.reference, self.joined = reference, reference.joined
-        self.state = reference.state
-        self.rotation: FloatArray | None = None
-        self._predicted: FloatArray | None = None
-
-    @property
-    def slope(self) -> FloatArray | None:
-        """Derivative (U_local,) of the state by the fraction of the path, at the reference; None if not known."""
-        return None if self._slopes is None else np.asarray((self._to - self._from) @ self._slopes)
-
-    def corrector(self, u: FloatArray) -> Corrector:
-        """Return the corrector at a prediction u (U_local,), whose rotations are remembered."""
-        self._predicted, self.rotation = u, self._factor.rotation(u)
-        return self._factor.corrector(self.rotation)
-
-    def rotations(self, u: FloatArray) -> FloatArray:
-        """Return the rotations (3, 3, n_owned) of the nodes from the reference to u (U_local,)."""
-        return self.rotation if self.rotation is not None and u is self._predicted else self._factor.rotation(u)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve (U_local,) with the factor at the reference."""
-        return self._factor.solve(right)
-
-    def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
-        """Find the result of the screen for an equilibrium; not screened if that is not asked for."""
-        if not self._screen or self.rotation is None:
-            return NOT_SCREENED
-        return (yield from self._factor.screen(u, residual.vector, self.rotation))
-
-    def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
-        """Whether Lanczos' process shows that the stiffness at an equilibrium is positive definite."""
-        if not self._screen or self.rotation is None:
-            return False
-        return (yield from self._factor.definite(u, residual.vector, self.rotation))
-
-    def at(self, fraction: float) -> None:
-        """Set the parameters of the equations to those after a fraction of the path."""
-        self._fraction = fraction
-        self._equations.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
-        self._equations.at_load(1.0)
-
-    def resume(self, work: Work, solved: int) -> None:
-        """Set the equations to where they were on this path, and count their work and back-substitutions there."""
-        work.back_substitutions += solved
-        self._equations.work = work
-        self.at(self._fraction)

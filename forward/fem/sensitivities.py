@@ -126,14 +126,7 @@ class Sensitivities(Linearisation):
     def set_before(self, u: FloatArray, share: float, shifts: Mapping[str, FloatArray]) -> None:
         """Set the state (U_local,) at the end of the increment before, and what tools have moved since.
 
-        Parameters
-        ----------
-        u
-            The state.
-        share
-            The part of the load by which it has grown.
-        shifts
-            What tools have moved besides (m), by their labels.
+        The load has grown by `share` since, and tools have moved by these shifts (m) besides.
         """
         self.linearisation_point.moved()
         self.unknowns.give(self._before, u)
@@ -185,10 +178,7 @@ class Sensitivities(Linearisation):
     def left(self, states: FloatArray, before: FloatArray, directions: FloatArray) -> FloatArray:
         """Return the changes of what the increment that is set leaves.
 
-        Parameters
-        ----------
-        states, before, directions
-            Changes of its state (k, U_local), of what the one before has left, and of the parameters (k, d).
+        By those of its state (k, U_local), of what the one before has left, and of the parameters (k, d).
         """
         if not self.items:
             return states

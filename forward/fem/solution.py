@@ -19,11 +19,11 @@ from forward.fem.body import Calibrating, DiscreteBody, not_estimated
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
-from forward.fem.reference import WayFromReference
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
+from forward.solvers.way import Way
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
@@ -46,7 +46,7 @@ class FiniteElementSolution:
         parameters: FloatArray,
         found: Found,
         work: Work,
-        way: WayFromReference | None,
+        way: Way | None,
         stiffer: float = 1.0,
     ) -> None:
         self._model, self.stiffer = model, stiffer

@@ -174,15 +174,7 @@ class Materials:
 
 
 class Admission:
-    """Which parameters a body has a model for.
-
-    Parameters
-    ----------
-    spec
-        The body.
-    parameters
-        Paths of its parameters; those that are no numbers of it are coefficients of random fields.
-    """
+    """Which parameters a body has a model for; paths that are no numbers of it are coefficients of random fields."""
 
     def __init__(self, spec: Any, parameters: tuple[str, ...]) -> None:
         self._scalars, self._materials, self._parameters = spec.scalars, spec.materials(parameters), parameters

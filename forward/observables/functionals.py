@@ -22,7 +22,7 @@ class Linear:
 
     def value(self) -> float:
         """Return ψ."""
-        return self._equations.dot(self._g, self._equations.state())
+        return float(self._equations.dot(self._g, self._equations.state()))
 
     def gradient(self) -> FloatArray:
         """Return ∂ψ/∂u (U_local,)."""

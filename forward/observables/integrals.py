@@ -97,18 +97,18 @@ class _Reaction:
         self.w = w
 
     def value(self) -> float:
-        return self._equations.dot(self.w, self._equations.imbalance())
+        return float(self._equations.dot(self.w, self._equations.imbalance()))
 
     def gradient(self) -> FloatArray:
-        return self._equations.stiffness_times(self.w, transpose=True)
+        return np.asarray(self._equations.stiffness_times(self.w, transpose=True))
 
     def gradient_before(self) -> FloatArray:
         """By what the increment before has left, where friction or an item depends on it."""
-        return self._equations.rubbed(self.w)
+        return np.asarray(self._equations.rubbed(self.w))
 
     def partial(self) -> FloatArray:
         equations = self._equations
-        slopes = equations.field_products(self.w)
+        slopes: FloatArray = equations.field_products(self.w)
         slopes[equations.scalars] = [equations.dot(self.w, force) for force in equations.parameter_forces()]
         return slopes
 

@@ -117,7 +117,7 @@ class _MaxDisplacement:
                     g[node] = u / np.linalg.norm(u)
                 else:
                     g[node, self._axis] = np.sign(u[self._axis])
-        return self._equations.with_pressures(g.ravel())
+        return np.asarray(self._equations.with_pressures(g.ravel()))
 
     def partial(self) -> FloatArray:
         return np.zeros(len(self._equations.parameters))

@@ -57,20 +57,6 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
-    """An integrand as operations at a point.
-
-    Attributes
-    ----------
-    tape
-        Its inputs are the m components of the state, what is given, the logarithms of random fields, and the numbers of
-        the model. Of a virtual work, its outputs (m,) are what works on the m components; of a density, its value.
-    """
-
-    tape: Tape
-
-
-@dataclass(frozen=True, eq=False)
 class Output:
     """An output.
 
@@ -89,7 +75,7 @@ class Output:
     row: FloatArray | None = None
     which: int = 0
     size: float = 1.0
-    density: Written | None = None
+    density: Tape | None = None
     points: Points | None = None
 
 
@@ -126,7 +112,9 @@ class ReducedData:
         Loads that are proportional to a number: its parameter (−1: none), its value otherwise, and the works (N,) on
         the coordinate fields.
     works
-        Virtual works whose integrands are evaluated at points.
+        Virtual works whose integrands are evaluated at points. Inputs of these tapes are the components of the state,
+        what is given, the logarithms of random fields, and the numbers of the model; outputs (m,) are what works on the
+        m components. Those of densities return a value.
     levels
         The model, and the nested larger one with which its errors are estimated.
     outputs
@@ -154,7 +142,7 @@ class ReducedData:
     lifts: tuple[tuple[int, float], ...]
     tests: int
     dead: tuple[tuple[int, float, FloatArray], ...]
-    works: tuple[Written, ...]
+    works: tuple[Tape, ...]
     levels: tuple[LevelData, ...]
     outputs: tuple[Output, ...]
     fields: FloatArray
@@ -205,7 +193,7 @@ def load(path: Path) -> ReducedData:
     return found
 
 
-_CLASSES = (Points, Written, Output, LevelData, ReducedData)
+_CLASSES = (Points, Output, LevelData, ReducedData)
 
 
 def _packed(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -215,8 +203,9 @@ def _packed(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
             arrays[name] = value
             return {"array": name}
         case Tape():
-            return {"tape": {key: _packed(one, f"{name}.{key}", arrays) for key, one in to_arrays(value).items()}}
-        case Points() | Written() | Output() | LevelData() | ReducedData():
+            parts = {key: _packed(one, f"{name}.tape.{key}", arrays) for key, one in to_arrays(value).items()}
+            return {"class": "Written", "parts": {"tape": {"tape": parts}}}
+        case Points() | Output() | LevelData() | ReducedData():
             parts = {key: _packed(one, f"{name}.{key}", arrays) for key, one in vars(value).items()}
             return {"class": type(value).__name__, "parts": parts}
         case tuple():
@@ -233,7 +222,7 @@ def _unpacked(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     match value:
         case {"array": name}:
             return arrays[name]
-        case {"tape": parts}:
+        case {"class": "Written", "parts": {"tape": {"tape": parts}}}:
             return from_arrays({key: _unpacked(one, arrays) for key, one in parts.items()})
         case {"class": kind, "parts": parts}:
             (made,) = (one for one in _CLASSES if one.__name__ == kind)

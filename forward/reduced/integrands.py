@@ -14,30 +14,21 @@ from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.graph import SELECT, Graph, Node, Tape
 from forward.model import FloatArray
-from forward.reduced.data import Points, Written
+from forward.reduced.data import Points
+from forward.reduced.kernels import Kernel
 
 # Returns the node of a component of what has a value of its own: a function, its gradient, a constant, a place.
 Known = Callable[[Any, tuple[int, ...]], Node]
 _NAMES = {"Ln": "ln", "Power": "pow", "Division": "div", "Abs": "abs", "Atan2": "atan2"}
+_NAMES |= {name.capitalize(): name for name in ("sqrt", "exp", "sin", "cos", "sinh", "cosh", "tanh", "atan")}
 _TENSORS = {"Identity", "Indexed", "ComponentTensor", "IndexSum", "ListTensor", "Variable", "Conj", "Real"}
 _NUMBERS = {"IntValue", "FloatValue", "RealValue", "ScalarValue"}
 GIVEN = 24  # inputs that what is given may take while it is not known how many there are
 LOGS = 8
 
 
-_NAMES |= {name.capitalize(): name for name in ("sqrt", "exp", "sin", "cos", "sinh", "cosh", "tanh", "atan")}
-
-
 class Reader:
-    """Reads expressions into a graph.
-
-    Parameters
-    ----------
-    graph
-        Where they go.
-    known
-        The nodes of terminals and of gradients of functions.
-    """
+    """Reads expressions into a graph, in which the nodes of terminals and of gradients of functions are known."""
 
     def __init__(self, graph: Graph, known: Known) -> None:
         self._graph, self._known = graph, known
@@ -126,8 +117,8 @@ class Integrand:
 
     Attributes
     ----------
-    written
-        As operations at a point.
+    tape
+        Its operations at a point.
     boundary, degree
         Name of the boundary, None for the body; degree of quadrature.
     components
@@ -138,7 +129,7 @@ class Integrand:
         Numbers of the random fields that it takes.
     """
 
-    written: Written
+    tape: Tape
     boundary: str | None
     degree: int
     components: tuple[int, ...]
@@ -227,7 +218,7 @@ def _read(
         tape = graph.tape([works[k] for k in components])
     kept = [*components, *(first["given"] + np.arange(len(given))), *(first["logs"] + np.arange(len(fields)))]
     kept += [*(first["numbers"] + np.arange(len(numbers)))]
-    return Integrand(Written(_with_inputs(tape, kept)), boundary, degree, components, tuple(given), tuple(fields))
+    return Integrand(_with_inputs(tape, kept), boundary, degree, components, tuple(given), tuple(fields))
 
 
 def _with_inputs(tape: Tape, kept: list[int]) -> Tape:
@@ -240,15 +231,7 @@ def _with_inputs(tape: Tape, kept: list[int]) -> Tape:
 
 
 class Sampler:
-    """Values of functions of a body at the points of an integrand, of a part of them if that is enough.
-
-    Parameters
-    ----------
-    equations
-        The body, in one process.
-    integrand
-        What is evaluated.
-    """
+    """Values of functions of a body at the points of an integrand, of a part of them if that is enough."""
 
     def __init__(self, equations: Discretisation, integrand: Integrand) -> None:
         self._equations, self.integrand = equations, integrand
@@ -283,6 +266,10 @@ class Sampler:
         outward = np.einsum("nji,nj->ni", np.linalg.inv(J), at.outward)  # type: ignore[attr-defined]
         areas = np.linalg.norm(outward, axis=1)
         return np.abs(np.linalg.det(J)) * areas, outward / areas[:, None]
+
+    def kernel(self, numbers: int) -> Kernel:
+        """Compile the integrand, which takes so many numbers."""
+        return Kernel(self.integrand.tape, self.integrand.tape.inputs - numbers)
 
     def components(self, state: FloatArray) -> FloatArray:
         """Return the components (m, n) that the integrand takes of a state (U_local,)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike
 from forward.graph import CODES, SELECT, Tape
 from forward.model import FloatArray
 from forward.native import library
-from forward.reduced.data import Points, Written
+from forward.reduced.data import Points
 
 _INFIX = {"add": "+", "mul": "*", "div": "/"}
 _NAMES = {"ln": "log", "abs": "fabs"}
@@ -42,17 +42,7 @@ void spread(long rows, long columns, long n, long modes, const double *H, const 
 
 
 class Kernel:
-    """A tape whose first inputs vary from point to point and whose others are the same at all of them.
-
-    Parameters
-    ----------
-    tape
-        The operations.
-    varying
-        How many of its inputs vary.
-    real
-        In what precision it calculates.
-    """
+    """A tape whose first inputs vary from point to point and whose others are the same at all of them."""
 
     def __init__(self, tape: Tape, varying: int, real: DTypeLike = np.float64) -> None:
         self.tape, self._varying, self._real = tape, varying, np.dtype(real)
@@ -83,13 +73,9 @@ def spread(H: FloatArray, B: FloatArray) -> FloatArray:
     return out
 
 
-_found: dict[str, Any] = {}
-
-
+@cache
 def _spread() -> Any | None:
-    if "spread" not in _found:
-        _found["spread"] = _compiled(_SPREAD, "", "spread")
-    return _found["spread"]
+    return _compiled(_SPREAD, "", "spread")
 
 
 def _in_lanes(real: str, end: str) -> str:
@@ -130,19 +116,12 @@ def _source(tape: Tape, varying: int, real: str, end: str) -> tuple[str, str]:
         (inside if varies else outside).append(f"const {real} t{k} = {value};")
         names.append(f"t{k}")
     inside += [f"out[{m} * n + q] = {names[i]};" for m, i in enumerate(tape.outputs.tolist())]
-    head = f"void at_points(long n, const {real} *restrict p, const {real} *restrict c, {real} *restrict out)"
     in_lanes = _in_lanes(real, end)
     lines = [
         "#include <math.h>",
         *in_lanes.splitlines(),
-        head,
-        "{",
-        *outside,
-        _APART,
-        "for (long q = 0; q < n; ++q) {",
-        *inside,
-        "}",
-        "}",
+        f"void at_points(long n, const {real} *restrict p, const {real} *restrict c, {real} *restrict out)",
+        *("{", *outside, _APART, "for (long q = 0; q < n; ++q) {", *inside, "}", "}"),
     ]
     return "\n".join(lines) + "\n", in_lanes
 
@@ -162,18 +141,11 @@ def _compiled(source: str, spare: str, name: str) -> Any | None:
 class Integrand:
     """An integrand at points, and its derivatives by what it takes.
 
-    Parameters
-    ----------
-    written, points
-        What it is, and where.
-    numbers
-        How many numbers it takes.
-    real
-        In what precision it is evaluated.
+    It takes so many numbers, and is evaluated in the precision `real`.
     """
 
-    def __init__(self, written: Written, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:
-        self._written, self.points, self.real = written, points, real
+    def __init__(self, tape: Tape, points: Points, numbers: int, real: DTypeLike = np.float64) -> None:
+        self._tape, self.points, self.real = tape, points, real
         m, n, count = points.fields.shape
         self.components, self._varying = m, m + len(points.given) + len(points.logs)
         self.fields = points.fields.astype(real, copy=False)
@@ -186,7 +158,7 @@ class Integrand:
 
     def _derived(self, along: Sequence[int]) -> Kernel:
         """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
-        graph, outputs = self._written.tape.graph()
+        graph, outputs = self._tape.graph()
         slopes = [graph.tangent(outputs, i) for i in along]
         by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
         return Kernel(graph.tape([*outputs, *by_output]), self._varying, self.real)
@@ -198,7 +170,7 @@ class Integrand:
     @cached_property
     def dead(self) -> bool:
         """Whether its outputs do not depend on the state."""
-        graph, outputs = self._written.tape.graph()
+        graph, outputs = self._tape.graph()
         slopes = (one for i in range(self.components) for one in graph.tangent(outputs, i))
         return all(graph.value(one) == 0 for one in slopes)
 

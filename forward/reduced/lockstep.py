@@ -32,14 +32,7 @@ def equilibria(
 ) -> tuple[FloatArray, list[int]]:
     """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes, with an inverse stiffness (n, n).
 
-    Parameters
-    ----------
-    level
-        The model.
-    parameters, modes, inverse
-        The samples, where they begin, and what corrects them.
-    tolerance
-        What may be left of the forces, relative to what they would be if they did not cancel.
+    The tolerance is relative to what forces would be if they did not cancel.
 
     Returns
     -------

@@ -23,7 +23,7 @@ from forward.pointwise import ExplicitSolution, OneByOne
 from forward.reduced.data import ReducedData, ReducedSpace
 from forward.reduced.lockstep import SINGLE, TOGETHER, TOLERANCE, equilibria
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
-from forward.reduced.reduced_equations import ReducedEquations
+from forward.reduced.reduced_equations import At, ReducedEquations
 
 if TYPE_CHECKING:
     from forward.fem.space import Observation
@@ -129,14 +129,7 @@ class ReducedModel(OneByOne):
     def with_rows(self, seen: FloatArray, rows: Observation, names: tuple[str, ...]) -> ReducedModel:
         """Return the same model with what is observed of it as outputs.
 
-        Parameters
-        ----------
-        seen
-            What is observed (n, N) of its coordinate fields.
-        rows
-            Which outputs of the body are observed besides.
-        names
-            Of what is observed.
+        That is (n, N) of its coordinate fields, and outputs of the body besides.
         """
         other = copy(self)
         other.outputs, other.observed = names, (seen, rows)
@@ -323,7 +316,7 @@ class ReducedSolution(ExplicitSolution):
 
     def _own_jacobian(self) -> FloatArray:
         model = self._model
-        by_state, directly = model.level.output_slopes(self.c, self._whole, self.stiffness, self._F)
+        by_state, directly = model.level.output_slopes(At(self.c, self._whole, self.stiffness, self._F))
         free = model.level.free
         return np.asarray(by_state[:, free] @ self.slopes[free] + directly[:, model.places])
 
@@ -389,7 +382,7 @@ class ReducedSolution(ExplicitSolution):
         c, free = self._larger[0], larger.free
         _, K, _ = larger.stiffness(c, self._whole)
         F = larger.by_parameters(c, self._whole, K)
-        by_state, directly = larger.output_slopes(c, self._whole, K, F)
+        by_state, directly = larger.output_slopes(At(c, self._whole, K, F))
         return np.asarray((by_state[:, free] @ _slopes(larger, K, F)[free] + directly)[:, model.places])
 
 

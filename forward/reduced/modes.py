@@ -121,10 +121,7 @@ def partition(
 ) -> Partition:
     """Share nodes at places (n, 3) among blocks, from the block of each cell (n_cells, k).
 
-    Parameters
-    ----------
-    full
-        Places (f, 3): the blocks with the nearest cells are kept in full.
+    The blocks with the cells nearest to places `full` (f, 3) are kept in full.
     """
     names, block = np.unique(labels, return_inverse=True)
     touched = np.zeros((len(places), len(names)), dtype=bool)
@@ -222,15 +219,7 @@ def _in_order(rows: FloatArray, inner: Callable[[FloatArray], FloatArray]) -> Fl
 
 
 class AtRest:
-    """A body at rest, in one process.
-
-    Parameters
-    ----------
-    model
-        The body.
-    nominal
-        Means (d,) of its parameters.
-    """
+    """A body at rest, in one process, at the means (d,) of its parameters."""
 
     def __init__(self, model: HyperelasticModel, nominal: FloatArray) -> None:
         self.model, self._nominal = model, nominal

@@ -14,21 +14,13 @@ from forward.model import FloatArray, ModelError
 from forward.observables.functionals import Integral
 from forward.reduced.data import Output
 from forward.reduced.integrands import Sampler, of_density
-from forward.reduced.kernels import Kernel
 from forward.reduced.reduced_equations import LENGTH
 
 NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
 
 
 class Outputs:
-    """The outputs of a body that is being reduced.
-
-    Parameters
-    ----------
-    model
-        The body.
-    names
-        Paths of the numbers that integrands take.
+    """The outputs of a body that is being reduced; integrands take numbers of it by their paths.
 
     Attributes
     ----------
@@ -73,16 +65,9 @@ class Outputs:
     def made(
         self, rows: FloatArray, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None
     ) -> tuple[Output, ...]:
-        """Return them for coordinate fields (N, U_local).
+        """Return them for coordinate fields (N, U_local) and snapshots (s, U_local) at parameters (s, d).
 
-        Parameters
-        ----------
-        rows
-            The fields.
-        states, parameters
-            Snapshots (s, U_local), and where (s, d).
-        kept
-            Which cells are kept in full; None for none.
+        `kept` says which cells are kept in full; None for none.
         """
         found: list[Output] = []
         tests = integrals = 0
@@ -97,15 +82,15 @@ class Outputs:
             elif kind == "peak":
                 sampler = self._of_output[name]
                 near = self._near_peak(sampler, states, parameters, kept)
-                found.append(output(density=sampler.integrand.written, points=sampler.points(rows, near)))
+                found.append(output(density=sampler.integrand.tape, points=sampler.points(rows, near)))
             elif kind == "linear":
                 found.append(output(row=rows @ functional.gradient()))
             elif name in self._of_output:
                 sampler = self._of_output[name]
-                density, points = sampler.integrand.written, sampler.points(rows)
+                density, points = sampler.integrand.tape, sampler.points(rows)
                 found.append(output(size=functional.size, density=density, points=points))
             else:
-                density = self.densities[integrals][0].integrand.written
+                density = self.densities[integrals][0].integrand.tape
                 found.append(output(which=integrals, size=functional.size, density=density))
                 integrals += 1
         return tuple(found)
@@ -137,8 +122,7 @@ class Outputs:
         if kept is not None:
             near |= np.repeat(kept, sampler.count // len(kept))
         everywhere = sampler.points(np.zeros((0, states.shape[1])))
-        tape = sampler.integrand.written.tape
-        kernel = Kernel(tape, tape.inputs - len(self._numbers))
+        kernel = sampler.kernel(len(self._numbers))
         for state, point in zip(states, parameters, strict=True):
             inputs = sampler.inputs(sampler.components(state), everywhere, point)
             values = kernel(inputs, point[self._numbers])[0]

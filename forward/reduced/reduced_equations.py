@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -20,19 +21,19 @@ LENGTH = 3  # in place of an axis
 LEAST = 0.1  # of the forces of the largest snapshot: below, forces that are left are measured against this
 
 
-class ReducedEquations:
-    """A reduced model with so many modes at its points.
+class At(NamedTuple):
+    """Where outputs are differentiated: coordinates (N,), parameters (d,), derivatives of the forces there by both."""
 
-    Parameters
-    ----------
-    data
-        The model.
-    level
-        Which of its levels.
-    which
-        Numbers (m,) of the outputs; None for all.
-    real
-        In what precision integrands are evaluated.
+    c: FloatArray
+    parameters: FloatArray
+    K: FloatArray
+    F: FloatArray
+
+
+class ReducedEquations:
+    """One of the levels of a reduced model: so many modes at its points.
+
+    Outputs are all, or those of these numbers (m,); integrands are evaluated in the precision `real`.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class ReducedEquations:
         p = len(data.numbers)
         self.real = real
         pairs = zip(data.works, level.works, strict=True)
-        self.works = [Integrand(written, points, p, real) for written, points in pairs]
+        self.works = [Integrand(tape, points, p, real) for tape, points in pairs]
         outputs = data.outputs if which is None else [data.outputs[i] for i in which]
         self._outputs = [_of_output(output, self, p) for output in outputs]
         self.free = slice(self.before, self.count)
@@ -128,9 +129,10 @@ class ReducedEquations:
             R += (value if number < 0 else parameters[number]) * row[: self.count]
         return R
 
-    def outputs(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Return the outputs (m,)."""
-        return np.array([output.value(c, parameters) for output in self._outputs])
+    def outputs(self, c: FloatArray, parameters: FloatArray, which: Sequence[int] | None = None) -> FloatArray:
+        """Return the outputs (m,), or some of them by number."""
+        some = self._outputs if which is None else [self._outputs[i] for i in which]
+        return np.array([output.value(c, parameters) for output in some])
 
     def outputs_together(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
         """Return the outputs (s, m) at coordinates (s, N) and parameters (s, d) of several samples."""
@@ -138,25 +140,11 @@ class ReducedEquations:
             return np.zeros((0, len(self._outputs)))
         return np.array([output.values(c, parameters) for output in self._outputs]).T.copy()
 
-    def some_outputs(self, which: Sequence[int], c: FloatArray, parameters: FloatArray) -> list[float]:
-        """Return some of these outputs, by number."""
-        return [self._outputs[i].value(c, parameters) for i in which]
-
-    def output_slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return derivatives of the outputs by the coordinates (m, N) and by the parameters (m, d).
-
-        Parameters
-        ----------
-        c, parameters
-            Where.
-        K, F
-            Derivatives of the forces by the coordinates and by the parameters there.
-        """
-        pairs = [output.slopes(c, parameters, K, F) for output in self._outputs]
+    def output_slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives of the outputs by the coordinates (m, N) and by the parameters (m, d)."""
+        pairs = [output.slopes(at) for output in self._outputs]
         by_state = np.array([one for one, _ in pairs]).reshape(-1, self.count)
-        by_parameters = np.array([other for _, other in pairs]).reshape(-1, len(parameters))
+        by_parameters = np.array([other for _, other in pairs]).reshape(-1, len(at.parameters))
         for k, (number, _) in enumerate(self.data.lifts):
             if number >= 0:
                 by_parameters[:, number] += [
@@ -180,9 +168,7 @@ class _Output:
         """Return the values (s,) of several samples."""
         return np.array([self.value(one, point) for one, point in zip(c, parameters, strict=True)])
 
-    def slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
         raise NotImplementedError
 
 
@@ -196,10 +182,8 @@ class _Linear(_Output):
     def value(self, c: FloatArray, parameters: FloatArray) -> float:
         return float(self._row() @ c)
 
-    def slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        return self._row(), np.zeros(len(parameters))
+    def slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
+        return self._row(), np.zeros(len(at.parameters))
 
 
 class _Work(_Output):
@@ -214,10 +198,8 @@ class _Work(_Output):
     def value(self, c: FloatArray, parameters: FloatArray) -> float:
         return float(self.level.forces(c, parameters)[0][self._place])
 
-    def slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        return K[self._place], F[self._place].copy()
+    def slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
+        return at.K[self._place], at.F[self._place].copy()
 
 
 class _Largest(_Output):
@@ -244,13 +226,11 @@ class _Largest(_Output):
         squares = np.sum([(c @ rows.T) ** 2 for rows in self._rows], axis=0)
         return np.asarray(np.sqrt(squares.max(axis=1)))
 
-    def slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        node, u = self._there(c)
+    def slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
+        node, u = self._there(at.c)
         size = float(np.linalg.norm(u))
         row = (u / size) @ self._rows[:, node] if size else np.zeros(self.level.count)
-        return row, np.zeros(len(parameters))
+        return row, np.zeros(len(at.parameters))
 
 
 class _OfDensity(_Output):
@@ -279,15 +259,13 @@ class _OfDensity(_Output):
         coefficients, numbers = zip(*((level.coefficients(p), level.numbers(p)) for p in parameters), strict=True)
         return self._density.at(c, coefficients, numbers)[:, 0]
 
-    def slopes(
-        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, at: At) -> tuple[FloatArray, FloatArray]:
         level, density = self.level, self._density
-        inputs, numbers = density.inputs(c, level.coefficients(parameters)), level.numbers(parameters)
+        inputs, numbers = density.inputs(at.c, level.coefficients(at.parameters)), level.numbers(at.parameters)
         values, by_state = density.by_state(inputs, numbers)
         weights = self._weights(values[0])
         by_logs, by_numbers = density.by_parameters(inputs, numbers)
-        slopes = np.zeros(len(parameters))
+        slopes = np.zeros(len(at.parameters))
         np.add.at(slopes, level.data.numbers, by_numbers[0] @ weights)
         for i, (number, _, change) in enumerate(density.points.logs):
             slopes[level.data.coefficients[number][1]] += (weights * by_logs[0, i]) @ change

@@ -62,12 +62,7 @@ class Sizes:
 class Reduction:
     """A body that is being reduced: what does not change from one round of snapshots to the next.
 
-    Parameters
-    ----------
-    model
-        The body, in this process alone.
-    nominal, spread
-        Means and standard deviations (d,) of its parameters.
+    The body is in this process alone; `nominal` and `spread` are means and standard deviations (d,) of its parameters.
     """
 
     def __init__(self, model: HyperelasticModel, nominal: FloatArray, spread: FloatArray) -> None:
@@ -83,7 +78,7 @@ class Reduction:
         self._dead_rows: list[tuple[int, float, FloatArray]] = []
         self.equations.at_load(1.0)  # constants are read as they are now, and loads count in full
         works, whole = self._works(names)
-        self._written = tuple(one.written for one in works)
+        self._tapes = tuple(one.tape for one in works)
         self._rules = Rules(self.equations, works, whole, self._outputs.densities, self._numbers)
 
     # --- loads -------------------------------------------------------------------------------------------------------
@@ -286,7 +281,7 @@ class Reduction:
             lifts=tuple((number, value) for number, value, _ in self._rest.lifts),
             tests=len(tests),
             dead=tuple((number, value, rows @ force) for number, value, force in self._dead_rows),
-            works=self._written,
+            works=self._tapes,
             levels=(),
             outputs=outputs,
             fields=whole,

@@ -20,7 +20,7 @@ from forward.model import FloatArray
 from forward.observables.functionals import Integral
 from forward.reduced.data import LevelData, Points
 from forward.reduced.integrands import Integrand, Sampler
-from forward.reduced.kernels import Kernel, spread
+from forward.reduced.kernels import spread
 
 CANDIDATES = 12_000  # points among which a rule is chosen, of more a random part
 STATES = 160  # snapshots on which it is trained, of more an even part: each has as many works as there are modes
@@ -192,8 +192,8 @@ class Rules:
         missed do to an output, to its spread. Mixed at random, a few hundred sums stand for all of them.
         """
         equations, numbers, sampler = self._equations, self._numbers, self._samplers[number]
-        kernel = self._kernel(sampler)
-        of_densities = [self._kernel(one) for one, _ in self._densities] if densities else []
+        kernel = sampler.kernel(len(numbers))
+        of_densities = [one.kernel(len(numbers)) for one, _ in self._densities] if densities else []
         tests, tested = training.tests, training.tested(sizes[-1])
         whole = len(points.weights) == sampler.count
         outputs = training.adjoints.shape[1]
@@ -237,10 +237,6 @@ class Rules:
             return Rule(np.arange(len(points.weights)), points.weights, 0.0)
         return rule._replace(missed=rule.missed / share)
 
-    def _kernel(self, sampler: Sampler) -> Kernel:
-        tape = sampler.integrand.written.tape
-        return Kernel(tape, tape.inputs - len(self._numbers))
-
 
 def _candidates(sampler: Sampler, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Number the points among which a rule is chosen, and those (n,) that are kept."""
@@ -264,16 +260,7 @@ def chosen(values: FloatArray, integrals: FloatArray, tolerance: float, most: in
     The active set method (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23) with the normal
     equations of the points that are in; several points enter at once, a part of those that are in.
 
-    Parameters
-    ----------
-    values
-        Integrands (rows, n) at n points.
-    integrals
-        Their integrals (rows,).
-    tolerance
-        Of the residual, relative to the integrals.
-    most
-        Largest number of points.
+    Values (rows, n) are those of integrands at n points; the tolerance is relative to the integrals (rows,).
     """
     scale = np.linalg.norm(values, axis=0)
     scale[scale == 0] = 1.0
@@ -402,15 +389,6 @@ class Mixture:
     """Sums of many rows at random, a few hundred in place of all: norms stay the same on average.
 
     Each row goes to a few of the sums with random signs (sparse embedding: J. Nelson, H. L. Nguyễn, FOCS 2013).
-
-    Parameters
-    ----------
-    size
-        Number of sums.
-    points
-        Number of columns.
-    seed
-        Of the signs.
     """
 
     def __init__(self, size: int, points: int, seed: int) -> None:

@@ -103,14 +103,7 @@ class Frame(NamedTuple):
 
 
 class Stream:
-    """Frames of a reduced model.
-
-    Parameters
-    ----------
-    model
-        The model, of all its parameters.
-    at
-        Where it begins.
+    """Frames of a reduced model, of all its parameters.
 
     Attributes
     ----------
@@ -197,7 +190,7 @@ class Stream:
         self.unbalanced = residual > OPEN
         outputs, far = self._from_here(self.here, parameters), self._far(self.here.parameters, parameters)
         far[self._each_frame] = 0.0
-        outputs[self._each_frame] = level.some_outputs(self._each_frame, c, parameters)
+        outputs[self._each_frame] = level.outputs(c, parameters, self._each_frame)
         self.modes, self.parameters, self.outputs = c[level.free].copy(), parameters.copy(), outputs
         self.besides = _learnt(self.besides, time.perf_counter() - now)
         return Frame(outputs.copy(), self.here.errors + self._bent * far, residual, corrections)

@@ -8,7 +8,8 @@ from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.settings import SolverSettings
 from forward.solvers.stability import NOT_SCREENED
 from forward.solvers.steps import Steps
-from forward.solvers.system import NoConvergence, Residual, System, Way
+from forward.solvers.system import NoConvergence, Residual, System
+from forward.solvers.way import Way
 
 STALLED = 0.5  # a residual that falls by less may have reached rounding
 

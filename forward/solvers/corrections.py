@@ -11,7 +11,8 @@ from forward.solvers.acceptance import Diverged, accepted, converged, convex
 from forward.solvers.anderson import AndersonMixing
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Corrector, Steps
-from forward.solvers.system import Found, Residual, System, Way
+from forward.solvers.system import Found, Residual, System
+from forward.solvers.way import Way
 
 NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved, of the same branch
 WINDOW = 8  # differences that Anderson mixing keeps

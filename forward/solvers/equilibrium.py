@@ -26,7 +26,8 @@ from forward.solvers.joined import load_steps, settled
 from forward.solvers.newton import admissible_step, factorise, newton
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Corrector, Steps, finish, plain
-from forward.solvers.system import Found, Residual, System, Way
+from forward.solvers.system import Found, Residual, System
+from forward.solvers.way import Way
 
 ASTRAY = 100  # relative residual after all allowed corrections: the reference is too far away
 

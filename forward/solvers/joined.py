@@ -25,7 +25,8 @@ from forward.solvers.corrections import NEAR, mix, straight
 from forward.solvers.newton import newton
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Steps, T, Task, abreast
-from forward.solvers.system import Found, System, Way
+from forward.solvers.system import Found, System
+from forward.solvers.way import Way
 
 TURNED = np.pi / 4  # angle (rad) by which a node is turned against the prediction
 SAME = 1e-5  # distance of two states that are one, over their size: tolerances of residuals allow for less
@@ -89,10 +90,7 @@ def load_steps(
     load, if `unstable` says so), the branch is expected to end: only `REFUSALS` attempts may find others, and each has
     `LATE` iterations. It need not end: a body that is pushed aside a little bends much where without that it buckles.
 
-    Parameters
-    ----------
-    beyond
-        A stable equilibrium at full load, which is the answer if the branch from rest ends before.
+    `beyond` is a stable equilibrium at full load, the answer if the branch from rest ends before.
 
     Raises
     ------

@@ -34,21 +34,7 @@ SPAN = 3  # iterations whose increments of the energy are compared with those of
 
 @dataclass(frozen=True)
 class Levels:
-    """A matrix K, and what a cycle for it needs.
-
-    Attributes
-    ----------
-    multiply
-        Products with K.
-    smooth
-        Products with D⁻¹.
-    coarse
-        Products with PA⁻¹Pᵀ.
-    total
-        Sum over the ranks.
-    largest
-        Bound of the eigenvalues of D⁻¹K.
-    """
+    """A matrix K, and what a cycle for it needs: products with K, D⁻¹ and PA⁻¹Pᵀ, sums, the bound of D⁻¹K."""
 
     multiply: Apply
     smooth: Apply
@@ -84,16 +70,7 @@ class Levels:
 class Solved(NamedTuple):
     """What conjugate gradients have found.
 
-    Attributes
-    ----------
-    x
-        The solution (n,).
-    converged
-        Whether it is one to the tolerance.
-    definite
-        Whether no direction of negative energy was met.
-    iterations
-        Their number.
+    It is definite if no direction of negative energy was met.
     """
 
     x: FloatArray
@@ -201,14 +178,7 @@ def minimised(
     The weighted residual is the smallest in the space of all directions searched: generalised conjugate residuals
     (S. C. Eisenstat, H. C. Elman, M. H. Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357).
 
-    Parameters
-    ----------
-    multiply, precondition, right, total, iterations
-        As of `smoothed`.
-    weights
-        Of the entries (n,) of residuals.
-    tolerance
-        Of the residual, relative to b.
+    Arguments are those of `smoothed`, with weights (n,) of residuals, and a tolerance of these relative to b.
     """
     r = weights * right
     directions, images = (np.empty((iterations, len(right))) for _ in range(2))

@@ -159,14 +159,7 @@ class _Space:
 def screen(vectors: FloatArray, multiply: Rows, solve: Corrector, free: FloatArray, total: Total) -> Steps[Screened]:
     """Look for a direction in which the stiffness K of a state is negative.
 
-    Parameters
-    ----------
-    vectors
-        Rows (k, n), orthonormal in K̄.
-    multiply, solve
-        Apply K and K̄⁻¹.
-    free, total
-        As in `screening_vectors`.
+    Vectors (k, n) are orthonormal in K̄; `multiply` and `solve` apply K and K̄⁻¹.
     """
     if len(vectors) == 0:  # every displacement is held
         return Screened(1.0, 1.0)

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from forward.model import FloatArray, SolveError, Stability, Work
-from forward.solvers.stability import Screened
-from forward.solvers.steps import Corrector, Steps
 
 TIGHT = 1e-10  # tolerance of solutions on which derivatives rest
 ROUGH = 1e-2  # of steps of Newton's method, which correct each other
@@ -39,14 +37,7 @@ class LinearSolver(Protocol):
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
         """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides.
 
-        Parameters
-        ----------
-        right
-            The right-hand sides.
-        transpose
-            Whether to solve with Kᵀ.
-        tolerance
-            Error, relative to the solution in the norm of the energy, that a solver that iterates may leave.
+        One that iterates may leave an error of the tolerance, relative to the solution in the norm of the energy.
 
         Raises
         ------
@@ -185,55 +176,6 @@ class System(Protocol):
         SolveError
             If the stiffness is singular.
         """
-
-
-class Way(Protocol):
-    """The path in parameters from a reference state, whose factor is available, to the requested values."""
-
-    @property
-    def state(self) -> FloatArray:
-        """The state (U_local,) of the reference."""
-
-    @property
-    def joined(self) -> bool:
-        """Whether the reference is joined to rest."""
-
-    @property
-    def length(self) -> float:
-        """What the parameters move the state by, one by one: the norm of the norms; 0 if that is not known."""
-
-    @property
-    def reversed_from(self) -> float:
-        """How far the reference is from a linear answer to its loads, if one of these is reversed on the path; else 0.
-
-        That is the distance from what the tangent at rest predicts, over the size of its state.
-        """
-
-    @property
-    def slope(self) -> FloatArray | None:
-        """Derivative (U_local,) of the state by the fraction of the path, at the reference; None if not known."""
-
-    @property
-    def draw(self) -> float:
-        """A number in [0, 1) that depends only on the parameters: eigenvalues are counted if it is small."""
-
-    def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
-        """Find the result of `forward.solvers.stability`'s screen for an equilibrium."""
-
-    def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
-        """Whether Lanczos' process shows that the stiffness at an equilibrium is positive definite."""
-
-    def rotations(self, u: FloatArray) -> FloatArray:
-        """Return the rotations (3, 3, n_owned) of this rank's nodes from the reference to u (U_local,)."""
-
-    def at(self, fraction: float) -> None:
-        """Set the parameters of the system to those after a fraction of the path."""
-
-    def corrector(self, u: FloatArray) -> Corrector:
-        """Return an approximate inverse of the stiffness at u, which asks for solutions as `solve` returns them."""
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve (n,) with the factor at the reference."""
 
 
 class Found(NamedTuple):

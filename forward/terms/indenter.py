@@ -137,14 +137,7 @@ class Indenter(Term):
     def resistance(self, modulus: float, extent: float) -> tools.Stiffness:
         """Return the stiffness that keeps the penetration small.
 
-        The formulas are at the top of this file.
-
-        Parameters
-        ----------
-        modulus
-            E/(1 − ν²) (Pa) of the body.
-        extent
-            Of the body along the direction (m).
+        Of a body with modulus E/(1 − ν²) (Pa) and this extent (m) along the direction, by the formulas at the top.
         """
         match self.shape:
             case "plane":

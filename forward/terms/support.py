@@ -39,10 +39,7 @@ class Support:
     def mistakes(self, *, complete: bool) -> Iterator[Mistake]:
         """Find loads that cannot act on the body, and that it can move freely.
 
-        Parameters
-        ----------
-        complete
-            Whether all boundaries that are named exist: otherwise one of them may hold the body.
+        It is `complete` if all boundaries that are named exist: otherwise one of them may hold the body.
         """
         moved = any(value for item in self.displacements for value in item.components.values())
         alone = not moved and len(self.loads) == 1

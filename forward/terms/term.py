@@ -155,12 +155,7 @@ class Term(Named):
     def mistakes(self, body: Body, *, alone: bool) -> Iterator[tuple[str, str, Any]]:
         """Find what cannot be on a body: the field, what is wrong, what was given.
 
-        Parameters
-        ----------
-        body
-            The body, which has the boundary `on`.
-        alone
-            Whether nothing else acts on it or moves it.
+        The body has the boundary `on`; `alone`, nothing else acts on it or moves it.
         """
         return iter(())
 
@@ -194,13 +189,7 @@ class Term(Named):
         raise NotImplementedError
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports.
-
-        Parameters
-        ----------
-        numbers
-            Its numbers with their units, by the names of its fields.
-        """
+        """Say what it is, for reports; its numbers are given with their units, by the names of its fields."""
         return f"{self.label}: {settings(dict(self) | dict(numbers), 'kind', 'name')}"
 
     @property

@@ -18,7 +18,7 @@ from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for, signature
 from forward.fem.dolfinx.lanes import Kernel, Numbers
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
-from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_ghosts
+from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_rows
 from forward.fem.dolfinx.unknowns import Unknowns
 from forward.model import FloatArray
 
@@ -183,17 +183,7 @@ class FacetValues:
 
 
 class NodalAverages:
-    """An expression of a space of displacements at its nodes: averages over the cells that meet there.
-
-    Parameters
-    ----------
-    expression
-        UFL expression.
-    shape
-        Its shape.
-    often
-        As of `PointValues`.
-    """
+    """An expression of a space of displacements at its nodes: averages over the cells that meet there."""
 
     def __init__(self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any, *, often: bool = False) -> None:
         nodes = cell_element(space).points
@@ -210,8 +200,7 @@ class NodalAverages:
         """Add what other ranks hold of three rows (3, n) at this rank's nodes."""
         if self._comm.size == 1:
             return rows
-        self._carrier.x.array[:] = rows.T.ravel()
-        return np.asarray(sum_ghosts(self._carrier).reshape(-1, 3).T)
+        return np.asarray(sum_rows(self._carrier, rows).T)
 
     def __call__(self) -> FloatArray:
         """Return the values (*shape, n_owned) at this rank's nodes, for the current state."""

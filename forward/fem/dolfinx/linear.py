@@ -54,11 +54,6 @@ class StiffnessMatrix:
     items
         What else acts: its entries by the rows (U_local,) of the matrix that the unknowns are.
 
-    Attributes
-    ----------
-    matrix
-        PETSc's matrix.
-
     Raises
     ------
     StopError
@@ -102,16 +97,12 @@ class StiffnessMatrix:
             self.matrix.setValuesIJV(each, columns.astype(np.int32), values, addv=True, rowmap=rows.astype(np.int32))
         self.matrix.assemble()
 
-    def assembled(self) -> Any:
-        """Assemble; return a copy of PETSc's matrix, for `products`."""
-        self.assemble()
-        return self.matrix.copy()
-
     def sparse(self) -> csr_matrix:
         """Assemble; return SciPy's sparse matrix (n, n), of one process."""
         from scipy.sparse import csr_matrix
 
-        matrix = self.assembled().convert("aij")
+        self.assemble()
+        matrix = self.matrix.copy().convert("aij")
         starts, columns, values = matrix.getValuesCSR()
         matrix.destroy()
         n = len(starts) - 1
@@ -119,29 +110,9 @@ class StiffnessMatrix:
         rows = ours[np.repeat(np.arange(n), np.diff(starts))]
         return csr_matrix((values, (rows, ours[columns])), shape=(n, n))
 
-    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
-        """Return the products (k, n) of such a copy with rows (k, n)."""
-        x, y = matrix.createVecs()
-        found = np.empty_like(rows)
-        for row, product in zip(rows, found, strict=True):
-            x.array[:] = self.unknowns.reorder(row)
-            matrix.mult(x, y)
-            product[:] = self.unknowns.take(y.array_r)
-        x.destroy()
-        y.destroy()
-        return found
-
 
 class BoundaryBlocks:
-    """The 3×3 blocks on the diagonal of a stiffness of displacements on boundaries, without the rest of it.
-
-    Parameters
-    ----------
-    form, comm
-        As of `StiffnessMatrix`.
-    space
-        The space of displacements.
-    """
+    """The 3×3 blocks on the diagonal of a stiffness of displacements on boundaries, without the rest of it."""
 
     def __init__(self, form: Any, space: Any, comm: Any) -> None:
         self._form = form
@@ -169,14 +140,7 @@ class SaddleBlocks:
     S = −C + B A_d⁻¹ Bᵀ, then displacements, u = A_d⁻¹ (r_u − Bᵀ p): A_d are the 3×3 blocks on the diagonal of A, and
     in S their diagonal (M. Benzi, G. H. Golub, J. Liesen, Acta Numerica 14 (2005) 1–137, section 10).
 
-    Parameters
-    ----------
-    stiffness
-        The matrix, which is assembled and then freed.
-    nodes
-        Number of nodes of this rank.
-    fixed
-        Prescribed unknowns.
+    The matrix is assembled and then freed; `nodes` are how many this rank has, `fixed` its prescribed unknowns.
     """
 
     def __init__(self, stiffness: StiffnessMatrix, nodes: int, fixed: NDArray[np.int64]) -> None:
@@ -366,11 +330,6 @@ class NodalBlocks:
     Of a cell with moduli 𝔸 = ∂P/∂F and shape functions φ_i, the block of node i is ∫ 𝔸_{akbl} ∂_kφ_i ∂_lφ_i dX. Here 𝔸
     and the Jacobian are means over the cell: for what only preconditions. An element matrix of cubic hexahedra has
     36 864 entries, of which these are 576.
-
-    Parameters
-    ----------
-    space
-        The space.
     """
 
     def __init__(self, space: Any) -> None:
@@ -396,10 +355,5 @@ class NodalBlocks:
         parts = (local.reshape(-1, 9) @ self._products).reshape(len(K), 9, -1).swapaxes(0, 1)
         count = len(self._carrier.x.array) // 3
         sums = [np.bincount(self._nodes, weights=part.ravel(), minlength=count) for part in parts]
-        rows = [self._owned(np.array(sums[i : i + 3])) for i in (0, 3, 6)]
+        rows = [spaces.sum_rows(self._carrier, np.array(sums[i : i + 3])) for i in (0, 3, 6)]
         return np.asarray(np.stack(rows, axis=1))
-
-    def _owned(self, rows: FloatArray) -> FloatArray:
-        """Return values (3, n) of nodes at the n_owned of this rank, with what others hold of them, as (n_owned, 3)."""
-        self._carrier.x.array[:] = rows.T.ravel()
-        return spaces.sum_ghosts(self._carrier).reshape(-1, 3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +27,8 @@ class MultigridSolver:
     Where conjugate gradients meet a direction of negative energy, or the stiffness is not symmetric, generalised
     conjugate residuals take their place.
 
-    Parameters
-    ----------
-    stiffness
-        The matrix K of displacements, stored by blocks.
-    coarse
-        Solver for the same form with test and trial functions that are linear.
-    transfer
-        From linear elements into those of the body.
-    fixed, coarse_fixed
-        Prescribed unknowns of this rank in both.
+    The stiffness is stored by blocks; the coarse solver is for the same form in linear elements, from which `transfer`
+    leads into those of the body. Prescribed unknowns are those of this rank.
     """
 
     def __init__(
@@ -89,14 +81,10 @@ class MultigridSolver:
         comm = self._stiffness.comm
         return values if comm.size == 1 else np.asarray(comm.allreduce(values))
 
-    def _multiply(self, x: FloatArray) -> FloatArray:
+    def _multiply(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
+        K = self._stiffness.matrix
         self._in.array[:] = x
-        self._stiffness.matrix.mult(self._in, self._out)
-        return np.array(self._out.array_r)
-
-    def _multiply_transposed(self, x: FloatArray) -> FloatArray:
-        self._in.array[:] = x
-        self._stiffness.matrix.multTranspose(self._in, self._out)
+        (K.multTranspose if transpose else K.mult)(self._in, self._out)
         return np.array(self._out.array_r)
 
     def _on_coarse(self, r: FloatArray) -> FloatArray:
@@ -137,7 +125,7 @@ class MultigridSolver:
     def _minimised(
         self, levels: Levels, right: FloatArray, tolerance: float, *, transpose: bool
     ) -> tuple[FloatArray, bool]:
-        multiply = self._multiply_transposed if transpose else self._multiply
+        multiply = partial(self._multiply, transpose=transpose)
         x, _, converged = minimised(multiply, levels.cycle, right, self._scale, self._total, tolerance, RESIDUALS)
         return x, converged
 

@@ -51,14 +51,10 @@ class ConjugateGradients:
 
     def __init__(self, stiffness):
         self._stiffness = stiffness
-        self._matrix = None
 
     def factorise(self):
-        if self._matrix is not None:
-            self._matrix.destroy()
-        self._matrix = self._stiffness.assembled()
-        diagonal = self._matrix.getDiagonal()
-        self._scale = 1 / self._stiffness.unknowns.take(diagonal.array_r)
+        self._matrix = self._stiffness.sparse()
+        self._scale = 1 / self._matrix.diagonal()
 
     def solve(self, right, *, transpose=False, tolerance=1e-13):
         if right.ndim == 2:
@@ -68,7 +64,7 @@ class ConjugateGradients:
         for _ in range(10 * len(right)):
             if np.linalg.norm(r) <= 1e-13 * np.linalg.norm(right):
                 break
-            q = self._stiffness.products(self._matrix, p[None])[0]
+            q = self._matrix @ p
             step = (r @ z) / (p @ q)
             before = r @ z
             x, r = x + step * p, r - step * q
