@@ -8,6 +8,8 @@ covariance of the models of a group and R_g the matrix that picks them from all 
 has the least variance, e_0ᵀΦ⁻¹e_0 = z_0, of all linear ones without bias: Σ_g R_gᵀ a_g = e_0 (D. Schaden, E. Ullmann,
 SIAM/ASA J. Uncertain. Quantif. 8 (2020) 601–635). Approximate control variates are of the kind, and multifidelity Monte
 Carlo (B. Peherstorfer, K. Willcox, M. Gunzburger, SIAM J. Sci. Comput. 38 (2016) A3163–A3194), whose groups are nested.
+With other sums of means than E[ψ_0], e has their factors in place of e_0. So differences between meshes are quantities
+that are alone in their groups, of whose means the sum is estimated (multilevel Monte Carlo): z_l = V_l/n_l and a_l = 1.
 
 The variance is convex in the numbers n. Those with the least largest variance of several quantities for a cost come
 from multiplicative steps on the shares of the cost (S. D. Silvey, D. M. Titterington, B. Torsney, Commun. Stat. Theory
@@ -60,17 +62,28 @@ def weights(told: FloatArray, counts: FloatArray) -> FloatArray:
     precision = np.einsum("g,gkl->kl", counts, told)
     sampled = np.flatnonzero(np.diag(precision))
     z = np.zeros(len(precision))
-    z[sampled] = _solved(precision[np.ix_(sampled, sampled)])
+    z[sampled] = _solved(precision[np.ix_(sampled, sampled)], _first(sampled.size))
     return np.asarray(np.einsum("g,gkl,l->gk", counts, told, z))
 
 
-def _solved(precision: FloatArray) -> FloatArray:
-    """Return Φ⁻¹e_0 (…, K), scaled for rounding."""
+def alone(variances: FloatArray) -> FloatArray:
+    """Return what a sample of each of G groups tells of J quantities (J, G, G, G): each its own variance (J, G)."""
+    each = np.arange(variances.shape[1])
+    found = np.zeros((*variances.shape, each.size, each.size))
+    found[:, each, each, each] = 1 / variances
+    return found
+
+
+def _solved(precision: FloatArray, e: FloatArray) -> FloatArray:
+    """Return Φ⁻¹e (…, K), scaled for rounding."""
     root = np.sqrt(np.einsum("...kk->...k", precision))
-    right = np.zeros(precision.shape[:-1])
-    right[..., 0] = 1 / root[..., 0]
     scaled = precision / (root[..., :, None] * root[..., None, :])
-    return np.asarray(np.linalg.solve(scaled, right[..., None])[..., 0] / root)
+    return np.asarray(np.linalg.solve(scaled, (e / root)[..., None])[..., 0] / root)
+
+
+def _first(count: int) -> FloatArray:
+    """Return e_0 (K,)."""
+    return np.asarray(np.eye(1, count)[0])
 
 
 @dataclass(frozen=True)
@@ -85,15 +98,26 @@ class Problem:
         Of one sample of each group (G,).
     taken
         Samples (G,) that there are already: of none, or of all models.
+    summed
+        Factors (K,) of the means whose sum is estimated; by default it is that of model 0.
     """
 
     told: FloatArray
     costs: FloatArray
     taken: FloatArray
+    summed: FloatArray | None = None
 
     def variances(self, counts: FloatArray) -> FloatArray:
         """Return the variances (J,) with so many samples (G,) of the groups in all."""
-        return np.asarray(_solved(np.einsum("g,jgkl->jkl", counts, self.told))[:, 0])
+        return np.asarray(self._solved(counts) @ self._e)
+
+    @property
+    def _e(self) -> FloatArray:
+        return _first(self.told.shape[-1]) if self.summed is None else self.summed
+
+    def _solved(self, counts: FloatArray) -> FloatArray:
+        """Return z (J, K)."""
+        return _solved(np.einsum("g,jgkl->jkl", counts, self.told), self._e)
 
     def best(self, cost: float, first: FloatArray | None = None) -> FloatArray:
         """Return the numbers (G,) of further samples for a cost, from shares (G,) of it that may be good already."""
@@ -103,8 +127,8 @@ class Problem:
         best, least = shares, np.inf
         for _ in range(STEPS):
             further = cost * shares / self.costs
-            z = _solved(np.einsum("g,jgkl->jkl", self.taken + further, self.told))
-            found = z[:, 0]
+            z = self._solved(self.taken + further)
+            found = z @ self._e
             # What one more unit of cost in each group is worth, of the mixture of the quantities.
             gains = np.einsum("j,jk,jgkl,jl->g", mixed, z, self.told, z) * cost / self.costs
             largest = float(found.max())

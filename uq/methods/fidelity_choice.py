@@ -23,7 +23,7 @@ from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
 from uq.estimators.subsampled_difference import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.tails import with_tails
 from uq.inputs.sampling import random_points
-from uq.methods.fidelity_team import PILOT, Block, Taken, Team
+from uq.methods.fidelity_team import PILOT, Block, Fidelities, Taken
 from uq.methods.fidelity_ways import FEWEST, UNLIMITED, sizes
 
 TRIED = 60  # numbers of full solves
@@ -60,7 +60,7 @@ class ByChoice:
         What all pools so far tell.
     """
 
-    def __init__(self, team: Team, pilot: Found, *, known: bool) -> None:
+    def __init__(self, team: Fidelities, pilot: Found, *, known: bool) -> None:
         self._team, self._known = team, known
         self._all = team.groups.index(tuple(range(1, len(team.members))))
         g = PILOT if PILOT in team.taken else 0

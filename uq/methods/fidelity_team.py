@@ -1,4 +1,4 @@
-"""The models of a multifidelity study at work: linearised, sampled in groups, and paid for."""
+"""Models that share random parameters, at work: linearised, sampled in groups, and paid for."""
 
 from __future__ import annotations
 
@@ -24,36 +24,50 @@ CHEAP = 64  # points of a cheap model in a block, unless they cost more than tho
 PILOT = -1  # group of a pilot that does not count in estimates, in results
 
 
-@dataclass(frozen=True)
+@dataclass
 class Member:
     """A model that is sampled.
 
     Attributes
     ----------
     label
-        Its name in results.
+        Its name in results, and before reasons of its failures; empty where the group says which it is.
     evaluate
         Its evaluation.
-    stopped_after
-        Iterations of its solver.
     cost
-        Of a solve, over that of the study's model.
+        Of a solve, by which numbers of samples are chosen.
     centre
         Its linearisation at the mean parameters.
+    stopped_after
+        Iterations of its solver.
+    company
+        How many points go together in a block.
+    solves, seconds
+        Number of its solves at samples so far, and their processor time (s).
+    first
+        The first of these.
     """
 
     label: str
     evaluate: Recorder
-    stopped_after: int | None
     cost: float
     centre: Linearisation
+    stopped_after: int | None = None
+    company: int = COMPANY
+    solves: int = 0
+    seconds: float = 0.0
+    first: Evaluations | None = None
 
     def solve(self, points: FloatArray, *, tangents: bool = False) -> Evaluations:
         """Solve at points (n, d)."""
-        start, company = self.centre.prediction, min(CHEAP, int(COMPANY / self.cost))
-        return self.evaluate(
-            Request(points, tangents=tangents, start=start, iterations=self.stopped_after, company=company)
+        start, iterations = self.centre.prediction, self.stopped_after
+        found = self.evaluate(
+            Request(points, tangents=tangents, start=start, iterations=iterations, company=self.company)
         )
+        self.solves += len(points)
+        self.seconds += float(found.seconds.sum())
+        self.first = self.first or found
+        return found
 
 
 @dataclass(frozen=True)
@@ -89,12 +103,58 @@ class Block:
 
 
 class Team:
+    """Models, of which groups are solved at the same random parameters: every group has its own stream of these.
+
+    Attributes
+    ----------
+    inputs, seed
+        The random parameters, and the seed of all streams.
+    members
+        The models, at most `most`.
+    groups
+        Groups of models, by their numbers.
+    taken
+        The samples of groups.
+    """
+
+    def __init__(self, inputs: Inputs, evaluate: Recorder, seed: int, most: int) -> None:
+        self.inputs, self.evaluate, self.seed, self._most = inputs, evaluate, seed, most
+        self.members: list[Member] = []
+        self.groups: list[Group] = []
+        self.taken: dict[int, Taken] = {}
+
+    def take(self, g: int, count: int, *, tangents: bool = False) -> None:
+        """Take further samples of a group, or of all models for a pilot that does not count."""
+        start = len(self.taken[g].points) if g in self.taken else 0
+        found = self.drawn(g, start, count, tangents=tangents)
+        self.taken[g] = self.taken[g].extended(found) if start else found
+
+    def drawn(self, g: int, start: int, count: int, *, tangents: bool = False) -> Taken:
+        """Draw points of a group's stream and solve its models there; others have NaN."""
+        stream = g if g >= 0 else len(self.groups)
+        points = self.inputs.points(random_points((self.seed, stream), start, start + count, len(self.inputs.names)))
+        found = Taken(points, np.full((count, self._most, len(self.evaluate.outputs)), np.nan))
+        for k in self.groups[max(g, 0)] if count else ():
+            found.values[:, k] = self.solved(k, points, found.reasons, tangents=tangents and k == 0)
+        return found
+
+    def blocks(self) -> list[Block]:
+        """What was taken of each group."""
+        return [Block(self.groups[max(g, 0)], self.taken[g], pilot=g == PILOT) for g in sorted(self.taken)]
+
+    def solved(self, k: int, points: FloatArray, reasons: set[str], *, tangents: bool = False) -> FloatArray:
+        """Solve a model at points; NaN where it has no answer, with the reasons added to others."""
+        one = self.members[k]
+        found = one.solve(points, tangents=tangents)
+        reasons.update(f"{one.label}: {failure.reason}" if one.label else failure.reason for failure in found.failures)
+        return np.asarray(np.where(found.ok[:, None], found.outputs, np.nan))
+
+
+class Fidelities(Team):
     """The model of a study (the first) and cheap ones.
 
     Attributes
     ----------
-    members
-        The models.
     groups, costs
         All groups of models, and the cost (G,) of a sample of each, in solves of the study's model.
     spent
@@ -105,74 +165,39 @@ class Team:
         Slopes (m, d) and E[T²] (m,) of the control: the tangent of the study's model, for all of them. Tangents of
         models that follow each other may differ, where the place of the largest stress jumps at the mean parameters,
         say. Each would take off something else then, and what is left would not be correlated.
-    pilot
-        Evaluations of the model of the study at the points of the pilot.
     """
 
     def __init__(
         self, cheap: Sequence[CheapModel], inputs: Inputs, evaluate: Recorder, seed: int, *, controlled: bool
     ) -> None:
-        self.inputs, self.evaluate = inputs, evaluate
-        self.seed, self.controlled = seed, controlled and evaluate.differentiable
+        super().__init__(inputs, evaluate, seed, 1 + len(cheap))
+        self.controlled = controlled and evaluate.differentiable
         centre = linearise(inputs, evaluate)
-        self.members = [Member(OWN_LABEL, evaluate, None, 1.0, centre)]
+        self.members.append(Member(OWN_LABEL, evaluate, 1.0, centre))
         self.spent = 0.0
         for one in cheap:
-            if one.stopped_after is not None:
-                cost = one.predicted(0, 0)
-                self.members.append(Member(one.label, evaluate, one.stopped_after, _known(one, cost), centre))
-                continue
-            other = evaluate.on(one.label)
-            cost = _known(one, one.predicted(evaluate.displacements, other.displacements))
-            try:
-                found = linearise(inputs, other)
-            except SolveError as error:
-                raise SolveError(f"{one.label}: {error.reason}", error.history) from None
-            self.members.append(Member(one.label, other, None, cost, found))
-            self.spent += TEXTBOOK * cost
-        self.groups: list[Group] = subsets(len(self.members))
+            stopped = one.stopped_after
+            other, found = evaluate if stopped else evaluate.on(one.label), centre
+            cost = one.predicted(evaluate.displacements, other.displacements)
+            if cost is None:
+                raise ValueError(f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`")
+            if stopped is None:
+                try:
+                    found = linearise(inputs, other)
+                except SolveError as error:
+                    raise SolveError(f"{one.label}: {error.reason}", error.history) from None
+                self.spent += TEXTBOOK * cost
+            self.members.append(Member(one.label, other, cost, found, stopped, min(CHEAP, int(COMPANY / cost))))
+        self.groups = subsets(len(self.members))
         self.costs = np.array([sum(self.members[k].cost for k in group) for group in self.groups])
         self.offsets = np.array([one.centre.middle for one in self.members])
         self.slopes = centre.output_slopes if self.controlled else np.zeros_like(centre.output_slopes)
         self.variances = np.einsum("mi,ij,mj->m", self.slopes, inputs.correlation, self.slopes)
-        self.taken: dict[int, Taken] = {}
-        self.pilot: Evaluations | None = None
 
-    def blocks(self) -> list[Block]:
-        """What was taken of each group."""
-        return [Block(self.groups[max(g, 0)], self.taken[g], pilot=g == PILOT) for g in sorted(self.taken)]
-
-    def begin(self, count: int, *, counts: bool, tangents: bool) -> None:
-        """Take the pilot, which counts in estimates or does not, with derivatives of the study's model or without."""
-        self.take(0 if counts else PILOT, count, tangents=tangents, keep=True)
-
-    def take(self, g: int, count: int, *, tangents: bool = False, keep: bool = False) -> None:
-        """Take further samples of a group, or of all models for a pilot that does not count."""
-        d, K, m = len(self.inputs.names), len(self.members), len(self.evaluate.outputs)
-        before = self.taken.setdefault(g, Taken(np.empty((0, d)), np.empty((0, K, m))))
-        found = self.drawn(g, len(before.points), count, tangents=tangents, keep=keep)
-        self.taken[g] = before.extended(found)
-
-    def drawn(self, g: int, start: int, count: int, *, tangents: bool = False, keep: bool = False) -> Taken:
-        """Draw points of a group's stream and solve its models there; others have NaN."""
-        d, K, m = len(self.inputs.names), len(self.members), len(self.evaluate.outputs)
-        stream = g if g >= 0 else len(self.groups)
-        points = self.inputs.points(random_points((self.seed, stream), start, start + count, d))
-        found = Taken(points, np.full((count, K, m), np.nan))
-        for k in self.groups[max(g, 0)] if count else ():
-            found.values[:, k] = self.solved(k, points, found.reasons, tangents=tangents and k == 0, keep=keep)
-        return found
-
-    def solved(
-        self, k: int, points: FloatArray, reasons: set[str], *, tangents: bool = False, keep: bool = False
-    ) -> FloatArray:
-        """Solve a model at points, and pay for it; NaN where it has no answer, with the reasons added to others."""
-        found = self.members[k].solve(points, tangents=tangents)
-        reasons.update(f"{self.members[k].label}: {failure.reason}" for failure in found.failures)
-        if keep and k == 0:
-            self.pilot = found
+    def solved(self, k: int, points: FloatArray, reasons: set[str], *, tangents: bool = False) -> FloatArray:
+        """Solve a model at points, as every team does, and pay for it."""
         self.spent += len(points) * self.members[k].cost
-        return np.asarray(np.where(found.ok[:, None], found.outputs, np.nan))
+        return super().solved(k, points, reasons, tangents=tangents)
 
     def counts(self) -> FloatArray:
         """Numbers of samples (G,) of the groups that count."""
@@ -207,9 +232,3 @@ class Team:
             reasons = "; ".join(sorted(taken.reasons)[:3])
             raise SolveError(f"{found.answered.sum()} of {found.count} samples have an answer, expected 2: {reasons}")
         return found
-
-
-def _known(one: CheapModel, cost: float | None) -> float:
-    if cost is None:
-        raise ValueError(f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`")
-    return cost

@@ -27,7 +27,7 @@ from uq.estimators.moments import (
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
 from uq.estimators.tails import influences, with_tails
 from uq.methods.chaos import objection
-from uq.methods.fidelity_team import PILOT, Block, Team
+from uq.methods.fidelity_team import PILOT, Block, Fidelities
 from uq.surrogates.field_regression import Deviations, deviations
 from uq.surrogates.gate import agree, wrong
 from uq.surrogates.outside_samples import beyond
@@ -42,7 +42,7 @@ UNLIMITED = 1e9
 class OfSamples:
     """A way by samples of a team, of which a pilot tells something (`pilot`)."""
 
-    def __init__(self, team: Team, pilot: Found) -> None:
+    def __init__(self, team: Fidelities, pilot: Found) -> None:
         self._team, self.pilot = team, pilot
 
     def blocks(self) -> list[Block]:
@@ -65,7 +65,7 @@ class ByModels(OfSamples):
         What all samples so far tell.
     """
 
-    def __init__(self, team: Team) -> None:
+    def __init__(self, team: Fidelities) -> None:
         self._team = team
         self.found = self._estimated()
         super().__init__(team, self.found)
@@ -168,7 +168,7 @@ class ByExpansion(OfSamples):
         What it leaves (m,), by the whole fit repeated without each part of its samples.
     """
 
-    def __init__(self, team: Team, told: Found, fitted: Deviations, scale: Estimates) -> None:
+    def __init__(self, team: Fidelities, told: Found, fitted: Deviations, scale: Estimates) -> None:
         super().__init__(team, told)
         self._fitted, self._scale = fitted, scale
         self._control: Control = expansion(fitted)
@@ -177,9 +177,9 @@ class ByExpansion(OfSamples):
         self.estimates, self._moved = scale, np.zeros((0, 0))
 
     @classmethod
-    def of(cls, team: Team, told: Found) -> ByExpansion | None:
+    def of(cls, team: Fidelities, told: Found) -> ByExpansion | None:
         """Fit to values, and gradients where there are some, at the pilot; None if that is impossible."""
-        pilot, centre = team.pilot, team.members[0].centre
+        pilot, centre = team.members[0].first, team.members[0].centre
         if pilot is None or objection(team.inputs, "multifidelity") is not None:
             return None
         ok = pilot.ok
@@ -301,7 +301,7 @@ def sizes(estimates: Estimates) -> FloatArray:
     return np.where(found > 0, found, 1.0)
 
 
-def own_values(team: Team) -> FloatArray:
+def own_values(team: Fidelities) -> FloatArray:
     """Outputs (n, m) of the study's model in samples in which it has an answer."""
     values = np.concatenate([one.taken.values[:, 0] for one in team.blocks() if 0 in one.group])
     return np.asarray(values[np.isfinite(values).all(axis=1)])

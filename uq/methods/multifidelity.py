@@ -28,7 +28,7 @@ from uq.evaluation.request import OWN, Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.fidelity_choice import ByChoice
-from uq.methods.fidelity_team import OWN_LABEL, PILOT, Team
+from uq.methods.fidelity_team import OWN_LABEL, PILOT, Fidelities
 from uq.methods.fidelity_ways import ByExpansion, ByModels
 from uq.methods.low_fidelity import CHEAP, CheapModel
 from uq.methods.method import MESH, Amount
@@ -189,8 +189,9 @@ class Multifidelity(Amount):
             If a cheap model without unknowns has no `cost`.
         """
         recorder = Recorder(evaluate)
-        team = Team(self.cheap, inputs, recorder, self.seed, controlled=self.control != "none")
-        team.begin(self.first, counts=self.reuse, tangents=self.control == "auto" and evaluate.differentiable)
+        team = Fidelities(self.cheap, inputs, recorder, self.seed, controlled=self.control != "none")
+        tangents = self.control == "auto" and evaluate.differentiable
+        team.take(0 if self.reuse else PILOT, self.first, tangents=tangents)
         models = ByModels(team)
         told = list(useless(team, models.pilot))
         expansion = ByExpansion.of(team, models.pilot) if self.control == "auto" else None
@@ -226,7 +227,7 @@ class Multifidelity(Amount):
         dataset.attrs["stopped"] = stopped
         return dataset
 
-    def _full_solves(self, team: Team, models: ByModels, cost: float) -> ByModels | ByChoice:
+    def _full_solves(self, team: Fidelities, models: ByModels, cost: float) -> ByModels | ByChoice:
         """Return how the study's model is asked: at even samples, or where two cheap models differ."""
         if len(self.cheap) == 1 or self.full_solves == "evenly":
             return models
@@ -234,13 +235,13 @@ class Multifidelity(Amount):
         better = self.full_solves == "differences" or choice.expected(cost) <= UNSEEN * models.expected(cost)
         return choice if better else models
 
-    def _left(self, team: Team) -> float:
+    def _left(self, team: Fidelities) -> float:
         """What may still be spent, in solves of the study's model."""
         return min(self.limit - team.spent, self.affordable(team.spent, team.evaluate.seconds))
 
 
 def described(
-    team: Team, way: ByModels | ByExpansion | ByChoice, models: ByModels, expanded: ByExpansion | None
+    team: Fidelities, way: ByModels | ByExpansion | ByChoice, models: ByModels, expanded: ByExpansion | None
 ) -> xr.Dataset:
     """Return estimates, what was spent on what, and what other methods are predicted to need, as labelled arrays."""
     by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
@@ -304,7 +305,7 @@ def described(
     return dataset
 
 
-def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bool_]) -> Iterator[Finding]:
+def rarely_failing(team: Fidelities, asked: NDArray[np.bool_], answered: NDArray[np.bool_]) -> Iterator[Finding]:
     """Find cheap models that fail at few of the samples of the study's model, which tell what is missed there.
 
     Parameters
@@ -322,7 +323,7 @@ def rarely_failing(team: Team, asked: NDArray[np.bool_], answered: NDArray[np.bo
             yield Finding("cheap-model-fails", "warning", {"model": one.label, "lost": lost, "asked": of, "few": few})
 
 
-def plain_correlations(team: Team) -> FloatArray:
+def plain_correlations(team: Fidelities) -> FloatArray:
     """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
     samples = team.samples(PILOT if PILOT in team.taken else 0)
     deviations = samples.deviations[samples.answered]
@@ -353,7 +354,7 @@ def preferred(by_models: float, by_expansion: float) -> Finding:
     return Finding("expansion-instead", "note", {"times": times})
 
 
-def useless(team: Team, found: Found) -> Iterator[Finding]:
+def useless(team: Fidelities, found: Found) -> Iterator[Finding]:
     """Find cheap models that do not follow the model of the study."""
     squares = correlations(found.covariance) ** 2
     for k, one in enumerate(team.members[1:], 1):

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ModelError
+from uq.estimators.blue import NEGLIGIBLE, Problem, alone
 from uq.estimators.doubts import of_differences, of_tails
 from uq.estimators.estimate import part
 from uq.estimators.moments import ratio
@@ -22,7 +23,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import Amount
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
-from uq.methods.multilevel_meshes import RATES, Found, Mesh, Pilot, influences, name_of, rate
+from uq.methods.multilevel_meshes import RATES, Found, Meshes, name_of, rate
 from uq.surrogates.linearisation import local_dataset
 
 if TYPE_CHECKING:
@@ -126,35 +127,35 @@ class MultilevelMonteCarlo(Amount):
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ModelError(message)
         recorder = Recorder(evaluate)
-        pilot = Pilot(self.pilot, self.seed, self.control != "none")
-        meshes = [Mesh(pilot, inputs, recorder, None)]
-        while len(meshes) < min(self.levels, FIRST_MESHES):
-            if len(meshes) > 1 and not meshes[-1].affords_finer(self._left(recorder)):
+        controlled = self.control != "none"
+        meshes = Meshes(inputs, recorder, self.seed, self.levels, self.pilot, controlled=controlled)
+        while (count := len(meshes.members)) < min(self.levels, FIRST_MESHES):
+            if count > 1 and not meshes.affords_finer(self._left(recorder)):
                 break
-            meshes.append(Mesh(pilot, inputs, recorder, meshes[-1]))
+            meshes.refine()
         while True:
-            found = Found.of(inputs, meshes)
+            found = Found.of(meshes)
             reached = float(found.relative(found.total_error).max())
             left = self._left(recorder)
             allocation = _allocate(self, meshes, found, left)
             if self.met(reached):
                 break
             if self._wants_finer(meshes, found, allocation, left):
-                meshes.append(Mesh(pilot, inputs, recorder, meshes[-1]))
+                meshes.refine()
             elif allocation.settled:
                 break
             else:
-                for mesh, n in zip(meshes, allocation.now, strict=True):
-                    mesh.extend(int(n))
-        return self._dataset(inputs, recorder, meshes, found, self._why(meshes, found, reached, allocation))
+                for level, n in enumerate(allocation.now):
+                    meshes.extend(level, int(n))
+        return self._dataset(recorder, meshes, found, self._why(meshes, found, reached, allocation))
 
     def _left(self, recorder: Recorder) -> float:
         """What is left of the budget (s)."""
         return np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
 
-    def _wants_finer(self, meshes: list[Mesh], found: Found, allocation: _Allocation, left: float) -> bool:
+    def _wants_finer(self, meshes: Meshes, found: Found, allocation: _Allocation, left: float) -> bool:
         """Whether a finer mesh is the next step."""
-        if len(meshes) == self.levels or not meshes[-1].affords_finer(left):
+        if len(meshes.members) == self.levels or not meshes.affords_finer(left):
             return False
         error = float(found.relative(found.bias_error).max())
         if self.tolerance is not None:
@@ -162,28 +163,28 @@ class MultilevelMonteCarlo(Amount):
             return allocation.settled and 2 * error**2 > self.tolerance**2
         return error > allocation.sampling_error
 
-    def _why(self, meshes: list[Mesh], found: Found, reached: float, allocation: _Allocation) -> str:
-        counts = " + ".join(str(len(mesh.points)) for mesh in meshes)
+    def _why(self, meshes: Meshes, found: Found, reached: float, allocation: _Allocation) -> str:
+        blocks = meshes.blocks()
+        counts = " + ".join(str(len(one.taken.points)) for one in blocks)
         mesh, sampling = (float(found.relative(e).max()) for e in (found.bias_error, found.estimates.mean_error))
         error = f"relative total error {reached:.3g} (mesh {mesh:.2g}, sampling {sampling:.2g})"
-        amount = f"{counts} samples on {len(meshes)} meshes"
-        if self.tolerance is not None and mesh > self.tolerance and len(meshes) == self.levels:
+        amount = f"{counts} samples on {len(blocks)} meshes"
+        if self.tolerance is not None and mesh > self.tolerance and len(blocks) == self.levels:
             amount += f" (levels = {self.levels} allows no finer one)"
         return self.why_stopped(reached, error, 1 - int(allocation.cut), 1, amount)
 
-    def _dataset(
-        self, inputs: Inputs, evaluate: Evaluate, meshes: list[Mesh], found: Found, stopped: str
-    ) -> xr.Dataset:
+    def _dataset(self, evaluate: Evaluate, meshes: Meshes, found: Found, stopped: str) -> xr.Dataset:
         by_output, by_level, both = ("output",), ("level",), ("level", "output")
-        finest = len(meshes) - 1
-        dataset = local_dataset(inputs, evaluate.on(name_of(finest)), meshes[-1].centre, fields=False)
-        single, telescoped = [mesh.single for mesh in meshes], found.by_mesh
-        differences = [mesh.term for mesh in meshes]
-        plain, kurtosis = np.array([mesh.plain_variance for mesh in meshes]), np.array([m.kurtosis for m in meshes])
-        remaining = np.array([t.variance for t in differences])
-        seconds = np.array([mesh.seconds_per_solve for mesh in meshes])
+        levels, members, blocks = found.levels, meshes.members, meshes.blocks()
+        dataset = local_dataset(meshes.inputs, members[-1].evaluate, members[-1].centre, fields=False)
+        single, telescoped = [one.single for one in levels], found.by_mesh
+        counts, values = [len(one.ok) for one in blocks], [one.taken.values for one in blocks]
+        plain, kurtosis = np.array([one.variance for one in levels]), np.array([one.kurtosis for one in levels])
+        remaining = np.array([one.term.variance for one in levels])
+        seconds = np.array([one.cost for one in members])
         consistency, shares = found.consistency, ratio(plain[1:], np.array([s.std**2 for s in single[1:]]))
-        dataset = dataset.assign_coords(level=np.arange(len(meshes))).assign(
+        coarse = [np.zeros_like(values[0][:, 0]), *(one[:, k] for k, one in enumerate(values[1:]))]
+        dataset = dataset.assign_coords(level=np.arange(len(levels))).assign(
             {
                 **found.estimates.variables(),
                 "bias_error": (by_output, found.bias_error),
@@ -195,33 +196,33 @@ class MultilevelMonteCarlo(Amount):
                 "weak_rate": (by_output, rate(found.differences)),
                 "strong_rate": (by_output, rate(plain[1:])),
                 "cost_rate": ((), float(-rate(seconds[:, None])[0])),
-                "mesh_unknowns": (by_level, np.array([mesh.unknowns for mesh in meshes])),
-                "mesh_samples": (by_level, np.array([len(mesh.points) for mesh in meshes])),
-                "mesh_failed": (by_level, np.array([int((~mesh.ok).sum()) for mesh in meshes])),
+                "mesh_unknowns": (by_level, np.array(meshes.unknowns)),
+                "mesh_samples": (by_level, np.array(counts)),
+                "mesh_failed": (by_level, np.array([int((~one.ok).sum()) for one in blocks])),
                 "mesh_cost": (by_level, seconds),
-                "mesh_nominal": (both, np.array([mesh.centre.outputs for mesh in meshes])),
+                "mesh_nominal": (both, np.array([one.centre.outputs for one in members])),
                 "mesh_mean": (both, np.array([e.mean for e in telescoped])),
                 "mesh_std": (both, np.array([e.std for e in telescoped])),
                 "mesh_variance": (both, np.array([s.std**2 for s in single])),
                 "mesh_variance_ratio": (both, np.array([s.variance_ratio for s in single])),
-                "difference_mean": (both, np.array([m.offset + m.term.first for m in meshes])),
-                "difference_mean_error": (both, np.sqrt(remaining / np.array([[t.n] for t in differences]))),
+                "difference_mean": (both, np.array([one.offset + one.term.first for one in levels])),
+                "difference_mean_error": (both, np.sqrt(remaining / np.array([[one.term.n] for one in levels]))),
                 "difference_variance": (both, plain),
                 "difference_variance_ratio": (both, ratio(plain, remaining, empty=1.0)),
                 "difference_kurtosis": (both, kurtosis),
                 "consistency": (both, np.vstack([np.full_like(kurtosis[:1], np.nan), consistency])),
-                "points": (("sample", "parameter"), np.concatenate([mesh.points for mesh in meshes])),
-                "sample_level": (("sample",), np.repeat(np.arange(len(meshes)), [len(m.points) for m in meshes])),
-                "fine": (("sample", "output"), np.concatenate([mesh.fine for mesh in meshes])),
-                "coarse": (("sample", "output"), np.concatenate([mesh.coarse for mesh in meshes])),
-                "ok": (("sample",), np.concatenate([mesh.ok for mesh in meshes])),
+                "points": (("sample", "parameter"), np.concatenate([one.taken.points for one in blocks])),
+                "sample_level": (("sample",), np.repeat(np.arange(len(levels)), counts)),
+                "fine": (("sample", "output"), np.concatenate([one[:, k] for k, one in enumerate(values)])),
+                "coarse": (("sample", "output"), np.concatenate(coarse)),
+                "ok": (("sample",), np.concatenate([one.ok for one in blocks])),
             }
         )
         dataset.attrs["stopped"] = stopped
-        moved, claimed = influences(meshes), found.estimates.relative_std_error
-        add(dataset, *of_tails(evaluate.outputs, meshes[0].values, claimed, moved[0]))
-        add(dataset, *of_differences(evaluate.outputs, moved, found.estimates.std, claimed))
-        notes = list(_notes(evaluate.outputs, consistency, kurtosis, shares, len(meshes)))
+        claimed = found.estimates.relative_std_error
+        add(dataset, *of_tails(evaluate.outputs, levels[0].values, claimed, found.moved[0]))
+        add(dataset, *of_differences(evaluate.outputs, found.moved, found.estimates.std, claimed))
+        notes = list(_notes(evaluate.outputs, consistency, kurtosis, shares, len(levels)))
         failed, count = int((~dataset["ok"]).sum()), dataset.sizes["sample"]
         if failed:
             follow = "" if self.control == "none" else ", or taken to follow the tangent,"
@@ -286,34 +287,31 @@ class _Allocation:
     sampling_error: float
 
 
-def optimal(variances: FloatArray, costs: FloatArray, target: float) -> FloatArray:
-    """Numbers of samples √(V_l/C_l) Σ√(V C)/target by which Σ V_l/n_l is `target` at the least cost Σ n_l C_l."""
-    return np.asarray(np.sqrt(variances / costs) * np.sqrt(variances * costs).sum() / target)
-
-
-def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[Mesh], found: Found, left: float) -> _Allocation:
+def _allocate(method: MultilevelMonteCarlo, meshes: Meshes, found: Found, left: float) -> _Allocation:
     """Choose numbers of samples: the least of what tolerance, samples and budget allow."""
-    counts = np.array([len(mesh.points) for mesh in meshes], dtype=float)
-    costs = np.array([mesh.cost for mesh in meshes])
+    counts = np.array([float(len(one.ok)) for one in meshes.blocks()])
     limit = float(method.samples or UNLIMITED)
-    # One variance for all outputs, relative to the square of what the tolerance is relative to.
-    by_output = found.relative(found.relative(np.array([mesh.term.variance for mesh in meshes])))
-    variances = np.maximum(by_output.max(axis=1), 1e-30)
-    if len(meshes) >= FIRST_MESHES:
+    # Relative to the square of what the tolerance is relative to.
+    variances = found.relative(found.relative(np.array([one.term.variance for one in found.levels])))
+    variances = np.maximum(variances, 1e-30)
+    if len(counts) >= FIRST_MESHES:
         # A few samples may agree by chance: no finer mesh is assumed to vary much less than expected.
-        decay = 2.0 ** -max(float(rate(variances[1:, None])[0]), RATES[0])
-        for level in range(2, len(meshes)):
-            variances[level] = max(variances[level], 0.5 * decay * variances[level - 1])
-    shape = optimal(variances, costs, 1.0)
+        decay = 2.0 ** -np.maximum(rate(variances[1:]), RATES[0])
+        for level in range(2, len(counts)):
+            variances[level] = np.maximum(variances[level], 0.5 * decay * variances[level - 1])
+    problem = Problem(alone(variances.T), meshes.costs, np.zeros_like(counts), np.ones_like(counts))
+    # Numbers of samples for a unit of cost; every mesh needs some.
+    shape = np.maximum(problem.best(1.0), NEGLIGIBLE / meshes.costs)
 
-    def numbers(multiple: float) -> FloatArray:
-        return np.asarray(np.maximum(counts, np.minimum(np.ceil(multiple * shape * (1 - 1e-9)), limit)))
+    def numbers(cost: float) -> FloatArray:
+        return np.asarray(np.maximum(counts, np.minimum(np.ceil(cost * shape * (1 - 1e-9)), limit)))
 
     wanted = limit / shape[0]
     if method.tolerance is not None:
-        wanted = min(wanted, 1 / _target(method, meshes, found, variances, costs))
-    # What the budget allows: cost grows with the multiple, so bisection finds the largest.
-    paid = np.array([mesh.measured_cost for mesh in meshes])
+        unit = float(problem.variances(shape).max())
+        wanted = min(wanted, unit / _target(method, meshes, found, unit))
+    # What the budget allows: the largest cost, by bisection.
+    paid = meshes.measured
     low, high = 0.0, wanted
     cut = (numbers(wanted) - counts) @ paid > left
     if cut:
@@ -322,14 +320,12 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[Mesh], found: Found
             low, high = (middle, high) if (numbers(middle) - counts) @ paid <= left else (low, middle)
     final = numbers(low if cut else high)
     now = np.minimum(final, np.ceil(MOST_GROWTH * counts))
-    sampling = float(np.sqrt((variances / final).sum()))
+    sampling = float(np.sqrt(problem.variances(final).max()))
     return _Allocation(now, bool((now <= counts).all()), bool(cut), sampling)
 
 
-def _target(
-    method: MultilevelMonteCarlo, meshes: Sequence[Mesh], found: Found, variances: FloatArray, costs: FloatArray
-) -> float:
-    """Square of the relative error allowed for sampling."""
+def _target(method: MultilevelMonteCarlo, meshes: Meshes, found: Found, unit: float) -> float:
+    """Square of the relative error allowed for sampling, whose square is `unit` for a unit of cost."""
     assert method.tolerance is not None
     allowed = method.tolerance**2
     # A little more than its estimate, so that the total is met when sampling meets its share.
@@ -337,8 +333,7 @@ def _target(
     if remaining >= allowed / 2:
         return remaining
     # Less than half is left: sample for it if that is cheaper than another mesh.
-    work = np.sqrt(variances * costs).sum() ** 2
-    last = len(meshes) == method.levels
-    if remaining > 0 and (last or work / remaining < work / allowed + meshes[-1].cost_of_finer):
+    last = len(meshes.members) == method.levels
+    if remaining > 0 and (last or unit / remaining < unit / allowed + meshes.cost_of_finer):
         return remaining
     return allowed / 2

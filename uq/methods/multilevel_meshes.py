@@ -13,8 +13,8 @@ where the controls, in brackets, have expectation zero. `moments.combine` adds t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -22,11 +22,12 @@ import numpy as np
 from forward.model import FloatArray, SolveError
 from uq.estimators.moments import Estimates, Moments, Term, combine, controlled, estimate, monomials, ratio, term
 from uq.estimators.tails import with_tails
-from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
+from uq.evaluation.evaluate import Recorder
+from uq.evaluation.request import OWN
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import random_points
+from uq.methods.fidelity_team import Block, Member, Team
 from uq.methods.method import MESH, TEXTBOOK, seconds_per_solve
-from uq.surrogates.linearisation import Linearisation, linearise
+from uq.surrogates.linearisation import linearise
 
 SIZE = 10_000  # unknowns assumed on the coarsest mesh for a model without a state
 ASSUMED_RATE = 1.0  # of convergence per mesh, if there is only one difference
@@ -38,161 +39,137 @@ def name_of(level: int) -> str:
     return f"{MESH}{level}" if level else OWN
 
 
-@dataclass(frozen=True)
-class Pilot:
-    """What every mesh begins with: so many samples of a seed; and whether tangents control the differences."""
-
-    samples: int
-    seed: int
-    controlled: bool
-
-
-class Mesh:
-    """A mesh with its linearisation and the samples on it and on the next coarser one.
+class Meshes(Team):
+    """The meshes, the coarsest first: group l are mesh l and the next coarser one.
 
     Attributes
     ----------
-    centre
-        Linearisation at the mean parameters.
-    points, fine, coarse, ok
-        Parameters (n, d), outputs (n, m) on this mesh and on the coarser one (zero where there is none), and which
-        samples have both.
+    unknowns
+        Number of unknowns of each.
     """
 
-    def __init__(self, pilot: Pilot, inputs: Inputs, evaluate: Evaluate, coarser: Mesh | None) -> None:
-        self._pilot, self._inputs, self._coarser = pilot, inputs, coarser
-        self.level: int = 0 if coarser is None else coarser.level + 1
-        self._evaluate = evaluate.on(name_of(self.level))
-        self.centre: Linearisation = linearise(inputs, self._evaluate)
-        self.unknowns = self._evaluate.displacements or SIZE * 8**self.level
-        self._solves, self._seconds = 0, 0.0
-        d, m = len(inputs.names), len(self.centre.outputs)
-        self.points = np.empty((0, d))
-        self.fine, self.coarse = np.empty((0, m)), np.empty((0, m))
-        self.ok = np.empty(0, dtype=bool)
-        self._reasons: set[str] = set()
-        self.extend(pilot.samples)
+    def __init__(
+        self, inputs: Inputs, evaluate: Recorder, seed: int, most: int, pilot: int, *, controlled: bool
+    ) -> None:
+        super().__init__(inputs, evaluate, seed, most)
+        self._pilot, self._controlled = pilot, controlled
+        self.unknowns: list[int] = []
+        self.refine()
 
-    def extend(self, count: int) -> None:
-        """Go on to `count` samples."""
-        before = len(self.points)
-        if count <= before:
-            return
-        cube = random_points((self._pilot.seed, self.level), before, count, len(self._inputs.names))
-        points = self._inputs.points(cube)
-        here = self._solve(points)
-        fine, ok, coarse = here.outputs, here.ok, np.zeros_like(here.outputs)
-        if self._coarser is not None:
-            there = self._coarser._solve(points)
-            coarse, ok = there.outputs, ok & there.ok
-            self._reasons |= {failure.reason for failure in there.failures}
-        self._reasons |= {failure.reason for failure in here.failures}
-        self.points = np.concatenate([self.points, points])
-        self.fine, self.coarse = np.concatenate([self.fine, fine]), np.concatenate([self.coarse, coarse])
-        self.ok = np.concatenate([self.ok, ok])
-        if self.ok.sum() < 2:
-            reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"level {self.level}: {self.ok.sum()} of {count} samples have an answer, expected 2: {reasons}"
-            raise SolveError(message)
+    def refine(self) -> None:
+        """Add a mesh, with its linearisation and a pilot; costs are predicted times (s), which depend on no machine."""
+        level = len(self.members)
+        evaluate = self.evaluate.on(name_of(level))
+        self.unknowns.append(evaluate.displacements or SIZE * 8**level)
+        cost = seconds_per_solve(self.unknowns[-1])
+        self.members.append(Member("", evaluate, cost, linearise(self.inputs, evaluate)))
+        self.groups.append((level, level - 1) if level else (0,))
+        self.extend(level, self._pilot)
 
-    def _solve(self, points: FloatArray) -> Evaluations:
-        found = self._evaluate(Request(points, start=self.centre.prediction))
-        self._solves += len(points)
-        self._seconds += float(found.seconds.sum())
-        return found
+    def extend(self, level: int, count: int) -> None:
+        """Go on to `count` samples of a mesh."""
+        before = len(self.taken[level].points) if level in self.taken else 0
+        if count > before:
+            self.take(level, count - before)
+        one = self.blocks()[level]
+        if one.ok.sum() < 2:
+            reasons = "; ".join(sorted(one.taken.reasons)[:3])
+            raise SolveError(f"level {level}: {one.ok.sum()} of {count} samples have an answer, expected 2: {reasons}")
 
     @property
-    def seconds_per_solve(self) -> float:
-        """Predicted time (s) of one solve: measured times would make results depend on the machine."""
-        return seconds_per_solve(self.unknowns)
+    def costs(self) -> FloatArray:
+        """Predicted time (s) of one sample of each mesh (L,), on both meshes."""
+        return np.array([sum(self.members[k].cost for k in group) for group in self.groups])
 
     @property
-    def cost(self) -> float:
-        """Predicted time (s) of one sample, on both meshes."""
-        return self.seconds_per_solve + (0 if self._coarser is None else self._coarser.seconds_per_solve)
-
-    @property
-    def measured_cost(self) -> float:
-        """Time (s) that one sample took on both meshes, which counts against a budget."""
-        here = self._seconds / self._solves
-        return here if self._coarser is None else here + self._coarser._seconds / self._coarser._solves
+    def measured(self) -> FloatArray:
+        """Time (s) that one sample of each mesh took (L,), which counts against a budget."""
+        return np.array([sum(self.members[k].seconds / self.members[k].solves for k in g) for g in self.groups])
 
     @property
     def cost_of_finer(self) -> float:
         """Predicted time (s) of linearisation and pilot on the next finer mesh."""
-        finer = seconds_per_solve(8 * self.unknowns)
-        return TEXTBOOK * finer + self._pilot.samples * (finer + self.seconds_per_solve)
+        finer = seconds_per_solve(8 * self.unknowns[-1])
+        return TEXTBOOK * finer + self._pilot * (finer + self.members[-1].cost)
 
     def affords_finer(self, left: float) -> bool:
         """Whether the next finer mesh takes at most half of the remaining budget (s), judging by the solves so far."""
-        return self.cost_of_finer * self.measured_cost / self.cost <= left / 2
+        return bool(self.cost_of_finer * self.measured[-1] / self.costs[-1] <= left / 2)
 
-    @property
-    def nominal(self) -> FloatArray:
-        """Difference (m,) of the outputs at the mean parameters."""
-        return self.centre.outputs - (0 if self._coarser is None else self._coarser.centre.outputs)
+    def levels(self) -> tuple[Level, ...]:
+        """Return what the samples of each mesh tell."""
+        return tuple(map(self._level, self.blocks()))
 
-    @property
-    def offset(self) -> FloatArray:
-        """Difference (m,) of the values from which deviations are taken."""
-        return self.centre.middle - (0 if self._coarser is None else self._coarser.centre.middle)
+    def _level(self, of: Block) -> Level:
+        points, values = of.taken.points[of.ok], of.taken.values[of.ok]
+        centres = [self.members[k].centre for k in of.group]
+        parts, sums = [], []
+        for k, centre in zip(of.group, centres, strict=True):
+            slopes, w = centre.output_slopes, values[:, k] - centre.middle
+            V = np.einsum("mi,ij,mj->m", slopes, self.inputs.correlation, slopes)
+            T = centre.coordinates.of(points) @ slopes.T
+            parts.append(np.array([w, w**2, T, T**2 - V]))
+            sums.append((monomials(w, T if self._controlled else None).sum(axis=1), V if self._controlled else None))
+        first, second, *controls = parts[0] - sum(parts[1:])
+        nominal, offset = (one[0] - sum(one[1:]) for one in zip(*((c.outputs, c.middle) for c in centres), strict=True))
+        single = estimate(sums[0][0], len(points), centres[0].middle, sums[0][1])
+        return Level(
+            values[:, of.group[0]],
+            single,
+            nominal,
+            offset,
+            first,
+            second,
+            (controls[0], controls[1]) if self._controlled else None,
+        )
 
-    def deviations(self, outputs: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return w and T (n, m) of outputs on this mesh, and E[T²] (m,)."""
-        slopes = self.centre.output_slopes
-        variance = np.einsum("mi,ij,mj->m", slopes, self._inputs.correlation, slopes)
-        return outputs - self.centre.middle, self.centre.coordinates.of(points) @ slopes.T, variance
 
-    def influences(self, mean: FloatArray) -> FloatArray:
+@dataclass(frozen=True)
+class Level:
+    """What the samples of a mesh and of the next coarser one tell.
+
+    Attributes
+    ----------
+    values
+        Outputs (n, m) on this mesh of the samples with an answer on both.
+    single
+        Moments on this mesh alone.
+    nominal, offset
+        Differences (m,) of the outputs at the mean parameters, and of the values from which deviations are taken.
+    first, second, controls
+        Samples (n, m) of the difference of both moments, and their controls with expectation zero, if there are any.
+    """
+
+    values: FloatArray
+    single: Moments
+    nominal: FloatArray
+    offset: FloatArray
+    first: FloatArray
+    second: FloatArray
+    controls: tuple[FloatArray, FloatArray] | None
+
+    @cached_property
+    def term(self) -> Term:
+        """This mesh's term of the telescoping sums."""
+        return term(self.first, self.second, self.controls)
+
+    def moved(self, mean: FloatArray) -> FloatArray:
         """By how much each sample (n, m) moves the variance on the finest mesh, with the mean (m,) of w there."""
-        first, second, *controls = self._moments()
-        c, d = controls
-        first, second = controlled(first, second, (c, d) if self._pilot.controlled else None)
+        first, second = controlled(self.first, self.second, self.controls)
         moved = second - 2 * mean * first
         return np.asarray(moved - moved.mean(axis=0))
 
     @property
-    def values(self) -> FloatArray:
-        """Outputs (n, m) on this mesh of the samples with an answer on both."""
-        return np.asarray(self.fine[self.ok])
-
-    def _moments(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return w_l − w_{l−1}, the second moment's term, and their controls (n, m) with expectation zero."""
-        points = self.points[self.ok]
-        w, T, V = self.deviations(self.fine[self.ok], points)
-        if self._coarser is None:
-            return w, w**2, T, T**2 - V
-        w0, T0, V0 = self._coarser.deviations(self.coarse[self.ok], points)
-        return w - w0, w**2 - w0**2, T - T0, T**2 - T0**2 - (V - V0)
-
-    @property
-    def term(self) -> Term:
-        """This mesh's term of the telescoping sums."""
-        first, second, c, d = self._moments()
-        return term(first, second, (c, d) if self._pilot.controlled else None)
-
-    @property
-    def plain_variance(self) -> FloatArray:
+    def variance(self) -> FloatArray:
         """Variance (m,) of the difference without control."""
-        return np.asarray(self._moments()[0].var(axis=0, ddof=1))
+        return np.asarray(self.first.var(axis=0, ddof=1))
 
     @property
     def kurtosis(self) -> FloatArray:
         """Fourth central moment over the squared variance (m,) of the controlled difference."""
-        r, _, control, _ = self._moments()
-        if self._pilot.controlled:
-            r = r - control
+        r = self.first if self.controls is None else self.first - self.controls[0]
         r = r - r.mean(axis=0)
         return ratio((r**4).mean(axis=0), (r**2).mean(axis=0) ** 2, empty=3.0)
-
-    @property
-    def single(self) -> Moments:
-        """Moments on this mesh alone."""
-        w, T, V = self.deviations(self.fine[self.ok], self.points[self.ok])
-        n, offset = len(w), self.centre.middle
-        if not self._pilot.controlled:
-            return estimate(monomials(w, None).sum(axis=1), n, offset)
-        return estimate(monomials(w, T).sum(axis=1), n, offset, V)
 
 
 @dataclass(frozen=True)
@@ -201,8 +178,12 @@ class Found:
 
     Attributes
     ----------
+    levels
+        What each mesh tells.
     by_mesh
         The telescoped moments up to each mesh.
+    moved
+        By how much each sample (n, m) of every mesh moves the variance on the finest one.
     differences
         E[Y_l] (L, m), l = 1 … L.
     signs, std_signs
@@ -213,7 +194,9 @@ class Found:
         Of l = 1 … L (L, m).
     """
 
+    levels: tuple[Level, ...]
     by_mesh: tuple[Estimates, ...]
+    moved: tuple[FloatArray, ...]
     differences: FloatArray
     signs: FloatArray
     std_signs: FloatArray
@@ -222,19 +205,24 @@ class Found:
     consistency: FloatArray
 
     @classmethod
-    def of(cls, inputs: Inputs, meshes: Sequence[Mesh]) -> Found:
+    def of(cls, meshes: Meshes) -> Found:
         """Estimate from the samples on all meshes."""
-        terms = [mesh.term for mesh in meshes]
-        *coarser, finest = (combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
-        by_mesh = (*coarser, with_tails(finest, inputs, influences(meshes), meshes[0].values))
-        differences = np.array([mesh.offset + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
+        levels = meshes.levels()
+        terms, middles = [one.term for one in levels], [one.centre.middle for one in meshes.members]
+        *coarser, finest = (combine(middle, terms[: k + 1]) for k, middle in enumerate(middles))
+        mean = np.sum([one.first for one in terms], axis=0)
+        moved = tuple(one.moved(mean) for one in levels)
+        by_mesh = (*coarser, with_tails(finest, meshes.inputs, moved, levels[0].values))
+        differences = np.array([one.offset + one.term.first for one in levels])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
-        consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
+        consistency = np.array([_consistency(*pair) for pair in pairwise(levels)])
         # The differences at the mean parameters converge at the same rate, without sampling error.
-        nominal = np.array([mesh.nominal for mesh in meshes])[1:]
+        nominal = np.array([one.nominal for one in levels])[1:]
         alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
         return cls(
+            levels,
             by_mesh,
+            moved,
             differences,
             np.sign(differences[-1]),
             np.sign(std_differences[-1]),
@@ -259,20 +247,14 @@ class Found:
         return ratio(error, np.broadcast_to(scale, error.shape))
 
 
-def influences(meshes: Sequence[Mesh]) -> list[FloatArray]:
-    """By how much each sample (n, m) of every mesh moves the variance on the finest one."""
-    mean = np.sum([mesh.term.first for mesh in meshes], axis=0)
-    return [mesh.influences(mean) for mesh in meshes]
-
-
-def _consistency(coarser: Mesh, mesh: Mesh) -> FloatArray:
+def _consistency(coarser: Level, finer: Level) -> FloatArray:
     """Compare the mean of ψ_{l−1} as the coarser and as the finer of two meshes: |a − b + c| / 3(σ_a + σ_b + σ_c).
 
     a and b are the estimates of E[ψ_{l−1}] and E[ψ_l], each from the samples of its own level, and c that of E[Y_l],
     with standard errors σ: beyond 1 the sum does not telescope (M. B. Giles, Acta Numerica 24 (2015), section 3.3).
     """
-    a, b, c = coarser.single, mesh.single, mesh.term
-    c_mean, c_error = mesh.offset + c.first, np.sqrt(c.variance / c.n)
+    a, b, c = coarser.single, finer.single, finer.term
+    c_mean, c_error = finer.offset + c.first, np.sqrt(c.variance / c.n)
     gap = np.abs(a.mean - b.mean + c_mean)
     # Rounding is no inconsistency, where the control leaves nothing else.
     gap = np.where(gap < 1e-12 * np.abs(b.mean), 0.0, gap)

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from tests.launch import ROOT, assert_same_bits, in_process, run_script, tissuq_on_two_ranks
+from uq.estimators.blue import Problem, alone
 from uq.estimators.moments import combine, estimate, monomials, term
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluations, Request
@@ -19,7 +20,7 @@ from uq.findings import findings
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
-from uq.methods.multilevel import MultilevelMonteCarlo, optimal
+from uq.methods.multilevel import MultilevelMonteCarlo
 from uq.methods.multilevel_meshes import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
@@ -151,8 +152,11 @@ def test_a_rate_that_is_too_good_is_not_relied_on():
 
 def test_numbers_of_samples_are_the_best():
     variances, costs = np.array([1.0, 0.04, 1e-3]), np.array([1.0, 10.0, 90.0])
-    n = optimal(variances, costs, 1e-4)
-    assert (variances / n).sum() == pytest.approx(1e-4)
+    problem = Problem(alone(variances[None]), costs, np.zeros(3), np.ones(3))
+    n = problem.best(1.0)
+    n *= (variances / n).sum() / 1e-4
+    assert problem.variances(n) == pytest.approx(1e-4)
+    np.testing.assert_allclose(n, np.sqrt(variances / costs) * np.sqrt(variances * costs).sum() / 1e-4)
     for other in np.random.default_rng(0).uniform(0.8, 1.2, (50, 3)):
         m = n * other
         m *= (variances / m).sum() / 1e-4
