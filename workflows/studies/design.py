@@ -22,17 +22,15 @@ from inverse.designs.fields import of_field
 from inverse.methods.design import Design
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.kept import Kept, KeptModel
 from workflows.config.blocks import AS_DECIDED, AVERAGED, PartOrKind, decided
+from workflows.config.one_model import Sourced
 from workflows.config.priors import findings_of_materials, ranges
-from workflows.config.source import Sourced
 from workflows.config.tables import at
 from workflows.data.designs import files
 from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
-from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,7 +50,7 @@ PRODUCTS = 600  # with the derivative, for the directions of a field that many c
 SIDES = {f"{axis}-{side}": (k, end) for k, axis in enumerate(AXES) for side, end in (("min", 0), ("max", -1))}
 
 
-class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
+class DesignStudy(Sourced, OfCandidates, FromPython):
     """What could be observed, and how much of it.
 
     Parameters
@@ -168,14 +166,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
         makers = {one: partial(made, one) for one in others}
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
-
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns, of a candidate if there are some."""
-        return self.inputs.names if self.candidates is None else super().parameters_of(label)
-
-    def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of the model, or of that of a candidate."""
-        return StudyKind.units_of(self, label) if self.candidates is None else super().units_of(label)
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -303,6 +293,8 @@ def _of_field(
     method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Measurements
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
+    from uq.evaluation.kept import Kept, KeptModel
+
     prior = spec.fields[0].prior(spec.body)
     names = [f"draw {number}" for number in range(method.draws)]
     solving: list[Kept] = []  # of the draw at hand
@@ -323,24 +315,13 @@ def _of_field(
         found = of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
         return found if mesh is None else found.assign(mesh_error=("value", mesh))
 
-    def forget() -> None:
-        while solving:
-            solving.pop().forget()
-
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         found = [one.dataset for one in outcomes if one.dataset is not None]
         if not found:
             raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
         return method.of_fields(found, values)
 
-    return TasksJob(
-        names,
-        linearise,
-        lambda number, outcome: None,
-        forget,
-        results,
-        texts=lambda found: files(spec, found),
-    )
+    return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
 
 
 def uncalibrated(solution: Solution) -> FloatArray | None:

@@ -1,16 +1,15 @@
-"""The method `reduce`: what a reduced model is made of, how accurate it is to be, and how it is made."""
+"""The job of a reduction: snapshots, round by round, the reduced model that they make, and its errors."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from pydantic import Field
 
 from forward.findings import Finding
 from forward.model import SolveError
@@ -19,26 +18,21 @@ from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from forward.reduced.spec import without_answer
-from forward.registry import named
-from forward.scalars import Mistake
-from forward.settings import Settings
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
-from uq.methods.method import Method
 from uq.surrogates.linearisation import linearise
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
+from workflows.studies.reduction_blocks import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, Solution
-    from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
 
-FILE = "reduced.npz"
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
 ENOUGH = 120  # modes of states that the larger model has besides then
@@ -50,87 +44,6 @@ UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
 TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be taken for the errors
 LEFT = 0.5  # of the errors after correction, above which neither: errors and estimates of any sign may agree on average
-
-
-class Blocks(Settings):
-    """Blocks of a body with modes of their own, joined at their interfaces.
-
-    Parameters
-    ----------
-    cut
-        Numbers of blocks along the axes; or "regions", which are the blocks then.
-    full
-        Places in blocks that are kept in full, where a tool may press that no snapshot has seen.
-    """
-
-    cut: (
-        tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
-        | Literal["regions"]
-    )
-    full: tuple[tuple[float, float, float], ...] = ()
-
-
-class Reduce(Method):
-    """Make a reduced model of a body.
-
-    Parameters
-    ----------
-    case
-        Which load case of a specimen is reduced, with those parameters that act in it.
-    snapshots
-        Solves of which it is made. Half of them fill the distribution evenly; the others are, round by round, those of
-        many candidates at which the estimated error of any output is largest.
-    rounds
-        In how many rounds those are drawn.
-    modes
-        Number of modes; by default as many as `truncation` needs.
-    more
-        How many modes of states the nested larger model has besides, which tells errors and corrects gradients.
-    blocks
-        Into which blocks the body is cut, with modes of their own; by default modes are those of the whole body.
-    truncation
-        What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
-    cubature
-        What the points may miss of the forces of the snapshots, relative.
-    derivatives
-        Whether states are differentiated and adjoints solved for at the snapshots, which takes a factorisation each.
-        Estimates of errors need them; a control variate beside the body (`multifidelity`) does without.
-    unseen
-        Further solves, at random samples, on which its errors are measured.
-    seed
-        Of all points.
-    """
-
-    kind: Literal["reduce"] = "reduce"
-    case: str | None = None
-    snapshots: Annotated[int, Field(ge=4)] = 96
-    rounds: Annotated[int, Field(ge=0)] = 3
-    modes: Annotated[int, Field(ge=1)] | None = None
-    more: Annotated[int, Field(ge=1)] = 120
-    blocks: Blocks | None = None
-    truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
-    cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3
-    derivatives: bool = True
-    unseen: Annotated[int, Field(ge=0)] = 32
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    def planned(self, dimension: int) -> int:
-        """Snapshots, unseen samples, and the solve at the mean."""
-        return self.snapshots + self.unseen + 1
-
-    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Refuse: states are needed, which an evaluation does not return."""
-        raise ValueError("method.kind = 'reduce' is run by a study of its own")
-
-    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of a model cannot be reduced."""
-        if spec.kind != "hyperelastic":
-            yield ("model", "kind"), "only a body can be reduced, expected 'hyperelastic'", spec.kind
-            return
-        if self.case is not None:
-            yield ("method", "case"), "a body has no load cases, expected none", self.case
-        for said in named("forward.reduced.limits:mistakes")(spec):
-            yield ("model",), said, spec.kind
 
 
 @dataclass(frozen=True)
