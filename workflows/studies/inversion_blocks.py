@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
     from forward.reduced.spec import Reduced
     from forward.spec import ModelSpec
-    from inverse.data.measurements import Measurements
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted
@@ -158,18 +157,11 @@ class InversionBlocks(OneModel, StudyKind):
             return tuple(case.name for case in self.model.cases)
         return next((found.parts for found in self.measurements if found is not None), ())
 
-    def measured(self, number: int) -> Measurements:
-        """Return a data set that can be used."""
-        found: Measurements = self.measurements[number]
-        return found
-
     def not_estimable(self, number: int) -> tuple[str, ...]:
         """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
-        return (
-            ()
-            if self.specimen is not None
-            else never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
-        )
+        if self.specimen is not None:
+            return ()
+        return never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
 
     @property
     def together(self) -> bool:

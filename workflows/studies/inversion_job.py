@@ -130,7 +130,7 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
 
     def observed(number: int) -> _Observed:
-        data = study.measured(number)
+        data = study.measurements[number]
         try:
             own = observing(model, data)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
@@ -180,7 +180,7 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, say: 
         model, why = seen.there
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-    return Problem(study.measured(number), study.method, study.data.errors, finer, shared, say)
+    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, say)
 
 
 def _inverted(
@@ -288,7 +288,7 @@ def _by_expansion(
     study: InversionBlocks, found: SharedExpansion, number: int, say: Callable[[str], None]
 ) -> xr.Dataset:
     """Invert a data set with the expansion, whose errors are among those of the data."""
-    data = study.measured(number)
+    data = study.measurements[number]
     missed = found.error[data.axes]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
     problem = Problem(wider, study.method, study.data.errors, found.finer, say=say)

@@ -116,11 +116,11 @@ class _Making:
     ) -> None:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
         self._start = linearise(inputs, evaluate).prediction
-        self._sizes = Sizes(method.modes, method.truncation, method.cubature, method.more)
+        more = method.more
         if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
-            self._sizes = replace(self._sizes, more=max(self._sizes.more, OF_STATES * method.modes))
-        if method.blocks is not None:
-            self._sizes = replace(self._sizes, cut=method.blocks.cut, full=method.blocks.full)
+            more = max(more, OF_STATES * method.modes)
+        blocks: dict[str, Any] = {} if method.blocks is None else {"cut": method.blocks.cut, "full": method.blocks.full}
+        self._sizes = Sizes(method.modes, method.truncation, method.cubature, more, **blocks)
         self._lost: list[str] = []  # why snapshots have no answer
         self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
 
@@ -191,15 +191,14 @@ class _Making:
         found["mode_energy"] = ("mode", (data.coordinates[:, data.before :] ** 2).mean(axis=0))
         if not method.unseen:
             return found
-        first = UNSEEN
-        points = inputs.points(random_points((method.seed, 1), first, first + method.unseen, len(inputs.names)))
+        last = UNSEEN + method.unseen
+        points = inputs.points(random_points((method.seed, 1), UNSEEN, last, len(inputs.names)))
         full = self._evaluate(Request(points, tangents=True, fields=KeptStates(None), start=self._start))
         ok = full.ok
         states = iter(np.zeros((0, 1)) if full.sketches is None else full.sketches[:, 0])
         model = ReducedModel(data, data.parameters)
         n, m = method.unseen, len(names)
         errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
-        estimated_state = np.full(n, np.nan)
         gradients = np.full((3, n, m, len(inputs.names)), np.nan)  # of the body, and what is off before and after
         places = np.zeros((3, n, m))  # of largest values: of the body, and what the model says before and after
         answered = np.zeros(n, dtype=bool)
@@ -213,7 +212,6 @@ class _Making:
             if state is not None:
                 errors[i], estimates[i] = full.outputs[i] - solution.outputs, solution.estimate.outputs
                 of_state[i] = np.linalg.norm(state - solution.state) / np.linalg.norm(state)
-                estimated_state[i] = solution.estimate.state
                 assert full.tangents is not None
                 own = solution.adjoint(np.eye(m))
                 exact = full.tangents[i]

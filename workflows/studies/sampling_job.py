@@ -211,10 +211,10 @@ def _told(
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        from workflows.accuracy.tolerance import meshes_before
+        from workflows.accuracy.tolerance import history
 
-        before = meshes_before(directory)
-        earlier = sum(one["seconds"] for one in before)
+        before = history(directory)  # estimates on the last mesh are those of the study
+        earlier = 0 if before is None else sum(one["seconds"] for one in before["meshes"][:-1])
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}
 
