@@ -31,7 +31,7 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Prediction
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load
-from workflows.studies.design_job import values_of
+from workflows.studies.design import values_of
 
 CELLS, NOISE, SPECIMENS, DRAWS = 3, 0.02, 16, 32
 SAMPLES = 64

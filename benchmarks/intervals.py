@@ -124,7 +124,7 @@ def held(folder: Path, count: int, seed: int, samples: int = SAMPLES) -> tuple[n
         }
         one = parse(blocks | {"data": given})
         inverted = invert_few(
-            inputs, SerialEvaluate(measured), Problem(one.measured(0), one.method, finer=None)
+            inputs, SerialEvaluate(measured), Problem(one.measurements[0], one.method, finer=None)
         ).dataset
         record = predicted.of_few(one, inverted, solved, solved, lambda: before)
         found.append([record["prediction_lower"], record["prediction_upper"]])

@@ -38,7 +38,7 @@ from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
-from workflows.studies.findings_inversion import NEITHER
+from workflows.results.summary import NEITHER
 
 if TYPE_CHECKING:
     import xarray as xr

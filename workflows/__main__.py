@@ -197,7 +197,7 @@ def _run(options: argparse.Namespace) -> int:
 def _reduce(options: argparse.Namespace) -> int:
     from workflows.config.study import kind_of
     from workflows.studies.reduction import OTHER_METHOD
-    from workflows.studies.reduction_job import FILE
+    from workflows.studies.reduction_blocks import FILE
 
     if kind_of(options.study) != "reduce":  # a study that samples the body says over which parameters
         options.set = [OTHER_METHOD, *options.set]

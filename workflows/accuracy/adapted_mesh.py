@@ -44,11 +44,6 @@ def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable
     return study.of(study.model.on_mesh(str(path), contents))
 
 
-def kept(study: S) -> S:
-    """Return a study on such a mesh as its results have it, which may be moved."""
-    return study.of(study.model.on_mesh(MESH, study.solid.body.contents))
-
-
 def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
     """Write down the mesh, at last, and how it came about."""
     from forward.bodies.tetrahedra import packed
@@ -76,7 +71,7 @@ def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
 
 def history(study: SamplingBlocks) -> dict[str, Any] | None:
     """Return how the mesh of a study came about, which stands beside it; None where that is not known."""
-    return written(_path(study).with_name(HISTORY))
+    return written(Path(study.solid.body.file).with_name(HISTORY))
 
 
 def written(path: Path) -> dict[str, Any] | None:
@@ -87,10 +82,6 @@ def written(path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _path(study: SamplingBlocks) -> Path:
-    return Path(study.solid.body.file)
-
-
 def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     """Add to results the mesh, what each cell adds to its errors, and what the meshes before were; and say it."""
     from forward.bodies.tetrahedra import indicators_of
@@ -99,7 +90,7 @@ def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     if told is None:
         return dataset
     cycles = told["cycles"]
-    mesh, shares = study.solid.body.load(), indicators_of(_path(study))
+    mesh, shares = study.solid.body.load(), indicators_of(Path(study.solid.body.file))
 
     def of_outputs(name: str) -> tuple[tuple[str, str], Any]:
         return ("cycle", "output"), np.array([cycle[name] for cycle in cycles], dtype=float)

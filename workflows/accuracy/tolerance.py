@@ -145,12 +145,6 @@ def history(directory: Path) -> dict[str, Any] | None:
     return written(directory.resolve() / FILE)
 
 
-def meshes_before(directory: Path) -> list[dict[str, Any]]:
-    """Return the meshes that were looked at before the last one, the estimates on which are those of the study."""
-    found = history(directory)
-    return [] if found is None else list(found["meshes"][:-1])
-
-
 class Found:
     """The model at the mean of its parameters, and the error of its mesh at a few.
 

@@ -70,17 +70,14 @@ def lines(error: ValidationError, place: str = "", apart: Sequence[str] = ()) ->
 
     Kinds of studies whose files have other blocks, `apart`, may be meant where a kind of method is not known.
     """
-    items = error.errors(include_url=False)
+    items = [(item, *_around_member(item["loc"], place)) for item in error.errors(include_url=False)]
     members: dict[str, list[str]] = {}  # what would have been right, by where
-    deeper = set[str]()
-    for item in items:
-        where, member, rest = _around_member(item["loc"], place)
+    for _, where, member, _ in items:
         if member is not None:
             members.setdefault(where, []).append(member)
-            deeper |= {where} if rest else set()
+    deeper = {where for _, where, member, rest in items if member is not None and rest}
     found = []
-    for item in items:
-        where, member, rest = _around_member(item["loc"], place)
+    for item, where, member, rest in items:
         if member is None or rest:
             found.append(_line(item, _place(item["loc"], place), apart))
         elif where not in deeper:

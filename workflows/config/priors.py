@@ -9,8 +9,7 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.materials.admissible import Materials
-from forward.model import FloatArray
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake
 from forward.settings import nearest
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
@@ -44,40 +43,23 @@ def inputs_of(
     return Inputs(own, pairs, materials, draws=draws)
 
 
-def mistakes_of_draws(
-    scalars: Mapping[str, Scalar],
-    draws: Draws,
-    constants: Collection[str] = (),
-    unavailable: Mapping[str, str] | None = None,
-) -> Iterator[Mistake]:
-    """Find draws at most of which the model is impossible; constants of materials are judged together.
+def _impossible(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterator[tuple[str, float, str]]:
+    """Go through draws by name, with the share where the model is impossible and why it is at the first of them.
 
-    Numbers that are `unavailable` come with the reason.
+    Those of the parameters, by `paths`, that are constants of materials are judged together, elsewhere.
     """
+    scalars, constants = spec.scalars, _constants(spec, paths)
     for name, values in zip(draws.names, draws.values.T, strict=True):
-        if name in (unavailable or {}):
-            yield ("parameters", "from"), (unavailable or {})[name], name
-        share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
-        if share > 1 - LEAST:
-            message = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
-            yield ("parameters", "from"), message, name
+        known = {} if name in constants else {one: scalars[name].objection(float(one)) for one in np.unique(values)}
+        bad = np.array([known.get(one) is not None for one in values])
+        yield name, float(draws.weights[bad].sum()), next((why for why in known.values() if why is not None), "")
 
 
-def findings_of_impossible(
-    scalars: Mapping[str, Scalar], draws: Draws, constants: Collection[str] = ()
-) -> Iterator[Finding]:
-    """Say how many draws are where the model is impossible, and that these samples fail."""
-    for name, values in zip(draws.names, draws.values.T, strict=True):
-        share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
+def findings_of_impossible(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterator[Finding]:
+    """Say how many draws, among all parameters, are where the model is impossible, and that these samples fail."""
+    for name, share, objection in _impossible(spec, draws, paths):
         if share > 0:
             yield Finding("draws-impossible", "warning", {"share": 100 * share, "name": name, "objection": objection})
-
-
-def _impossible(number: Scalar, values: FloatArray, draws: Draws) -> tuple[float, str]:
-    """Share of draws where the model is impossible, and why it is at the first of them."""
-    why = {value: number.objection(float(value)) for value in np.unique(values)}
-    bad = np.array([why[value] is not None for value in values])
-    return float(draws.weights[bad].sum()), next((text for text in why.values() if text is not None), "")
 
 
 def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
@@ -90,33 +72,32 @@ def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mist
         yield place, message, prior.model_dump()
 
 
-def mistakes_of_parameters(
-    scalars: Mapping[str, Scalar],
-    parameters: Mapping[str, Distribution],
-    constants: Collection[str] = (),
-    unavailable: Mapping[str, str] | None = None,
-) -> Iterator[Mistake]:
-    """Find parameters that are not numbers of a model, or that allow values for which it is impossible.
+def mistakes_of_parameters(spec: ModelSpec, parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
+    """Find parameters, by paths, that are not numbers of a model, or that allow values for which it is impossible.
 
-    Constants of materials are left out: they are judged together, by `workflows.config.priors`. Numbers that are
-    `unavailable` come with the reason.
+    Constants of materials are left out, which are judged together. Numbers that are unavailable come with the reason.
     """
+    scalars, constants = spec.scalars, _constants(spec, parameters)
     for path, distribution in parameters.items():
-        why = (unavailable or {}).get(path)
+        why = spec.unavailable.get(path)
         if why is not None or path not in scalars:
             yield ("parameters",), why or f"not a number of the model; {nearest(path, tuple(scalars))}", path
             continue
         if path in constants:
             continue
-        ends = distribution.support
-        if ends is None:
-            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        ends = distribution.support or (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
         for end in ends:
             objection = scalars[path].objection(end)
             if objection is not None:
                 message = f"reaches {end:.4g}, where the model is impossible ({objection})"
                 yield ("parameters", path), message, distribution.model_dump()
                 break
+
+
+def _constants(spec: ModelSpec, paths: Collection[str]) -> tuple[str, ...]:
+    """Those of some paths that are constants of materials."""
+    materials = spec.materials(paths)
+    return () if materials is None else materials.names
 
 
 def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mistake]:
@@ -138,11 +119,13 @@ def mistakes_of_priors(
     draws: Draws | None = None,
 ) -> Iterator[Mistake]:
     """Find priors, by paths, or draws that do not fit a model or each other; `inputs` makes the random parameters."""
-    materials = spec.materials(parameters)
-    constants = () if materials is None else materials.names
-    yield from mistakes_of_parameters(spec.scalars, parameters, constants, spec.unavailable)
-    if draws is not None:
-        yield from mistakes_of_draws(spec.scalars, draws, constants, spec.unavailable)
+    yield from mistakes_of_parameters(spec, parameters)
+    for name, share, objection in () if draws is None else _impossible(spec, draws, parameters):
+        if name in spec.unavailable:
+            yield ("parameters", "from"), spec.unavailable[name], name
+        if share > 1 - LEAST:
+            message = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
+            yield ("parameters", "from"), message, name
     try:
         found = inputs()
     except ValueError as error:
@@ -153,18 +136,12 @@ def mistakes_of_priors(
             yield from mistakes_of_materials(found.within(materials), materials)
 
 
-def findings_of_materials(inputs: Inputs) -> Iterator[Finding]:
-    """Say how much of a prior is inadmissible, and that the rest is rescaled."""
+def findings_of_materials(inputs: Inputs, *, fail: bool = False) -> Iterator[Finding]:
+    """Say how much of a prior is inadmissible and that the rest is rescaled, or how many samples `fail` for it."""
     if inputs.admitted < 1:
-        yield Finding("prior-inadmissible", "note", {"share": _share(inputs)})
-
-
-def findings_of_draws(inputs: Inputs) -> Iterator[Finding]:
-    """Say how many of the samples will be inadmissible, and that they fail."""
-    if inputs.admitted < 1:
-        yield Finding("samples-inadmissible", "warning", {"share": _share(inputs)})
-
-
-def _share(inputs: Inputs) -> str:
-    share = 100 * (1 - inputs.admitted)
-    return f"{share:.2g} %" if share > 0.01 else "less than 0.01 %"
+        share = 100 * (1 - inputs.admitted)
+        values = {"share": f"{share:.2g} %" if share > 0.01 else "less than 0.01 %"}
+        if fail:
+            yield Finding("samples-inadmissible", "warning", values)
+        else:
+            yield Finding("prior-inadmissible", "note", values)

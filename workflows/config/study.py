@@ -16,7 +16,7 @@ from forward.settings import cut
 from uq.methods.method import METHODS
 from workflows.config.blocks import AVERAGED, KEPT, located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.source import Sourced, averages
+from workflows.config.one_model import Sourced, averages
 from workflows.config.tables import EACH, at, changed, deeper_than, leaves
 from workflows.studies.study import SAMPLING, STUDIES, UNNAMED, WITHOUT_EFFECT, StudyKind
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Part = dict[str, Any]
+NEITHER, DOUBTFUL = 2, 3  # values of `trust`, see docs/results.md
 ALONE = ""  # name of a number that stands without one
 NUMBERS = ("rmse", "rmse_error", "claimed", "coverage")  # of a method at a budget
 MOMENTS = (*ESTIMATED, "variance_ratio", "std_variance_ratio", "loo_error", "bias_error", "std_bias_error")

@@ -175,7 +175,7 @@ def _complete(
     add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
     add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
-    return study.finished(dataset, evaluations)
+    return job.finished(dataset, evaluations)
 
 
 def _warn_of_memory(study: StudyKind, world: Any, *, quiet: bool) -> None:

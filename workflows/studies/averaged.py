@@ -62,10 +62,10 @@ class AveragedStudy(Study):
             blocks = self.model_dump(mode="json", exclude_none=True)
             assert self.source is not None
             drawn = read(self.source.file, self.source.group, one.name)
-            typical = dict(
-                zip((name.rpartition(".")[2] for name in drawn.names), drawn.weights @ drawn.values, strict=True)
-            )
-            blocks["model"]["material"] = _completed(one.material, blocks["model"].get("material", {}) | typical)
+            means = zip((name.rpartition(".")[2] for name in drawn.names), drawn.weights @ drawn.values, strict=True)
+            others, known = blocks["model"].get("material", {}) | dict(means), constants(str(one.material["kind"]))
+            lacking = {key: float(value) for key, value in others.items() if key in known}
+            blocks["model"]["material"] = lacking | dict(one.material)
             blocks["parameters"]["from"] |= {"model": one.name}
             blocks["accuracy"] = {"mesh_error": False}
             found[one.name] = Study.model_validate(blocks)
@@ -137,15 +137,18 @@ class AveragedStudy(Study):
         if self.model.meshed:
             space: Any = model.space
             mesh = (space.coordinates, *space.cells())
-        told = {"candidates": {one.name: one.probability for one in self.candidates}}
-        return MethodJob(model, others, task, recorders, labelled=lambda found: label(found, units, *mesh), told=told)
 
-    def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        """Say of each candidate where it has no answer."""
-        for name, found in evaluations.items():
-            told = failure_domain.findings(self.parts[name].inputs, found, continued=False)
-            add(dataset, *(one.of(f"Candidate '{name}'") for one in told))
-        return with_unknown_meshes(self, dataset)
+        def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
+            for one, several in evaluations.items():
+                told = failure_domain.findings(parts[one].inputs, several, continued=False)
+                add(found, *(finding.of(f"Candidate '{one}'") for finding in told))
+            return with_unknown_meshes(self, found)
+
+        def labelled(found: xr.Dataset) -> xr.Dataset:
+            return label(found, units, *mesh)
+
+        told = {"candidates": {one.name: one.probability for one in self.candidates}}
+        return MethodJob(model, others, task, recorders, labelled=labelled, finished=finished, told=told)
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be averaged."""
@@ -169,12 +172,6 @@ class AveragedStudy(Study):
 
 
 AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
-
-
-def _completed(material: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the block of a candidate's material, with the constants that it lacks."""
-    known = constants(str(material["kind"]))
-    return {key: float(value) for key, value in others.items() if key in known} | dict(material)
 
 
 def _told(dataset: xr.Dataset) -> xr.Dataset:

@@ -21,6 +21,7 @@ from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.findings import Finding
@@ -118,14 +119,13 @@ class ModelCandidate(CandidateBlock):
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of the priors does not fit the model."""
         materials = spec.materials(self.parameters)
-        constants = () if materials is None else materials.names
-        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
+        yield from mistakes_of_parameters(spec, self.parameters)
         if materials is not None and all(path in spec.scalars for path in self.parameters):
             with suppress(ValueError):  # correlations, which are reported elsewhere
                 yield from mistakes_of_materials(self.restricted(spec), materials)
 
 
-class OfCandidates(Settings):
+class OfCandidates(StudyKind):
     """A study of candidates that each change one model, or are materials without one.
 
     Parameters
@@ -164,13 +164,16 @@ class OfCandidates(Settings):
             yield from spec.findings_over(ranges(self.candidates[name].parameters))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns of a candidate."""
-        name, _, _ = label.partition("/")
-        found: tuple[str, ...] = self.candidates[name].inputs.names
+        """Names of the unknowns of a candidate, or of the one model."""
+        if self.candidates is None:
+            return super().parameters_of(label)
+        found: tuple[str, ...] = self.candidates[label.partition("/")[0]].inputs.names
         return found
 
     def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of a candidate's model."""
+        """SI units of the numbers of a candidate's model, or of the one model."""
+        if self.candidates is None:
+            return super().units_of(label)
         name, _, _ = label.partition("/")
         found: dict[str, str] = self.candidates[name].units(self.of_candidates.get(name))
         return found

@@ -3,38 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
+from forward.bodies.geometry import AXES
 from forward.findings import Finding
+from forward.model import FloatArray, ModelError, SolveError
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
+from forward.specimen import Observed
+from inverse.data.measurements import Measurements
+from inverse.designs.fields import of_field
 from inverse.methods.design import Design
+from inverse.methods.invert import derivable
+from uq.evaluation.evaluate import Recorder
 from workflows.config.blocks import AS_DECIDED, AVERAGED, PartOrKind, decided
+from workflows.config.one_model import Sourced
 from workflows.config.priors import findings_of_materials, ranges
-from workflows.config.source import Sourced
 from workflows.config.tables import at
+from workflows.data.designs import files
 from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
-from workflows.studies.design_job import job, job_of_models
-from workflows.studies.design_job import mistakes as mistakes_of_values
-from workflows.studies.predictions import PRODUCT, duration
-from workflows.studies.study import StudyKind
+from workflows.studies.job import MethodJob, TasksJob
+from workflows.studies.predictions import PRODUCT, duration, has_mesh
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import xarray as xr
+
+    from forward.model import ForwardModel, Solution
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.request import Evaluate, Evaluations
+    from uq.evaluation.tasks import Outcome
     from workflows.studies.job import Job
 
 
 ANY_MODEL = OfKind(MODELS, "specimen")
 PRODUCTS = 600  # with the derivative, for the directions of a field that many candidates tell
+SIDES = {f"{axis}-{side}": (k, end) for k, axis in enumerate(AXES) for side, end in (("min", 0), ("max", -1))}
 
 
-class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
+class DesignStudy(Sourced, OfCandidates, FromPython):
     """What could be observed, and how much of it.
 
     Parameters
@@ -117,19 +133,39 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         return [*lines, f"unknown     {unknown}"], solve + derivatives
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
-        """Make the model, or those of all candidates; collective."""
+        """Make the model, or those of all candidates, which are all observed at the places of the first; collective."""
+        method, nodal = self.method, self.candidates is None and self.field
+        specs = self.of_candidates or {"/": self.spec}
+        first, *others = specs
+        model: Any = specs[first].build(
+            ensemble.group, specs[first].coefficients if nodal else self.parameters_of(first)
+        )
         if self.candidates is None:
-            return job(self.method, self.spec, self.inputs, ensemble, checkpoint, field=self.field)
-        weights = {name: one.weight for name, one in self.candidates.items()}
-        return job_of_models(self.method, self.of_candidates, self.priors, weights, ensemble)
+            derivable(model, self.spec.kind)
+        values = values_of(specs[first], model)
+        if nodal:
+            return _of_field(method, self.spec, ensemble, checkpoint, model, values)
+        recorders: dict[str, Recorder] = {}
 
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns, of a candidate if there are some."""
-        return self.inputs.names if self.candidates is None else super().parameters_of(label)
+        def made(name: str) -> ForwardModel:
+            other: Any = specs[name].build(ensemble.group, self.parameters_of(name))
+            if specs[name].placed and specs[first].placed:
+                other = other.observing(model.places, model.axes.tolist(), model.cases.tolist())
+            elif other.outputs != model.outputs:
+                raise ModelError(f"{name} gives {', '.join(other.outputs[:3])}, …, expected the outputs of {first}")
+            found: ForwardModel = other
+            return found
 
-    def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of the model, or of that of a candidate."""
-        return StudyKind.units_of(self, label) if self.candidates is None else super().units_of(label)
+        def task(evaluate: Evaluate) -> xr.Dataset:
+            for one in specs:
+                recorders[one] = Recorder(evaluate if one == first else evaluate.on(one))
+            if self.candidates is None:
+                return method.run(self.inputs, recorders[first], values, evaluate if has_mesh(self.spec) else None)
+            weights = {one: candidate.weight for one, candidate in self.candidates.items()}
+            return method.run_models(self.priors, weights, recorders, values)
+
+        makers = {one: partial(made, one) for one in others}
+        return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -163,7 +199,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         yield from model.mistakes_of_mesh()
         yield from self.mistakes_of_ranks(self.spec)
         yield from self.mistakes_of_parameters()
-        yield from mistakes_of_values(self.method, model)
+        yield from _mistakes_of_values(self.method, model)
 
     def _of_candidates(self) -> Iterator[Mistake]:
         if self.method.criterion != "models":
@@ -178,6 +214,120 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
             if spec is None:
                 continue
             if first:  # which the others are observed like
-                yield from mistakes_of_values(self.method, spec)
+                yield from _mistakes_of_values(self.method, spec)
                 first = False
             yield from self.mistakes_of_ranks(spec)
+
+
+# --- what could be measured: of a specimen by its settings as far as these tell, and by its model ---------------------
+
+
+def _mistakes_of_values(method: Design, spec: ModelSpec) -> Iterator[Mistake]:
+    """Find what a design asks for that a model does not have; nothing where only its mesh knows."""
+    values = known(spec) if spec.placed else of_outputs(spec)
+    if values is None:
+        return
+    if not len(values):
+        message = "nothing is observed, expected boundaries or points, or outputs of load cases"
+        yield ("model", "observed"), message, ()
+        return
+    for key, message, given in method.mistakes(values):
+        yield ("method", key), message, given
+
+
+def of_outputs(spec: ModelSpec) -> Measurements:
+    """Say what each output of a model is that is no specimen."""
+    axes, names = dict(spec.axes_of_outputs), tuple(output.name for output in spec.returned)
+    steps = [str(step) for step in axes["step"][1]] if "step" in axes else [""] * len(names)
+    parts = [str(part) for part in axes["output_of"][1]] if "output_of" in axes else list(names)
+    return Measurements.possible(names, np.full((len(names), 3), np.nan), steps, parts)
+
+
+def known(spec: Any) -> Measurements | None:
+    """Say what the values of a specimen are; None where nodes of a mesh from a file are observed."""
+    names, places, cases, parts = list[str](), list[FloatArray](), list[str](), list[str]()
+    for case in spec.cases:
+        for item in spec.seen(case):
+            points = _points(spec, item)
+            if points is None:
+                return None
+            names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(points)) for axis in item.components]
+            places += [point for point in points for _ in item.components]
+            parts += [axis for _ in points for axis in AXES if axis in item.components]
+        names += [f"{case.name}.{output.name}" for output in case.outputs]
+        places += [np.full(3, np.nan) for _ in case.outputs]
+        parts += [output.name for output in case.outputs]
+        cases += [case.name] * (len(names) - len(cases))
+    return Measurements.possible(names, np.array(places).reshape(-1, 3), cases, parts)
+
+
+def _points(spec: Any, item: Observed) -> FloatArray | None:
+    """Points (n, 3) at which displacements are measured: nodes of a side as they lie on a cube of cells of one size."""
+    if item.on is None:
+        return np.array(item.at)
+    cells = getattr(spec.body, "cells", None)
+    if cells is None or len(cells) != len(AXES) or item.on not in SIDES:
+        return None
+    lines = [np.linspace(0.0, 1.0, spec.body.degree * n + 1) for n in cells]
+    axis, end = SIDES[item.on]
+    lines[axis] = lines[axis][[end]]
+    return np.asarray(np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3))
+
+
+def values_of(spec: Any, model: Any) -> Measurements:
+    """Say of each output of a model what it is and where it is measured."""
+    if not spec.placed:
+        return of_outputs(spec)
+    cases = [spec.cases[number] for number in model.cases]
+    parts = [
+        AXES[axis] if axis < len(AXES) else case.outputs[axis - len(AXES)].name
+        for axis, case in zip(model.axes, cases, strict=True)
+    ]
+    return Measurements.possible(model.outputs, model.places, [case.name for case in cases], parts)
+
+
+# --- a field of nodal values -----------------------------------------------------------------------------------------
+
+
+def _of_field(
+    method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Measurements
+) -> TasksJob:
+    """Each draw of the field is a task of one group."""
+    from uq.evaluation.kept import Kept, KeptModel
+
+    prior = spec.fields[0].prior(spec.body)
+    names = [f"draw {number}" for number in range(method.draws)]
+    solving: list[Kept] = []  # of the draw at hand
+    goals = method.candidates(values)[1]
+
+    def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
+        solving.append(Kept(checkpoint, ensemble.group, names[number]))
+        kept = KeptModel(model, solving[-1], solved)
+        whitened = method.whitened(number, len(model.parameters))
+        try:
+            solution = kept.solve(prior.root(whitened))
+        except SolveError:
+            ensemble.count(1, 1)
+            raise
+        ensemble.count(1, 0)
+        sigma = method.sigma(values, solution.outputs[None])
+        mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
+        found = of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
+        return found if mesh is None else found.assign(mesh_error=("value", mesh))
+
+    def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
+        found = [one.dataset for one in outcomes if one.dataset is not None]
+        if not found:
+            raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
+        return method.of_fields(found, values)
+
+    return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
+
+
+def uncalibrated(solution: Solution) -> FloatArray | None:
+    """Estimate what the mesh takes away from the outputs (m,) of a solution; None where nothing tells."""
+    try:
+        error = solution.mesh_error()
+    except SolveError:
+        return None
+    return None if error is None else error.outputs

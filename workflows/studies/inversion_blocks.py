@@ -16,19 +16,19 @@ from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AS_DECIDED, Parallel, decided
+from workflows.config.blocks import AS_DECIDED, decided
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
 from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import never_estimable
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.model import FloatArray
     from forward.reduced.spec import Reduced
     from forward.spec import ModelSpec
-    from inverse.data.measurements import Measurements
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted
@@ -66,7 +66,7 @@ class Predict(Settings):
         return self.samples
 
 
-class InversionBlocks(OneModel):
+class InversionBlocks(OneModel, StudyKind):
     """The blocks of an inversion, as `workflows.studies.inversion.Inversion` explains them."""
 
     restricted: ClassVar[bool] = True
@@ -76,12 +76,6 @@ class InversionBlocks(OneModel):
     method: Invert = Invert()
     predict: Predict | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
-
-    if TYPE_CHECKING:  # of every study
-        parallel: Parallel
-
-        def units_of(self, label: str) -> dict[str, str]:
-            """SI units of numbers of the model, by their paths."""
 
     # --- the model ---------------------------------------------------------------------------------------------------
 
@@ -163,18 +157,11 @@ class InversionBlocks(OneModel):
             return tuple(case.name for case in self.model.cases)
         return next((found.parts for found in self.measurements if found is not None), ())
 
-    def measured(self, number: int) -> Measurements:
-        """Return a data set that can be used."""
-        found: Measurements = self.measurements[number]
-        return found
-
     def not_estimable(self, number: int) -> tuple[str, ...]:
         """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
-        return (
-            ()
-            if self.specimen is not None
-            else never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
-        )
+        if self.specimen is not None:
+            return ()
+        return never_estimable(self.model, tuple(self.measurements[number].names.tolist()))
 
     @property
     def together(self) -> bool:

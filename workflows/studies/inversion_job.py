@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.fem.finer import extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.settings import one_line
 from inverse.criticism.finer import Finer
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
@@ -23,11 +25,18 @@ from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
-from workflows.studies.findings_inversion import judged
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
+from workflows.studies.inversion_results import (
+    BATCH,
+    Vertices,
+    arviz_groups,
+    batch_table,
+    dataset,
+    judged,
+    table_of_finished,
+)
 from workflows.studies.job import MOVED, MethodJob, TasksJob
-from workflows.studies.predictions import FINER, finer_meshes, has_mesh
+from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
@@ -50,6 +59,8 @@ def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint:
     """Make the model; collective over the group."""
     made = _outputs(study, ensemble) if study.specimen is None else _specimen(study, study.specimen, ensemble)
     derivable(made.model, study.model.kind)
+    if study.predict is not None:
+        made = replace(made, predicted=study.predicted.build(ensemble.group, study.acting))
     return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
 
@@ -86,12 +97,15 @@ class _Made:
         Places (N, 3) of the vertices of a specimen, cells, and VTK's number of their kind; None of other models.
     look
         Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices, of a specimen.
+    predicted
+        The model of what is predicted, if anything is.
     """
 
     model: ForwardModel
     observed: Callable[[int], _Observed]
     vertices: Vertices | None = None
     look: Look | None = None
+    predicted: ForwardModel | None = None
 
 
 def _outputs(study: InversionBlocks, ensemble: Ensemble) -> _Made:
@@ -116,7 +130,7 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
 
     def observed(number: int) -> _Observed:
-        data = study.measured(number)
+        data = study.measurements[number]
         try:
             own = observing(model, data)
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
@@ -135,7 +149,10 @@ def _meshes(
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked
-    return finer_meshes(model, start)
+    try:
+        return extrapolated(model, start), ""
+    except ValueError as error:  # a mesh that is not divided, or would be too large
+        return None, one_line(str(error))
 
 
 def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
@@ -163,7 +180,7 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, say: 
         model, why = seen.there
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-    return Problem(study.measured(number), study.method, study.data.errors, finer, shared, say)
+    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, say)
 
 
 def _inverted(
@@ -198,9 +215,9 @@ def _with_predictions(
 def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
     names = [one.name for one in study.data.sets]
-    rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
+    finished = table_of_finished(study, made.vertices, partial(write_text, directory / BATCH))
     solving: list[Kept] = []  # of the data set at hand
-    reduced = _reduced(study)
+    reduced, predicted = _reduced(study), None if study.field else made.predicted
     expanded = cache(partial(_expanded, study, made, ensemble, checkpoint))
 
     def kept(name: str) -> Kept:
@@ -211,12 +228,7 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
         """Solve other models, on finer meshes or at moved points, which are no solves of the model."""
         return SerialEvaluate(model, kept=kept(name))
 
-    def states_of(name: str, model: ForwardModel) -> KeptModel:
-        """Keep the solves for what is predicted from a field."""
-        return KeptModel(model, kept(name))
-
-    invert_field = _inverting_field(study, made, ensemble, states_of) if study.field else None
-    predicted = None if study.predict is None or study.field else _predicted(study, ensemble)
+    invert_field = _inverting_field(study, made, ensemble, kept) if study.field else None
 
     @cache
     def before() -> Band:
@@ -246,20 +258,14 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
             return invert_field(names[number], KeptModel(seen.model, kept(names[number]), solved), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
         near = partial(Nearby.at, seen.model, spread=study.inputs.std)
-        cheap = None if reduced is None else reduced(seen.model)
-        return _inverted(study, made, seen, problem, full, cheap, near)
-
-    def forget() -> None:
-        """Remove the solves of a data set, whose results are stored."""
-        while solving:
-            solving.pop().forget()
+        return _inverted(study, made, seen, problem, full, reduced(seen.model), near)
 
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         if all(one.dataset is None for one in outcomes):
             raise SolveError("; ".join(f"{name}: {one.reason}" for name, one in zip(names, outcomes, strict=True)))
         return dataset(study, outcomes, made.vertices)
 
-    return TasksJob(names, invert, rows.add, forget, results, **_written(study, made))
+    return TasksJob(names, invert, results, solving, finished, **_written(study, made))
 
 
 def _expanded(
@@ -282,7 +288,7 @@ def _by_expansion(
     study: InversionBlocks, found: SharedExpansion, number: int, say: Callable[[str], None]
 ) -> xr.Dataset:
     """Invert a data set with the expansion, whose errors are among those of the data."""
-    data = study.measured(number)
+    data = study.measurements[number]
     missed = found.error[data.axes]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
     problem = Problem(wider, study.method, study.data.errors, found.finer, say=say)
@@ -293,7 +299,7 @@ def _by_expansion(
 
 
 def _inverting_field(
-    study: InversionBlocks, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
+    study: InversionBlocks, made: _Made, ensemble: Ensemble, kept: Callable[[str], Kept]
 ) -> Callable[[str, ForwardModel, Problem], xr.Dataset]:
     """Return what inverts a data set, by its name, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
@@ -303,11 +309,11 @@ def _inverting_field(
     prior = study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
     predicting: FieldPredictions | None = None
-    if study.predict is not None:
+    predicted = made.predicted
+    if predicted is not None:
         from workflows.studies.predicted import of_field
 
-        other = _predicted(study, ensemble)
-        predicting = of_field(study, lambda name: states_of(name, other))
+        predicting = of_field(study, lambda name: KeptModel(predicted, kept(name)))
 
     def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
         posterior = FieldPosterior(states, problem.data.values, problem.noise, prior, progress=ensemble.count)
@@ -317,18 +323,13 @@ def _inverting_field(
     return invert
 
 
-def _predicted(study: InversionBlocks, ensemble: Ensemble) -> ForwardModel:
-    """Make the model of what is predicted; collective over the group."""
-    return study.predicted.build(ensemble.group, study.acting)
+def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel | None]:
+    """Load what stands for a model with which data are compared; no model is returned where that is asked itself.
 
-
-def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel] | None:
-    """Load what stands for a model with which data are compared; None where that is asked itself.
-
-    What it returns is collective over the ranks of that model.
+    What is returned is collective over the ranks of that model.
     """
     if study.method.reduced is None:
-        return None
+        return lambda observed: None
     if study.specimen is None:
         alone: ForwardModel = study.reduced[""].standing_for(study.spec, study.inputs.names)
         return lambda observed: alone
@@ -343,13 +344,12 @@ def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel] | None:
 
 def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
-    seen, reduced = made.observed(0), _reduced(study)
+    seen, predicted = made.observed(0), made.predicted
     recorders: dict[str, Recorder] = {}
-    cheap = None if reduced is None else reduced(seen.model)
-    predicted = None if study.predict is None else _predicted(study, ensemble)
+    cheap = _reduced(study)(seen.model)
     moved = None if seen.shared is None else seen.shared[1]
     models = {FINER: None if seen.there is None else seen.there[0], MOVED: moved, PREDICTED: predicted}
-    others = {name: partial(_itself, model) for name, model in models.items() if model is not None}
+    others = {name: partial(lambda one: one, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         full = recorders["/"] = Recorder(evaluate)
@@ -369,7 +369,3 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(seen.model, others, task, recorders, **_written(study, made))
-
-
-def _itself(model: ForwardModel) -> ForwardModel:
-    return model

@@ -1,4 +1,4 @@
-"""Results of inversions: the dataset of all data sets, batch.csv, ArviZ's groups."""
+"""Results of inversions: the dataset of all data sets with verdicts on each, batch.csv, ArviZ's groups."""
 
 from __future__ import annotations
 
@@ -12,11 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.inclusions import derived, log_factor
+from forward.fem.finer import counted as counted_on
+from forward.findings import Finding, Severity
 from forward.model import FloatArray
+from forward.readable import told
+from inverse.criticism import doubts as criticism
+from inverse.data.shared_motion import said as said_of_motion
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
-from workflows.results.summary import of_meshes
-from workflows.studies.findings_inversion import judged
+from uq.findings import add
+from uq.inputs.distributions import Normal
+from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
+from workflows.studies.predictions import of_file
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,11 +31,13 @@ if TYPE_CHECKING:
     from forward.bodies.random_fields import NodalPrior
     from inverse.data.measurements import Measurements
     from uq.evaluation.tasks import Outcome
+    from uq.inputs.distributions import Distribution
     from workflows.studies.inversion_blocks import InversionBlocks
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
+SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
 
 def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
@@ -56,13 +65,11 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
             words = [no if one is None else str(one[name].item()) for one, no in zip(each, lost, strict=True)]
             held[name] = ("data_set", words)
     held["ok"] = ("data_set", [one is not None for one in each])
-    found = list(study.measurements)
-    count = len(found)
     prior = study.model.fields[0].prior(study.model.body) if study.field else None
     mean, std = _prior_moments(study, prior)
     held["prior_mean"], held["prior_std"] = ("parameter", mean), ("parameter", std)
-    true = np.full((count, len(study.names)), np.nan)
-    for k, m in enumerate(found):
+    true = np.full((len(each), len(study.names)), np.nan)
+    for k, m in enumerate(study.measurements):
         for name, value in ({} if m is None else m.truth).items():
             if name in study.names:
                 true[k, study.names.index(name)] = value
@@ -93,22 +100,20 @@ def _of_specimen(
     """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
     places, cells, kind = vertices
     found = list(study.measurements)
+    moves = [np.zeros(0) if m is None else m.moves for m in found]
+    before = study.stiffness(places, prior_draws(study)).std(axis=0) if prior is None else np.sqrt(prior.variance)
     return {
-        "points_moved": ("data_set", [0 if m is None else int((m.moves > 0).sum()) for m in found]),
-        "largest_move": ("data_set", [0.0 if m is None else float(m.moves.max(initial=0.0)) for m in found]),
-        "rms_move": ("data_set", [0.0 if m is None else _rms(m.moves) for m in found]),
+        "points_moved": ("data_set", [int((one > 0).sum()) for one in moves]),
+        "largest_move": ("data_set", [float(one.max(initial=0.0)) for one in moves]),
+        "rms_move": ("data_set", [float(np.linalg.norm(one) / np.sqrt(max(len(one), 1))) for one in moves]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
         "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
-        "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
+        "stiffness_prior_std": ("node", before),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
-
-
-def _rms(moved: FloatArray) -> float:
-    return float(np.linalg.norm(moved) / np.sqrt(max(len(moved), 1)))
 
 
 def _moves(found: Sequence[Measurements | None], count: int) -> FloatArray:
@@ -165,13 +170,6 @@ def _prior_moments(study: InversionBlocks, prior: NodalPrior | None) -> tuple[Fl
     return mean, std
 
 
-def _prior_stiffness_std(study: InversionBlocks, places: FloatArray, prior: NodalPrior | None) -> FloatArray:
-    """Return the prior standard deviation (N,) of ln stiffness at places (N, 3)."""
-    if prior is not None:
-        return np.asarray(np.sqrt(prior.variance))
-    return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
-
-
 def prior_draws(study: InversionBlocks) -> FloatArray:
     """Prior draws (n, d) of the parameters."""
     return study.inputs.drawn(np.random.default_rng(study.method.seed), PRIOR_DRAWS)
@@ -190,6 +188,106 @@ def _true_at(study: InversionBlocks, measurement: Measurements | None, places: F
         linear, nearest = (of(*truth["stiffness"])(places) for of in (LinearNDInterpolator, NearestNDInterpolator))
         return np.asarray(np.where(np.isfinite(linear), linear, nearest))  # beyond the hull, by rounding
     return np.full(len(places), np.nan)
+
+
+# --- verdicts --------------------------------------------------------------------------------------------------------
+
+
+def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
+    """Look for everything that makes the posteriors of an inversion doubtful; return the results with verdicts."""
+    words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
+    said: list[Finding] = []
+    if study.predict is not None:
+        from workflows.studies import predicted
+
+        predicted.keep_unknown_meshes(study, dataset)
+    for k, name in enumerate(dataset.data_set.values):
+        if not bool(dataset["ok"][k]):
+            said.append(Finding("not-inverted", "warning", {"name": name, "why": words[k]}))
+            continue
+        doubts = doubts_of(dataset.isel(data_set=k), study, k)
+        words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
+        said.append(Finding("verdict", SEVERITY.get(int(trust[k]), "note"), {"verdict": words[k]}, subject=str(name)))
+        said += [one.of(str(name)) for one in doubts]
+        if study.predict is not None:
+            said += predicted.findings(dataset.isel(data_set=k), name)
+    found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
+    add(found, *said)
+    return found
+
+
+def _verdict(words: str, trust: int, doubts: list[Finding]) -> tuple[str, int]:
+    """Return the sentence and the number of a verdict, given those before any doubts."""
+    errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
+    warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
+    if trust == NEITHER:
+        return "; ".join([words, *errors, *warnings]), NEITHER
+    if errors:
+        return f"not to be trusted: {'; '.join([*errors, *warnings])}", NEITHER
+    if warnings:
+        return f"doubtful: {'; '.join(warnings)}; but for that: {words}", DOUBTFUL
+    return words, trust
+
+
+def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
+    """Say what is doubtful about one data set, given by its number."""
+    found: list[Finding] = []
+    names = [str(name) for name in one.parameter.values]
+    mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
+    square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
+    d, units = len(names) - (study.method.noise is not None), study.units_of("/")
+    if study.field:
+        centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
+        priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
+        stiffness = (one[name].to_numpy() for name in ("stiffness_std", "stiffness_prior_std", "node_position"))
+        found += criticism.little_seen(*stiffness)
+    else:
+        priors = dict(study.inputs.marginals)
+        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
+    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
+    seen = np.isfinite(one["measured"].to_numpy())
+    residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
+    if study.method.noise is not None:
+        sigma, measured = one["sigma"].to_numpy()[seen], one["measured"].to_numpy()[seen]
+        found += criticism.noise_far(float(mode[-1]), study.method.noise.at(0.5), sigma, measured)
+    else:
+        found += criticism.too_large_errors(
+            *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
+        )
+    labels = study.measurements[number].data_labels()
+    found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
+    if "points_moved" in one:
+        data, count = study.measurements[number], int(one["points_moved"])
+        if count:
+            moves = {"farthest": told(float(one["largest_move"]), "m"), "rms": told(float(one["rms_move"]), "m")}
+            where = "" if data.on_surface else " outside the body"
+            points = "1 point" if count == 1 else f"{count} points"
+            found.append(Finding("data-moved", "note", {"points": points, "where": where, **moves}))
+        if data.registered is not None:
+            found.append(Finding("registered", "note", {"how": data.registered.described}))
+        found += data.findings
+    if "motion_eigenvalue" in one:
+        motions = one["motion_eigenvalue"].to_numpy()
+        found.append(said_of_motion(motions[np.isfinite(motions)]))
+    if "expansion_error" in one:
+        found += criticism.expansion_off(float(one["expansion_error"]), int(one["expansion_solves"]))
+    if "reduced_share" in one:
+        shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
+        found += criticism.reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
+    return found + _of_mesh(one, study, number)
+
+
+def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:
+    """Say what the mesh does to one data set, given by its number, and what of it is doubtful."""
+    if "mesh_checked" not in one:
+        return []
+    error = one["mesh_error"].to_numpy()[np.isfinite(one["measured"].to_numpy())]
+    settled, counted = bool(one["mesh_settled"]), not study.field or counted_on(study.model)
+    found = criticism.of_mesh(one, error, settled=settled, counted=counted, from_file=of_file(study.model))
+    return criticism.not_estimable(study.not_estimable(number)) + found
+
+
+# --- batch.csv, and ArviZ's groups -----------------------------------------------------------------------------------
 
 
 STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
@@ -237,37 +335,28 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     return row | {f"{name} mesh_shift": f"{shift:.4g}" for name, shift in shifts if np.isfinite(shift)}
 
 
-class Rows:
-    """The table of a batch, rewritten whenever a data set is finished; rows are in the order of the data sets.
+def table_of_finished(
+    study: InversionBlocks, vertices: Vertices | None, write: Callable[[str], None]
+) -> Callable[[int, Outcome], None]:
+    """Return what takes a finished data set, by its number, and writes the table of all that are finished, in order.
 
-    Parameters
-    ----------
-    study
-        All data sets.
-    vertices
-        As in `dataset`.
-    write
-        Writes the table.
+    Vertices are as in `dataset`.
     """
+    rows: dict[int, Mapping[str, Any]] = {}
 
-    def __init__(self, study: InversionBlocks, vertices: Vertices | None, write: Callable[[str], None]) -> None:
-        self._study, self._vertices, self._write = study, vertices, write
-        self._rows: dict[int, Mapping[str, Any]] = {}
-
-    def add(self, number: int, outcome: Outcome) -> None:
-        """Add a finished data set."""
-        sets, measurement = self._study.data.sets[number], self._study.measurements[number]
+    def add(number: int, outcome: Outcome) -> None:
+        one, measurement = study.data.sets[number], study.measurements[number]
         if outcome.dataset is None:
             moved = 0 if measurement is None else int((measurement.moves > 0).sum())
-            row = {"data_set": sets.name, "ok": "no", "data": 0, "points_moved": moved, "why": outcome.reason}
-            self._rows[number] = row
+            row = {"data_set": one.name, "ok": "no", "data": 0, "points_moved": moved, "why": outcome.reason}
+            rows[number] = row
         else:
-            data = self._study.data.model_copy(update={"sets": (sets,)})
-            alone = self._study.model_copy(update={"data": data, "measurements": (measurement,)})
-            found = judged(dataset(alone, [outcome], self._vertices), alone)
-            self._rows[number] = _row(found.isel(data_set=0))
-        rows = (self._rows[number] for number in sorted(self._rows))
-        self._write(_table(self._study.names, self._study.parts, rows))
+            data = study.data.model_copy(update={"sets": (one,)})
+            alone = study.model_copy(update={"data": data, "measurements": (measurement,)})
+            rows[number] = _row(judged(dataset(alone, [outcome], vertices), alone).isel(data_set=0))
+        write(_table(study.names, study.parts, (rows[number] for number in sorted(rows))))
+
+    return add
 
 
 def arviz_groups(study: InversionBlocks, found: xr.Dataset) -> dict[str, xr.Dataset]:

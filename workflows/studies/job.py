@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from forward.model import FloatArray, ForwardModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble, EnsembleEvaluate
+    from uq.evaluation.kept import Kept
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.work_queue import Progress
 
@@ -34,6 +35,8 @@ class Job:
     ----------
     labelled
         Adds to the results what the method does not know.
+    finished
+        Adds at last what all evaluations say.
     arviz_groups
         Groups of results.nc besides its own variables.
     texts
@@ -47,6 +50,7 @@ class Job:
     """
 
     labelled: Callable[[xr.Dataset], xr.Dataset] = field(default=lambda found: found)
+    finished: Callable[[xr.Dataset, Mapping[str, Evaluations]], xr.Dataset] = field(default=lambda found, _: found)
     arviz_groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
     texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
     told: dict[str, Any] = field(default_factory=dict)
@@ -138,17 +142,19 @@ class TasksJob(Job):
     ----------
     names
         Of the tasks.
-    work, arrived, kept
+    work, arrived
         As in `uq.evaluation.tasks.run_tasks`.
     results
         The dataset of the study from the outcomes of all tasks.
+    solving
+        What is kept of the solves of the task at hand, until its results are.
     """
 
     names: Sequence[str]
     work: Callable[[int, list[Evaluations]], xr.Dataset]
-    arrived: Callable[[int, Outcome], None]
-    kept: Callable[[], None]
     results: Callable[[Sequence[Outcome]], xr.Dataset]
+    solving: list[Kept]
+    arrived: Callable[[int, Outcome], None] = field(default=lambda number, outcome: None)
 
     @property
     def own_seconds(self) -> float:
@@ -166,6 +172,10 @@ class TasksJob(Job):
         """Do the tasks, one after the other in each group; collective over all ranks."""
         from uq.evaluation.tasks import run_tasks
 
+        def kept() -> None:
+            while self.solving:
+                self.solving.pop().forget()
+
         found = run_tasks(
             ensemble,
             self.names,
@@ -173,7 +183,7 @@ class TasksJob(Job):
             checkpoint=checkpoint,
             progress=progress,
             arrived=self.arrived,
-            kept=self.kept,
+            kept=kept,
         )
         if found is None:
             return None

@@ -19,7 +19,6 @@ from workflows.studies.predictions import (
     NOT_ASKED,
     PRODUCT,
     duration,
-    formulation,
     mesh_check,
     never_estimable,
     times_of,
@@ -168,6 +167,7 @@ def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
     from workflows.studies.inversion_blocks import SOLVES_OF_FIELD
 
     usable = [m for m in study.measurements if m is not None]
+    decision = study.model.decision(ranges(study.parameters))
     counts = [len(m) for m in usable]
     moved = [int((m.moves > 0).sum()) for m in usable]
     cases = [times_of(spec.loaded(case)) for case in spec.cases]
@@ -187,7 +187,7 @@ def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
         f"unknown     {unknown}",
         *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
-        formulation(study.model.decision(ranges(study.parameters))),
+        f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}",
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
         *([f"            {_moved(sum(moved), usable)}"] if sum(moved) else []),
         *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),

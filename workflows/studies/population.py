@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from uq.evaluation.request import Evaluations
     from uq.evaluation.work_queue import Progress
 
+GONE = (StudyError, ValueError, OSError)
 KEPT = ("model", "data", "method", "candidates", "parameters", "correlations")  # blocks that a posterior depends on
 
 
@@ -74,6 +75,15 @@ class PopulationStudy(FromPython, StudyKind):
     def posteriors(self) -> dict[str, Draws]:
         """Draws of each specimen, by its name."""
         return self.source.specimens(self.method.model)
+
+    @cached_property
+    def of_specimens(self) -> Any:
+        """The study of the specimens; an exception of `GONE` where it cannot be read any more."""
+        from workflows.config.study import parse
+        from workflows.run.own_code import make_visible
+
+        make_visible(self.source.path)
+        return parse(self.source.blocks, folder=self.source.path)
 
     @property
     def planned(self) -> int:
@@ -114,8 +124,10 @@ class PopulationStudy(FromPython, StudyKind):
     @cached_property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for the models of the specimens."""
-        source = _source(self)
-        return () if source is None else source.modules
+        with suppress(*GONE):
+            found: tuple[str, ...] = self.of_specimens.modules
+            return found
+        return ()
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Fit on the first rank, and draw specimens again on all of them where that is needed."""
@@ -123,10 +135,12 @@ class PopulationStudy(FromPython, StudyKind):
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the parameters, as the study of the specimens has them; none where that is gone."""
-        source = _source(self)
-        if source is None:
-            return {}
-        return source.units_of(self.source.candidate(self.method.model) if hasattr(source, "candidates") else "/")
+        with suppress(*GONE):
+            study = self.of_specimens
+            label = self.source.candidate(self.method.model) if hasattr(study, "candidates") else "/"
+            found: dict[str, str] = study.units_of(label)
+            return found
+        return {}
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what is wrong with the source, which is taken as it was when the study was begun."""
@@ -270,22 +284,7 @@ class PopulationJob(Job):
 
 def _prior(study: PopulationStudy, names: Sequence[str]) -> Inputs:
     """Return the prior of these parameters, which the posteriors were found with."""
-    from workflows.config.study import parse
-
-    left = study.source
-    before: Any = parse(left.blocks, folder=left.path)
+    before, left = study.of_specimens, study.source
     by_candidate = "candidates" in left.blocks
     inputs: Inputs = before.models[left.candidate(study.method.model)].inputs if by_candidate else before.inputs
     return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
-
-
-def _source(study: PopulationStudy) -> StudyKind | None:
-    """Return the study that the source is of; None where that is gone."""
-    from workflows.config.study import parse
-    from workflows.run.own_code import make_visible
-
-    try:
-        make_visible(Path(study.method.source))
-        return parse(study.source.blocks, folder=Path(study.method.source))
-    except (StudyError, ValueError, OSError):
-        return None

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from forward.fem.cost import REPORT, START
-from forward.settings import one_line
 from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
-    from forward.fem.finer import FinerMeshes
-    from forward.fem.locking import Decision
-    from forward.joined_models import JoinedMeshes
-    from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
 NONE_TO_SPARE = -1e9  # solves: for estimates without what calibrates them
 PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and at the corrected one
 FINER = "finer mesh"  # in names of models
 NOT_ASKED = "not requested: no result will be called trusted"
 
@@ -39,14 +35,6 @@ def estimates_paid(spec: ModelSpec, parameters: int, solves: int) -> float:
         return math.inf
     once = START + REPORT + cost.first + cost.reference_factor(parameters)
     return float((SHARE * (once + solves * cost.sample) - one.once) / (cost.sample + one.seconds))
-
-
-def formulation(decision: Decision) -> str:
-    """Say which formulation is used, and why."""
-    return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
-
-
-LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and at the corrected one
 
 
 def has_mesh(spec: ModelSpec) -> bool:
@@ -78,26 +66,6 @@ def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
 
     both = ((finer(one), graded(one)) for one in spec.bodies if one.body.structured)
     return tuple(mesh for pair in both for mesh in pair if mesh is not None)
-
-
-def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
-    """Return a model on finer meshes, which are first solved on at `start` (d,), or why there are none."""
-    from forward.fem.finer import extrapolated
-
-    try:
-        return extrapolated(model, start), ""
-    except ValueError as error:  # a mesh that is not divided, or would be too large
-        return None, one_line(str(error))
-
-
-def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
-    """Return the model on finer meshes of a specimen, or of the measured outputs of a body."""
-    from forward.combine import sums_of
-    from forward.fem.finer import extrapolated
-
-    own = make()
-    body, _ = sums_of(own)
-    return extrapolated(body, start).of(own)
 
 
 def mesh_check(spec: ModelSpec) -> tuple[float, str]:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from forward.findings import Finding
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.config.tables import at
 from workflows.studies.predictions import duration, times_of
-from workflows.studies.reduction_job import Reduce, job
+from workflows.studies.reduction_blocks import Reduce
 from workflows.studies.sampling import Study
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
@@ -51,12 +48,9 @@ class ReductionStudy(Study):
         return cls.model_validate(_of_case({name: one for name, one in blocks.items() if name not in OF_DATA}))
 
     @property
-    def estimates(self) -> int:
+    def estimating(self) -> bool:
         """The mesh is that of the body; its error is not estimated here."""
-        return 0
-
-    def _of_estimates(self) -> Iterator[Finding]:
-        yield from ()
+        return False
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is reduced, from how many solves, and how long these take."""
@@ -74,11 +68,9 @@ class ReductionStudy(Study):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the body; collective."""
-        return job(self.method, self.spec, self.inputs, ensemble, directory)
+        from workflows.studies.reduction_job import job
 
-    def finished(self, dataset: xr.Dataset, evaluations: Any) -> xr.Dataset:
-        """Results are complete."""
-        return dataset
+        return job(self.method, self.spec, self.inputs, ensemble, directory)
 
 
 def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:

@@ -1,16 +1,15 @@
-"""The method `reduce`: what a reduced model is made of, how accurate it is to be, and how it is made."""
+"""The job of a reduction: snapshots, round by round, the reduced model that they make, and its errors."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from pydantic import Field
 
 from forward.findings import Finding
 from forward.model import SolveError
@@ -19,26 +18,21 @@ from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from forward.reduced.spec import without_answer
-from forward.registry import named
-from forward.scalars import Mistake
-from forward.settings import Settings
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
-from uq.methods.method import Method
 from uq.surrogates.linearisation import linearise
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
+from workflows.studies.reduction_blocks import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, Solution
-    from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
 
-FILE = "reduced.npz"
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
 ENOUGH = 120  # modes of states that the larger model has besides then
@@ -50,87 +44,6 @@ UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
 TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be taken for the errors
 LEFT = 0.5  # of the errors after correction, above which neither: errors and estimates of any sign may agree on average
-
-
-class Blocks(Settings):
-    """Blocks of a body with modes of their own, joined at their interfaces.
-
-    Parameters
-    ----------
-    cut
-        Numbers of blocks along the axes; or "regions", which are the blocks then.
-    full
-        Places in blocks that are kept in full, where a tool may press that no snapshot has seen.
-    """
-
-    cut: (
-        tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
-        | Literal["regions"]
-    )
-    full: tuple[tuple[float, float, float], ...] = ()
-
-
-class Reduce(Method):
-    """Make a reduced model of a body.
-
-    Parameters
-    ----------
-    case
-        Which load case of a specimen is reduced, with those parameters that act in it.
-    snapshots
-        Solves of which it is made. Half of them fill the distribution evenly; the others are, round by round, those of
-        many candidates at which the estimated error of any output is largest.
-    rounds
-        In how many rounds those are drawn.
-    modes
-        Number of modes; by default as many as `truncation` needs.
-    more
-        How many modes of states the nested larger model has besides, which tells errors and corrects gradients.
-    blocks
-        Into which blocks the body is cut, with modes of their own; by default modes are those of the whole body.
-    truncation
-        What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
-    cubature
-        What the points may miss of the forces of the snapshots, relative.
-    derivatives
-        Whether states are differentiated and adjoints solved for at the snapshots, which takes a factorisation each.
-        Estimates of errors need them; a control variate beside the body (`multifidelity`) does without.
-    unseen
-        Further solves, at random samples, on which its errors are measured.
-    seed
-        Of all points.
-    """
-
-    kind: Literal["reduce"] = "reduce"
-    case: str | None = None
-    snapshots: Annotated[int, Field(ge=4)] = 96
-    rounds: Annotated[int, Field(ge=0)] = 3
-    modes: Annotated[int, Field(ge=1)] | None = None
-    more: Annotated[int, Field(ge=1)] = 120
-    blocks: Blocks | None = None
-    truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
-    cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3
-    derivatives: bool = True
-    unseen: Annotated[int, Field(ge=0)] = 32
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    def planned(self, dimension: int) -> int:
-        """Snapshots, unseen samples, and the solve at the mean."""
-        return self.snapshots + self.unseen + 1
-
-    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Refuse: states are needed, which an evaluation does not return."""
-        raise ValueError("method.kind = 'reduce' is run by a study of its own")
-
-    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of a model cannot be reduced."""
-        if spec.kind != "hyperelastic":
-            yield ("model", "kind"), "only a body can be reduced, expected 'hyperelastic'", spec.kind
-            return
-        if self.case is not None:
-            yield ("method", "case"), "a body has no load cases, expected none", self.case
-        for said in named("forward.reduced.limits:mistakes")(spec):
-            yield ("model",), said, spec.kind
 
 
 @dataclass(frozen=True)
@@ -203,11 +116,11 @@ class _Making:
     ) -> None:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
         self._start = linearise(inputs, evaluate).prediction
-        self._sizes = Sizes(method.modes, method.truncation, method.cubature, method.more)
+        more = method.more
         if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
-            self._sizes = replace(self._sizes, more=max(self._sizes.more, OF_STATES * method.modes))
-        if method.blocks is not None:
-            self._sizes = replace(self._sizes, cut=method.blocks.cut, full=method.blocks.full)
+            more = max(more, OF_STATES * method.modes)
+        blocks: dict[str, Any] = {} if method.blocks is None else {"cut": method.blocks.cut, "full": method.blocks.full}
+        self._sizes = Sizes(method.modes, method.truncation, method.cubature, more, **blocks)
         self._lost: list[str] = []  # why snapshots have no answer
         self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
 
@@ -278,15 +191,14 @@ class _Making:
         found["mode_energy"] = ("mode", (data.coordinates[:, data.before :] ** 2).mean(axis=0))
         if not method.unseen:
             return found
-        first = UNSEEN
-        points = inputs.points(random_points((method.seed, 1), first, first + method.unseen, len(inputs.names)))
+        last = UNSEEN + method.unseen
+        points = inputs.points(random_points((method.seed, 1), UNSEEN, last, len(inputs.names)))
         full = self._evaluate(Request(points, tangents=True, fields=KeptStates(None), start=self._start))
         ok = full.ok
         states = iter(np.zeros((0, 1)) if full.sketches is None else full.sketches[:, 0])
         model = ReducedModel(data, data.parameters)
         n, m = method.unseen, len(names)
         errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
-        estimated_state = np.full(n, np.nan)
         gradients = np.full((3, n, m, len(inputs.names)), np.nan)  # of the body, and what is off before and after
         places = np.zeros((3, n, m))  # of largest values: of the body, and what the model says before and after
         answered = np.zeros(n, dtype=bool)
@@ -300,7 +212,6 @@ class _Making:
             if state is not None:
                 errors[i], estimates[i] = full.outputs[i] - solution.outputs, solution.estimate.outputs
                 of_state[i] = np.linalg.norm(state - solution.state) / np.linalg.norm(state)
-                estimated_state[i] = solution.estimate.state
                 assert full.tangents is not None
                 own = solution.adjoint(np.eye(m))
                 exact = full.tangents[i]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -14,22 +14,19 @@ from forward.machine import MIB
 from forward.model import ModelError
 from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
-from workflows.config.priors import findings_of_draws, inputs_of, ranges
+from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
 from workflows.studies.sampling_blocks import SamplingBlocks
-from workflows.studies.study import Sampled, StudyKind
+from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.request import Evaluations
     from workflows.studies.job import Job
 
 
-class Study(SamplingBlocks, FromPython, StudyKind):
+class Study(SamplingBlocks, FromPython):
     """What to compute.
 
     Parameters
@@ -77,7 +74,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
-        of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
+        of_draws = () if materials is None else findings_of_materials(self.inputs.within(materials), fail=True)
         found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
         if self.source is not None:
             found = (*found, *self.source.findings(self.spec, self.inputs))
@@ -126,23 +123,15 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         """The study, with a mesh that was refined where its results are."""
         if not self.model.adaptive:
             return self
-        from workflows.accuracy.adapted_mesh import kept
+        from workflows.accuracy.adapted_mesh import MESH
 
-        return kept(self)
+        return self.of(self.model.on_mesh(MESH, self.solid.body.contents))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and others that the method may want, at the points of the method; collective."""
         from workflows.studies.sampling_job import job
 
         return job(self, ensemble, directory)
-
-    def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        """Add how the stability of each sample was tested."""
-        from workflows.accuracy.adapted_mesh import with_history
-        from workflows.studies.sampling_job import with_stability, with_unknown_meshes
-
-        found = with_unknown_meshes(self, with_stability(self, dataset, evaluations["/"]))
-        return with_history(self, found) if self.model.adaptive else found
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -151,22 +140,19 @@ class Study(SamplingBlocks, FromPython, StudyKind):
 
     @model_validator(mode="before")
     @classmethod
-    def _choose_method(cls, value: Any) -> Any:
-        """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
+    def _complete(cls, value: Any) -> Any:
+        """Take `mesh_error` from beside the blocks into its own, unless that says it too.
+
+        And say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes.
+        """
+        match {"accuracy": {}} | value:
+            case {"mesh_error": asked, "accuracy": {**block}, **rest} if "mesh_error" not in block:
+                value = rest | {"accuracy": block | {"mesh_error": asked}}
         if at(value, "accuracy", "tolerance") is None:
             return value
         from workflows.accuracy.levers import completed
 
         return completed(value)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _gather_accuracy(cls, value: Any) -> Any:
-        """Take `mesh_error` from beside the blocks into its own, unless that says it too."""
-        match {"accuracy": {}} | value:
-            case {"mesh_error": asked, "accuracy": {**block}, **rest} if "mesh_error" not in block:
-                return rest | {"accuracy": block | {"mesh_error": asked}}
-        return value
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""

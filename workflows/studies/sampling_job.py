@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,20 +70,25 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
     }
-    function = study.spec.build(ensemble.group, inputs.names)
-    if function.space is None or not function.space.displacements:  # a specimen has states, but no one field
+    model: Any = study.spec.build(ensemble.group, inputs.names)
+
+    def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
+        found = with_unknown_meshes(study, _with_stability(study, found, evaluations["/"]))
+        return adapted_mesh.with_history(study, found) if study.model.adaptive else found
+
+    made = partial(MethodJob, model, others, task, recorders, told=told, finished=finished)
+    if model.space is None or not model.space.displacements:  # a specimen has states, but no one field
 
         def described(found: xr.Dataset) -> xr.Dataset:
-            found = label(_without_nodes(found), units, None, None, 0)
+            found = label(found.drop_dims("node", errors="ignore"), units, None, None, 0)
             if not study.spec.shareable:
                 log, models = recorders["/"].log, recorders["/"].models
                 own = [one for one, name in zip(log, models, strict=True) if name == OWN]
-                add(found, *of_answers(function, inputs, own))
+                add(found, *of_answers(model, inputs, own))
             return found
 
-        return MethodJob(function, others, task, recorders, labelled=described, told=told)
+        return made(labelled=described)
 
-    model: Any = function
     # Rank 0 may leave the task by an exception: nothing collective may follow it.
     cells, kind = model.space.cells()
     regions = model.space.regions()
@@ -101,16 +106,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         found = with_regions(found, model.spec.body.regions, regions)
         return with_random_fields(with_stresses(found, tensors), factors, model.space.variance_kept)
 
-    volumes = partial(node_volumes, model.space.coordinates, cells)
-    return MethodJob(
-        model,
-        others,
-        task,
-        recorders,
-        labelled=labelled,
-        node_volumes=volumes,
-        told=told,
-    )
+    return made(labelled=labelled, node_volumes=partial(node_volumes, model.space.coordinates, cells))
 
 
 def _with_mesh_errors(
@@ -174,11 +170,6 @@ def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
     )
 
 
-def _without_nodes(found: xr.Dataset) -> xr.Dataset:
-    """Leave out fields if states are not displacement fields."""
-    return found.drop_dims([dim for dim in ("node",) if dim in found.dims])
-
-
 def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
     """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
 
@@ -190,7 +181,7 @@ def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) ->
     return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
-def with_stability(study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+def _with_stability(study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
     """Add how the stability of each sample was tested, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
     add(dataset, *failure_domain.findings(study.inputs, evaluations, continued=continued))
@@ -220,10 +211,10 @@ def _told(
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        from workflows.accuracy.tolerance import meshes_before
+        from workflows.accuracy.tolerance import history
 
-        before = meshes_before(directory)
-        earlier = sum(one["seconds"] for one in before)
+        before = history(directory)  # estimates on the last mesh are those of the study
+        earlier = 0 if before is None else sum(one["seconds"] for one in before["meshes"][:-1])
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}
 

@@ -45,11 +45,6 @@ class SelectionBlocks(OfCandidates):
     method: Annotated[SelectSpecimens | Select, AS_DECIDED]
     measurements: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)
 
-    if TYPE_CHECKING:  # of every study
-
-        def units_of(self, label: str) -> dict[str, str]:
-            """SI units of numbers of the model of these evaluations, by their paths."""
-
     @model_validator(mode="before")
     @classmethod
     def _by_what_is_compared(cls, blocks: Any) -> Any:

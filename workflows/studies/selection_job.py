@@ -6,15 +6,17 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
+from forward.combine import sums_of
+from forward.fem.finer import extrapolated
 from forward.findings import Finding
-from forward.model import ForwardModel
+from forward.model import FloatArray, ForwardModel
 from inverse.criticism.finer import Finer
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
 from workflows.studies.job import MOVED, MethodJob
-from workflows.studies.predictions import FINER, of_file, once_on_finer_meshes
+from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
@@ -83,7 +85,9 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
         add(judged, *(one for several in wrong.values() for one in several))
         return judged
 
-    finer_ones = {f"{n}/{g}/{FINER}": partial(build_finer, study, n, makers[n, g]) for n, g in checked}
+    finer_ones = {
+        f"{n}/{g}/{FINER}": partial(build_finer, makers[n, g], study.models[n].inputs.mean) for n, g in checked
+    }
     moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
     return MethodJob(
         makers[study.pairs[0]](),
@@ -97,9 +101,11 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
     )
 
 
-def build_finer(study: SelectionBlocks, name: str, make: Make) -> ForwardModel:
-    """Make a candidate's model, which `make` returns, on a finer mesh; collective."""
-    return once_on_finer_meshes(make, study.models[name].inputs.mean)
+def build_finer(make: Make, start: FloatArray) -> ForwardModel:
+    """Make, on finer meshes, the specimen or the measured outputs of a body that `make` returns; collective."""
+    own = make()
+    body, _ = sums_of(own)
+    return extrapolated(body, start).of(own)
 
 
 def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:

@@ -15,14 +15,11 @@ from workflows.config.blocks import AVERAGED, Parallel, Report
 from workflows.config.mistakes import refused
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from forward.findings import Finding
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.request import Evaluations
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.job import Job
 
@@ -178,10 +175,6 @@ class StudyKind(Settings):
     def sampled(self) -> Sampled | None:
         """The one model of the study with its random parameters, if it has one: what a server answers for."""
         return None
-
-    def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        """Add to results what all evaluations say."""
-        return dataset
 
     @property
     def beside(self) -> Mapping[str, bytes]:

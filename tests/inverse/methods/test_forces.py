@@ -232,7 +232,7 @@ def test_ranks_that_share_a_specimen_find_the_same_forces(tmp_path):
 
 def test_synthetic_tables_hold_forces_with_errors_of_their_own(folder):
     study = load(folder / "few.toml")
-    found = study.measured(0)
+    found = study.measurements[0]
     forces = found.axes >= 3
     assert forces.sum() == 2
     np.testing.assert_array_equal(found.cases[forces], [0, 1])
@@ -265,7 +265,7 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
 
 def test_forces_alone_are_data_enough(folder):
     study = load(folder / "few.toml")
-    data, forces = study.measured(0), study.measured(0).subset(study.measured(0).axes >= 3)
+    data, forces = study.measurements[0], study.measurements[0].subset(study.measurements[0].axes >= 3)
     rows = [
         f"{study.parts[c]},{n},{v},{s}"
         for c, n, v, s in zip(forces.cases, forces.names, forces.values, forces.sigma, strict=True)
@@ -310,7 +310,7 @@ def test_forces_lie_nowhere_in_comparisons_as_in_inversions(folder, monkeypatch)
     study = load(folder / "select.toml")
     with pytest.raises(SolveError, match="enough"):
         study.method.run(study.models, study.data_groups, lambda *pair: None, finer=lambda *pair: NOT_LOOKED)
-    (data,), inverted = looked, load(folder / "few.toml").measured(0)
+    (data,), inverted = looked, load(folder / "few.toml").measurements[0]
     np.testing.assert_array_equal(np.isnan(data.places).all(axis=1), data.axes >= 3)
     rows = (uncertain(np.ones(len(one)), np.ones(len(one)), one) for one in (data, inverted))
     np.testing.assert_allclose(*rows)
@@ -321,7 +321,7 @@ def test_forces_stand_beside_points_of_uncertain_registration(folder):
     uncertain = '["data"]\nregistration = { kind = "given", rotation_std = 2.0, translation_std = 1e-3 }'
     (folder / "moved.toml").write_text(FEW.replace('["data"]', uncertain))
     study = load(folder / "moved.toml")
-    motion, forces = motion_of(study.measured(0), study.model.body), study.measured(0).axes >= 3
+    motion, forces = motion_of(study.measurements[0], study.model.body), study.measurements[0].axes >= 3
     model = study.specimen.build(MPI.COMM_SELF, study.inputs.names).observing(*motion.observed)
     rows = motion.errors(model.solve(study.inputs.mean).outputs)
     assert rows.shape == (6, len(forces))
@@ -410,7 +410,7 @@ def test_missing_errors_of_forces_are_asked_for(folder):
     (folder / "unknown.toml").write_text(FEW.replace('["data"]', '["unknown"]\nsigma = 1e-5'))
     with pytest.raises(StudyError, match=r"of 'grip' is not known \(and 1 more\).*data\.sigma_of\.grip"):
         load(folder / "unknown.toml")
-    assert load(folder / "unknown.toml", ["data.sigma_of={grip=0.5, force=0.1}"]).measured(0).sigma.min() > 0
+    assert load(folder / "unknown.toml", ["data.sigma_of={grip=0.5, force=0.1}"]).measurements[0].sigma.min() > 0
 
 
 def test_outputs_of_load_cases_are_checked():

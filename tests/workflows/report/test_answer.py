@@ -13,8 +13,8 @@ from tests.workflows.report.test_report import SVG, solve, study, study_of, writ
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
+from workflows.results import summary
 from workflows.run import closing
-from workflows.studies import findings_inversion
 
 
 @pytest.fixture(autouse=True)
@@ -149,7 +149,7 @@ def test_a_comparison_of_methods_names_the_best(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("trust", "source", "by"), [(findings_inversion.NEITHER, answer.LAPLACE, ", by Laplace"), (0, answer.LAPLACE, "")]
+    ("trust", "source", "by"), [(summary.NEITHER, answer.LAPLACE, ", by Laplace"), (0, answer.LAPLACE, "")]
 )
 def test_numbers_that_nothing_stands_in_place_of_are_said_to_be_by_laplace(trust, source, by):
     names = ("mean", "mode", "lower", "upper", "prior_mean")

@@ -17,7 +17,7 @@ from uq.findings import findings
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.run import run
-from workflows.studies.design_job import known, values_of
+from workflows.studies.design import known, values_of
 
 MODULE = """
 import numpy as np

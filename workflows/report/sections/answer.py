@@ -31,7 +31,7 @@ from workflows.report.sections.frame import gravest
 from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
 from workflows.results.comparison import bayes_factor, by_probability, grade
-from workflows.studies.findings_inversion import NEITHER
+from workflows.results.summary import NEITHER
 
 if TYPE_CHECKING:
     import xarray as xr
