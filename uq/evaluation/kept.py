@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.combine import CombinedSolution
+from forward.combine import CombinedSolution, OfOne
 from forward.model import (
     FloatArray,
     ForwardModel,
@@ -23,7 +23,6 @@ from forward.model import (
     gathered,
     scattered,
 )
-from forward.pointwise import OfOne
 from uq.evaluation.checkpoint import read
 from uq.evaluation.request import Evaluations, Failure
 
