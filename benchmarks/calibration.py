@@ -20,7 +20,7 @@ from mpi4py import MPI
 from benchmarks import calibration_forces, calibration_palpation
 from benchmarks.beams import CONFIG
 from benchmarks.simulated import Kind, calibrate
-from forward.fem.specimen import SpecimenModel
+from forward.fem.joined import SpecimenModel
 from forward.specimen import Specimen
 from inverse.data.noise import Noise
 from inverse.low_dimensional.posterior import Posterior

@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
 from benchmarks.calibration import PRIORS, specimen
-from forward.fem.specimen import SpecimenModel
+from forward.fem.joined import SpecimenModel
 from forward.model import FloatArray
 from forward.specimen import LoadCase, Specimen
 from inverse.data.noise import Noise

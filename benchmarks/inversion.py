@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.bodies.random_fields import RandomField
-from forward.fem.specimen import SpecimenModel
+from forward.fem.joined import SpecimenModel
 from forward.model import FloatArray
 from forward.specimen import Specimen
 from inverse.data.noise import Noise

@@ -24,7 +24,7 @@ from mpi4py import MPI
 
 from benchmarks.other_code import Cube
 from forward.fem.finer import extrapolated
-from forward.fem.specimen import SpecimenModel
+from forward.fem.joined import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.doubts import of_mesh

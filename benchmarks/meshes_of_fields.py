@@ -35,7 +35,7 @@ from benchmarks.meshes import (
 )
 from benchmarks.other_code import Cube
 from forward.fem.finer import extrapolated
-from forward.fem.specimen import SpecimenModel
+from forward.fem.joined import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.finer import Finer

@@ -25,12 +25,21 @@ from forward.model import (
     Stability,
     Work,
 )
-from forward.pointwise import OfOne, OneByOne
+from forward.pointwise import OfModel, OneByOne
 
 
 def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:
     """Return the product (…, n) of a matrix (n, m) with a vector (m,), or with each of k rows (k, m)."""
     return np.asarray((matrix @ np.asarray(rows).T).T)
+
+
+class OfOne(OfModel, OneByOne):
+    """A model that is made of another `model`."""
+
+    @property
+    def space(self) -> NodalSpace | None:
+        """Where the states live."""
+        return self.model.space
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +73,11 @@ class Rows(OfOne):
 def picked(which: Sequence[int] | NDArray[np.int64], count: int) -> csr_matrix:
     """Return the matrix (n, count) that takes n of so many numbers, by their places."""
     return eye(count, format="csr")[np.array(which, dtype=np.int64)]
+
+
+def taking(model: ForwardModel, which: Sequence[int] | NDArray[np.int64], names: tuple[str, ...]) -> Mapped:
+    """Return a model as one of other parameters, of which it takes some, by their places."""
+    return Mapped(model, Sparse(picked(which, len(names)), np.zeros(len(which))), names)
 
 
 def selected(model: ForwardModel, which: Sequence[int]) -> Rows:

@@ -96,8 +96,8 @@ class Hyperelastic(LoadedBody):
         """
         if self.unrefined:
             raise ModelError(f"model.adapt: {UNREFINED}")
-        alone = "path:built" if self.stepped else "model:HyperelasticModel"
-        model = "path:HistoryModel" if self.path_dependent else alone
+        alone = "joined:path" if self.stepped else "model:HyperelasticModel"
+        model = "history:HistoryModel" if self.path_dependent else alone
         return named(f"forward.fem.{model}")(self, comm, parameters)
 
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-import numpy as np
 from pydantic import Field, model_validator
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
-from forward.combine import Joined, Mapped, Rows, Sparse, picked, sums_of
+from forward.combine import Joined, Rows, sums_of, taking
 from forward.fem.cost import Times, sum_of
 from forward.findings import Finding
 from forward.materials.admissible import Materials
@@ -176,8 +175,7 @@ class JoinedModels(ModelSpec):
             own = [(path, self.path_of(name, path)) for path in model.scalars]
             acting = [(path, parameters.index(whole)) for path, whole in own if whole in parameters]
             part = model.build(comm, tuple(path for path, _ in acting))
-            by = Sparse(picked([column for _, column in acting], len(parameters)), np.zeros(len(acting)))
-            made.append(Mapped(part, by, parameters))
+            made.append(taking(part, [column for _, column in acting], parameters))
         return Joined(tuple(made), tuple(one.name for one in self.outputs), tuple(f"model '{n}'" for n in self.models))
 
     @model_validator(mode="after")

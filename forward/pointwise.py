@@ -17,7 +17,6 @@ from forward.model import (
     ForwardModel,
     Guess,
     ModelError,
-    NodalSpace,
     Solution,
     SolveError,
     Stability,
@@ -74,15 +73,6 @@ class OfModel:
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
         return displacements(self.model)
-
-
-class OfOne(OfModel, OneByOne):
-    """A model that is made of another `model`."""
-
-    @property
-    def space(self) -> NodalSpace | None:
-        """Where the states live."""
-        return self.model.space
 
 
 class ExplicitSolution:

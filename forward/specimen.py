@@ -281,7 +281,7 @@ class Specimen(Solid):
         parameters
             As in `Hyperelastic.build`.
         """
-        return named("forward.fem.specimen:built")(self, comm, parameters)
+        return named("forward.fem.joined:specimen")(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Specimen:

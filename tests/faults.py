@@ -62,7 +62,7 @@ FAULTS = {
         "forward/combine.py", "np.split(rows, ends, axis=-1),", "np.split(rows, ends, axis=-1)[::-1],"
     ),
     "friction-adjoint": Fault(
-        "forward/fem/path.py",
+        "forward/fem/history.py",
         "carried -= np.array([equations.rubbed(row)",
         "carried += np.array([equations.rubbed(row)",
     ),

@@ -16,7 +16,13 @@ from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace, Observation
 from forward.loaded import LoadedBody
-from forward.model import FloatArray, Guess, Saturation, SolveError
+from forward.materials.admissible import Admission
+from forward.model import FloatArray, Guess, NodalSpace, Saturation, SolveError
+from forward.solvers.system import Found
+
+AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
+UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
+STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
 
 S = TypeVar("S")
 S_contra = TypeVar("S_contra", contravariant=True)
@@ -45,6 +51,8 @@ class DiscreteBody(Generic[S]):
         For a path that is not a number of the model, or an output at a point outside the body.
     """
 
+    differentiable = True
+
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
         scalars = spec.scalars
         coefficients = set(spec.coefficients)
@@ -56,10 +64,12 @@ class DiscreteBody(Generic[S]):
         self.parameters = parameters
         self.outputs = tuple(output.name for output in spec.outputs)
         self.equations = Discretisation(spec, comm, parameters)
-        self.space = BodySpace(self.equations)
+        self.space: NodalSpace = BodySpace(self.equations)
         self.rows: Observation | None = None  # what is observed in place of the outputs
         self.functionals = [output.functional(self.equations) for output in spec.outputs]
         self._richer: dict[int, Enriched] = {}  # by how many degrees; copies share it
+        self._admission = Admission(spec, parameters)
+        self._extent = max(high - low for low, high in spec.body.bounds)
 
     @cached_property
     def reference(self) -> ReferenceFactor:
@@ -105,3 +115,50 @@ class DiscreteBody(Generic[S]):
     def finer_mesh(self, spare: float) -> Calibrating[S]:
         """Return the body on a finer mesh, which may cost so many solves."""
         raise NotImplementedError
+
+    def require_admissible(self, parameters: FloatArray) -> None:
+        """Refuse parameters (d,) for which there is no model."""
+        self._admission.require(parameters)
+
+    def enters(self, found: Found, stiffer: float) -> bool:
+        """Whether the body enters a tool farther than is aimed at, with tools so many times as stiff as stated.
+
+        Raises
+        ------
+        SolveError
+            If it does, and tools cannot be stiffer.
+        """
+        equations = self.equations
+        equations.set_state(found.state)
+        for label, penetration in equations.penetrations().items():
+            depth, aim = equations.number(f"loads.{label}.depth"), self._aims[label]
+            if depth <= 0 or penetration <= aim * depth:
+                continue
+            if stiffer >= STIFFER**RAISES:
+                message = (
+                    f"the body enters the tool '{label}' by {penetration / depth:.2g} of its depth, where {aim:g} is "
+                    f"aimed at, even with tools {stiffer:g} times as stiff as the depth and the constants as stated "
+                    "ask for: pressures are far above these; state constants, or a depth, near those of the samples"
+                )
+                raise SolveError(message, work=equations.work)
+            return True
+        return False
+
+    @cached_property
+    def _aims(self) -> dict[str, float]:
+        """Penetrations that are aimed at, relative to the depth, by the labels of the tools."""
+        return {load.label: load.penetration for load in self.spec.loads if load.contact}  # type: ignore[attr-defined]
+
+    def refuse_sharp(self, found: Found) -> None:
+        """Refuse a body that nothing has moved though a tool is inside it, between the points that are looked at."""
+        equations = self.equations
+        if equations.norm(found.state) > AT_REST * self._extent:
+            return
+        for load in (load for load in self.spec.loads if load.contact):
+            numbers = {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars}
+            if load.entered(self.spec.body, numbers) > UNSEEN * numbers["depth"]:  # type: ignore[attr-defined]
+                message = (
+                    f"the tool '{load.label}' enters the body between the points at which contact is looked for: it is "
+                    "too sharp, or its depth too small, for the mesh; refine the mesh there"
+                )
+                raise SolveError(message, work=equations.work)

@@ -28,15 +28,14 @@ from scipy.sparse import csr_matrix, identity, kron
 from forward.bodies.location import locate, shapes
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
-from forward.combine import CombinedSolution, Joined, Mapped, Rows, sums_of
+from forward.combine import CombinedSolution, Joined, Mapped, OfOne, Rows, sums_of
 from forward.joined_models import JoinedMeshes
 from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError
-from forward.pointwise import OfOne, OneByOne
+from forward.pointwise import OneByOne
 
 if TYPE_CHECKING:
+    from forward.fem.joined import PathModel, SpecimenModel
     from forward.fem.model import HyperelasticModel
-    from forward.fem.path import PathModel
-    from forward.fem.specimen import SpecimenModel
     from forward.loaded import LoadedBody
     from forward.specimen import Specimen
 

@@ -10,28 +10,21 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import cached_property, partial
 from itertools import chain, groupby, islice, repeat
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from forward.fem.body import DiscreteBody
+from forward.fem.body import STIFFER, DiscreteBody
 from forward.fem.calibration import FinerMesh
 from forward.fem.cost import Linear, together
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import Observation
-from forward.loaded import LoadedBody
-from forward.materials.admissible import Admission
 from forward.model import FloatArray, Guess, InadmissibleError, ReferenceSolution, Solution, SolveError, Work
 from forward.pointwise import OneByOne
 from forward.solvers.equilibrium import solve, solving
 from forward.solvers.steps import Task, failed, finish_all
 from forward.solvers.system import Found
 from forward.solvers.way import Way
-
-AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
-UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
-STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
-
 
 P = TypeVar("P")
 
@@ -61,12 +54,6 @@ def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool
 
 class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
     """A hyperelastic body as a `ForwardModel`; parameters as of `DiscreteBody`."""
-
-    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
-        super().__init__(spec, comm, parameters)
-        self._admission = Admission(spec, parameters)
-        self._extent = max(high - low for low, high in spec.body.bounds)
-        self.differentiable = True
 
     def with_rows(self, rows: Observation, names: tuple[str, ...]) -> HyperelasticModel:
         """Return the same model whose outputs, of these names, are what is observed; collective.
@@ -191,10 +178,6 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             point, way, work = begun.popleft()
             yield found if isinstance(found, SolveError) else self.solution(point, found, work, way)
 
-    def require_admissible(self, parameters: FloatArray) -> None:
-        """Refuse parameters (d,) for which there is no model."""
-        self._admission.require(parameters)
-
     def _kept_out(self, found: Found, parameters: FloatArray) -> tuple[Found, float]:
         """Raise the stiffness of the tools until the body enters none too far; return its factor too.
 
@@ -202,47 +185,8 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         """
         equations, stiffer = self.equations, 1.0
         self.refuse_sharp(found)
-        while said := self.entered(found):
-            if stiffer >= STIFFER**RAISES:
-                raise SolveError(self.too_far(said, stiffer), work=equations.work)
+        while self.enters(found, stiffer):
             stiffer *= STIFFER
             equations.set_parameters(parameters, stiffer)
             found = solve(equations, self.spec.solver, np.zeros(equations.size), found.state)
         return found, stiffer
-
-    def too_far(self, said: str, stiffer: float) -> str:
-        """Say why there is no answer where even stiffer tools are entered too far."""
-        return (
-            f"{said}, even with tools {stiffer:g} times as stiff as the depth and the constants as stated ask for: "
-            "pressures are far above these; state constants, or a depth, near those of the samples"
-        )
-
-    def entered(self, found: Found) -> str:
-        """Say how far the body enters a tool where that is more than is aimed at; empty where it is not."""
-        equations = self.equations
-        equations.set_state(found.state)
-        for label, penetration in equations.penetrations().items():
-            depth, aim = equations.number(f"loads.{label}.depth"), self._aims[label]
-            if depth > 0 and penetration > aim * depth:
-                share = penetration / depth
-                return f"the body enters the tool '{label}' by {share:.2g} of its depth, where {aim:g} is aimed at"
-        return ""
-
-    @cached_property
-    def _aims(self) -> dict[str, float]:
-        """Penetrations that are aimed at, relative to the depth, by the labels of the tools."""
-        return {load.label: load.penetration for load in self.spec.loads if load.contact}  # type: ignore[attr-defined]
-
-    def refuse_sharp(self, found: Found) -> None:
-        """Refuse a body that nothing has moved though a tool is inside it, between the points that are looked at."""
-        equations = self.equations
-        if equations.norm(found.state) > AT_REST * self._extent:
-            return
-        for load in (load for load in self.spec.loads if load.contact):
-            numbers = {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars}
-            if load.entered(self.spec.body, numbers) > UNSEEN * numbers["depth"]:  # type: ignore[attr-defined]
-                message = (
-                    f"the tool '{load.label}' enters the body between the points at which contact is looked for: it is "
-                    "too sharp, or its depth too small, for the mesh; refine the mesh there"
-                )
-                raise SolveError(message, work=equations.work)

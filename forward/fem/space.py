@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from forward.bodies.geometry import tolerance
 from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
-from forward.model import FloatArray
+from forward.model import FloatArray, NodalSpace
 
 
 class BodySpace:
@@ -66,7 +66,7 @@ class JoinedSpace:
     """
 
     def __init__(
-        self, one: BodySpace, count: int, along: Callable[[FloatArray], FloatArray], displacements: int
+        self, one: NodalSpace, count: int, along: Callable[[FloatArray], FloatArray], displacements: int
     ) -> None:
         self.coordinates, self.displacements = one.coordinates, displacements
         self.cells, self.regions, self.variance_kept = one.cells, one.regions, one.variance_kept

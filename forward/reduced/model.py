@@ -26,8 +26,8 @@ from forward.reduced.newton import Way, in_steps, newton, predictor, stable, und
 from forward.reduced.reduced_equations import At, ReducedEquations
 
 if TYPE_CHECKING:
+    from forward.fem.joined import SpecimenModel
     from forward.fem.space import Observation
-    from forward.fem.specimen import SpecimenModel
 
 BEYOND = 0.25  # of the range of an output in the snapshots, how far beyond it is cut off
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.combine import CombinedSolution, OfOne
 from forward.model import (
     FloatArray,
     ForwardModel,
     Guess,
     InadmissibleError,
-    MeshError,
-    Saturation,
     Solution,
     SolveError,
     Stability,
@@ -25,7 +23,6 @@ from forward.model import (
     gathered,
     scattered,
 )
-from forward.pointwise import OfOne
 from uq.evaluation.checkpoint import read
 from uq.evaluation.request import Evaluations, Failure
 
@@ -117,12 +114,10 @@ class KeptModel(OfOne):
         def solved() -> Evaluations:
             begin = time.process_time()
             try:
-                solution = self.model.solve(point, guess)
+                solutions.append(self.model.solve(point, guess))
             except SolveError as error:
-                return _failed(self.outputs, error, time.process_time() - begin)
-            seconds = time.process_time() - begin
-            solutions.append(solution)
-            return _answered(self.model, point, solution, seconds)
+                return _recorded(self.model, point, error, time.process_time() - begin)
+            return _recorded(self.model, point, solutions[0], time.process_time() - begin)
 
         block, _ = self.kept.found(point, solved)
         self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
@@ -136,8 +131,8 @@ class KeptModel(OfOne):
         return KeptSolution(block, state, lambda: self.model.solve(point, replace(guess or Guess(), state=state)))
 
 
-class KeptSolution:
-    """A solution as it is stored; its model solves for it once a derivative is asked for.
+class KeptSolution(CombinedSolution):
+    """A solution whose values are stored; its model solves for it once anything else is asked.
 
     Parameters
     ----------
@@ -149,6 +144,8 @@ class KeptSolution:
         Returns the solution of the model itself.
     """
 
+    residual, converged, stability, work = 0.0, True, Stability.NOT_TESTED, Work()  # stored, not asked of `solutions`
+
     def __init__(self, block: Evaluations, state: FloatArray, solve: Callable[[], Solution]) -> None:
         self._solve = solve
         self.outputs, self.state = block.outputs[0], state
@@ -156,59 +153,29 @@ class KeptSolution:
         self.stability, self.work = Stability(block.stability[0]), Work(*block.work[0].tolist())
 
     @cached_property
-    def _solution(self) -> Solution:
-        return self._solve()
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
-        return self._solution.tangent(direction)
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return self._solution.adjoint(weights)
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state (U_local,) along a `direction` (d,), or of k of them."""
-        return self._solution.state_tangent(direction)
-
-    def mesh_error(self) -> MeshError | None:
-        """Estimate the error of the mesh."""
-        return self._solution.mesh_error()
-
-    def saturation(self, spare: float = math.inf) -> Saturation | None:
-        """Calibrate estimates of the error of the mesh."""
-        return self._solution.saturation(spare)
+    def solutions(self) -> tuple[Solution, ...]:
+        """That of the model itself."""
+        return (self._solve(),)
 
 
-def _answered(model: ForwardModel, point: FloatArray, solution: Solution, seconds: float) -> Evaluations:
-    """A solve with an answer; its state is complete on the group's first rank."""
-    whole = gathered(model, np.asarray(solution.state)[None])
+def _recorded(model: ForwardModel, point: FloatArray, found: Solution | SolveError, seconds: float) -> Evaluations:
+    """A solve, with an answer or without one; its state is complete on the group's first rank."""
+    failures: tuple[Failure, ...] = ()
+    outputs, residual, converged, whole = np.full(len(model.outputs), np.nan), np.nan, False, None
+    if isinstance(found, SolveError):
+        failures = (Failure(0, (), found.reason, found.history, found.inadmissible),)
+    else:
+        outputs, residual, converged = np.array(found.outputs), found.residual, found.converged
+        whole = gathered(model, np.asarray(found.state)[None])
     return Evaluations(
         point[None],
-        np.array(solution.outputs)[None],
+        outputs[None],
         None,
-        (),
+        failures,
         np.array([seconds]),
-        solution.work.as_array()[None],
-        np.array([solution.residual]),
-        np.array([solution.converged]),
-        np.array([solution.stability], dtype=np.int8),
+        found.work.as_array()[None],
+        np.array([residual]),
+        np.array([converged]),
+        np.array([found.stability], dtype=np.int8),
         np.zeros((0, 0)) if whole is None else whole,
-    )
-
-
-def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:
-    """A solve without an answer."""
-    failure = Failure(0, (), error.reason, error.history, error.inadmissible)
-    return Evaluations(
-        np.zeros((1, 0)),
-        np.full((1, len(outputs)), np.nan),
-        None,
-        (failure,),
-        np.array([seconds]),
-        error.work.as_array()[None],
-        np.array([np.nan]),
-        np.zeros(1, dtype=bool),
-        np.array([error.stability], dtype=np.int8),
-        np.zeros((0, 0)),
     )

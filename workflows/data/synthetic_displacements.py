@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.bodies.geometry import Body
-    from forward.fem.specimen import SpecimenModel
+    from forward.fem.joined import SpecimenModel
     from forward.model import FloatArray
     from forward.specimen import Specimen
     from inverse.methods.synthesize import Synthesize

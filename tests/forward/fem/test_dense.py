@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from forward.fem.enriched import EnrichedState
+from forward.fem.history import HistorySolution, Increment, Passed
 from forward.fem.linearisation_point import LinearisationPoint
-from forward.fem.path import HistorySolution, Increment, Passed
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
 
@@ -175,7 +175,7 @@ def test_tangent_and_adjoint_of_a_path_with_memory(steps):
         equations=equations,
         values=np.zeros((len(steps), 0)),
         parameters=equations.parameters,
-        body=SimpleNamespace(functionals=functionals(equations)),
+        functionals=functionals(equations),
         set_increment=set_increment,
         along=lambda directions: directions,
     )

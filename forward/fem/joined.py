@@ -1,6 +1,8 @@
-"""A specimen as a model: every load case is a model of its own, and with it has its own factor.
+"""One body several times, as one model: along a path, or in several load cases.
 
-Products with the derivatives of all cases, in any order, use the factors of one solution.
+Each time it is a model of its own, with its own state and factor, on one mesh. Of a path there is one set of forms, and
+each state is found from the one before. Products with the derivatives of all, in any order, use the factors of one
+solution.
 """
 
 from __future__ import annotations
@@ -13,31 +15,164 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import eye
 
 from forward.bodies.geometry import AXES
-from forward.combine import CombinedSolution, Joined, Mapped, Sparse, picked
+from forward.combine import CombinedSolution, Joined, Mapped, Sparse, mapped, taking
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import relative
 from forward.fem.equations import Discretisation
+from forward.fem.history import last_first, reached
 from forward.fem.layout import Layout, vertices_of
 from forward.fem.model import HyperelasticModel
+from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace, Observation, log_factor
-from forward.model import FloatArray, Guess, MeshError, Saturation
+from forward.loaded import LoadedBody
+from forward.model import FloatArray, Guess, MeshError, NodalSpace, Saturation, SolveError, Work
 
+FEW = 16  # parameters up to which derivatives of the states of all steps are kept
 SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
 Numbers = Sequence[int] | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class SpecimenModel(Joined):
-    """A specimen as a `ForwardModel`: its outputs are the observations of all cases, its states those of all cases.
+class JoinedBodies(Joined):
+    """A body several times as one model.
 
     Attributes
     ----------
     spec
-        The specimen (`forward.specimen.Specimen`).
+        The body and its steps, or the specimen (`forward.specimen.Specimen`).
     bodies
-        The bodies of the cases with what is observed of them.
+        The body as a model each time.
+    """
+
+    models: tuple[Mapped, ...]
+    _: KW_ONLY
+    space: NodalSpace
+    spec: Any
+    bodies: tuple[HyperelasticModel, ...]
+
+    @property
+    def equations(self) -> Discretisation:
+        """Those of the first; all share the mesh."""
+        return self.bodies[0].equations
+
+
+@dataclass(frozen=True, eq=False)
+class PathModel(JoinedBodies):
+    """A body along a path as a `ForwardModel`.
+
+    Its outputs are those of the first step, then of the second, and so on. A state holds that of the last step, so that
+    fields are those there, then those of the others in their order. Every step keeps a factor at its reference.
+
+    Attributes
+    ----------
+    values
+        Those (steps, numbers) of the numbers that have steps.
+    """
+
+    _: KW_ONLY
+    values: FloatArray
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> PathSolution:
+        """Find the equilibria of all steps at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
+
+        Raises
+        ------
+        SolveError
+            With the step at which the path stops, and the outputs before.
+        """
+        solutions: list[StepSolution] = []
+        directions = np.eye(len(parameters))
+        soon = guess is not None and guess.derivatives and len(directions) <= FEW
+        for label, model, one, given in zip(self.labels, self.bodies, self.models, self.guesses(guess), strict=True):
+            known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
+            try:
+                there = one.by.values(parameters[None])[0]
+                found = StepSolution((model.solve(there, mapped(known, one.by)),), len(there), one.by)
+                if soon:  # while its factor is at hand: the next step needs the room
+                    found = replace(found, slopes=found.state_tangent(directions))
+                solutions.append(found)
+            except SolveError as error:
+                stop = error.within(label)
+                stop.work = Work.sum_of([*(before.work for before in solutions), error.work])
+                stop.reached = reached([before.outputs for before in solutions], len(self.outputs))
+                raise stop from error
+        return PathSolution(tuple(solutions), len(parameters), order=self.order, body=self.bodies[0])
+
+    def _continued(self, solutions: Sequence[StepSolution]) -> FloatArray | None:
+        """Predict the state (U_local,) of the next step from the last two."""
+        if not solutions:
+            return None
+        last = solutions[-1].state
+        if len(solutions) == 1:
+            return last
+        before, here, there = self.values[len(solutions) - 2 : len(solutions) + 1]
+        step = here - before
+        ahead: float = (there - here) @ step / (step @ step)
+        return last + ahead * (last - solutions[-2].state)
+
+
+@dataclass(frozen=True, eq=False)
+class StepSolution(CombinedSolution):
+    """The equilibrium of a step, with derivatives (d, U_local) of its state where they were found with it."""
+
+    solutions: tuple[FiniteElementSolution]
+    slopes: FloatArray | None = None
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state (U_local,) along a `direction` (d,), or (k, U_local); collective."""
+        return super().state_tangent(direction) if self.slopes is None else direction @ self.slopes
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
+        return self.solutions[0].along(self.state_tangent(direction), self._directions(direction))
+
+
+@dataclass(frozen=True, eq=False)
+class PathSolution(CombinedSolution):
+    """The equilibria of all steps with their linearisations."""
+
+    solutions: tuple[StepSolution, ...]
+    _: KW_ONLY
+    body: HyperelasticModel
+
+    def visit(self) -> Discretisation:
+        """Return the equations, set to the last step."""
+        return self.solutions[-1].solutions[0].visit()
+
+    def saturations(self, spare: float) -> list[Saturation | None]:
+        """Calibrate each step on one finer mesh; collective."""
+        finer = self.body.finer_mesh(spare)
+        return [one.solutions[0].saturation(spare, finer) for one in self.solutions]
+
+
+def path(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathModel:
+    """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
+    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.stepped))
+    bodies = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
+    values = np.array(list(spec.stepped.values())).T
+    extended = eye(len(parameters) + len(spec.stepped), len(parameters), format="csr")
+    maps = [Sparse(extended, np.append(np.zeros(len(parameters)), of_step)) for of_step in values]
+    return PathModel(
+        tuple(Mapped(body, by, parameters) for body, by in zip(bodies, maps, strict=True)),
+        tuple(output.name for output in spec.returned),
+        spec.labels,
+        last_first(len(spec.labels)),
+        space=JoinedSpace(whole.space, len(spec.labels), maps[0].along, whole.space.displacements),
+        spec=spec,
+        bodies=bodies,
+        values=values,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenModel(JoinedBodies):
+    """A specimen as a `ForwardModel`: its outputs are the observations of all cases, its states those of all cases.
+
+    Attributes
+    ----------
     places
         Points (n, 3) at which the outputs are observed (m, undeformed); NaN of those at no point.
     axes
@@ -48,11 +183,7 @@ class SpecimenModel(Joined):
         Their load cases (n,), by number.
     """
 
-    models: tuple[Mapped, ...]
     _: KW_ONLY
-    space: JoinedSpace
-    spec: Any
-    bodies: tuple[HyperelasticModel, ...]
     places: FloatArray
     axes: NDArray[np.int64]
     directions: FloatArray
@@ -111,11 +242,6 @@ class SpecimenModel(Joined):
             cases=of_cases,
         )
 
-    @property
-    def equations(self) -> Discretisation:
-        """Those of the first case; all share the mesh."""
-        return self.bodies[0].equations
-
     @cached_property
     def vertices(self) -> Layout:
         """The vertices of the mesh in the canonical order, and its cells; collective when first used."""
@@ -173,7 +299,7 @@ class SpecimenSolution(CombinedSolution):
         return replace(found, outputs=outputs, shifts=None, doubts=None)
 
 
-def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
+def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
     """Return a specimen (`forward.specimen.Specimen`) as a model of some of its numbers, by their paths; collective.
 
     Raises
@@ -191,8 +317,7 @@ def built(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         loaded = spec.loaded(case)
         where = np.flatnonzero(np.isin(parameters, [*loaded.scalars, *loaded.coefficients]))
         bodies.append(loaded.build(comm, tuple(parameters[i] for i in where)))
-        by = Sparse(picked(where, len(parameters)), np.zeros(len(where)))
-        models.append(Mapped(bodies[-1], by, parameters))
+        models.append(taking(bodies[-1], where, parameters))
     none = np.zeros(0, dtype=np.int64)
     model = SpecimenModel(
         tuple(models),

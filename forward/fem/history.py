@@ -1,7 +1,6 @@
-"""A body in several steps: one mesh and one set of forms, a state for every step, each found from the one before.
+"""A body on which tools rub, or items remember: the load grows in increments, each found from the one before.
 
-Mostly steps only say where the curve is known. With friction the state depends on the states before, and the load grows
-in increments. With the states u_i at their ends, F_i(u_i, u_{i−1}, ω) = 0. Tangents go forward through the increments,
+With the states u_i at their ends, F_i(u_i, u_{i−1}, ω) = 0. Tangents go forward through the increments,
 K_i du_i = −∂F_i/∂ω dω − C_i du_{i−1} with C_i = ∂F_i/∂u_{i−1}, and adjoints back, K_iᵀλ_i = ∂ψ/∂u_i − C_{i+1}ᵀλ_{i+1}:
 they are those of the path as it is computed, for one factor of each increment. What items keep stands behind u_i.
 """
@@ -10,159 +9,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Never
+from typing import Any, NamedTuple, Never
 
 import numpy as np
-from scipy.sparse import eye
 
-from forward.combine import CombinedSolution, Joined, Mapped, Sparse, mapped, side_by_side
-from forward.fem.body import not_estimated
+from forward.combine import side_by_side
+from forward.fem.body import STIFFER, DiscreteBody, not_estimated
 from forward.fem.equations import Discretisation
-from forward.fem.model import RAISES, STIFFER, HyperelasticModel
-from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import JoinedSpace
 from forward.loaded import LoadedBody
-from forward.model import FloatArray, Guess, Saturation, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, SolveError, Stability, Work
 from forward.pointwise import OneByOne
 from forward.solvers.acceptance import Diverged
 from forward.solvers.newton import newton
 from forward.solvers.system import Found
 from forward.terms.acting import Past
 
-FEW = 16  # parameters up to which derivatives of the states of all steps are kept
 SMALLEST = 1 / 64  # of an increment, to which it may be divided where Newton's method fails
-
-
-@dataclass(frozen=True, eq=False)
-class PathModel(Joined):
-    """A body along a path as a `ForwardModel`.
-
-    Its outputs are those of the first step, then of the second, and so on. A state holds that of the last step, so that
-    fields are those there, then those of the others in their order. Every step keeps a factor at its reference.
-
-    Attributes
-    ----------
-    spec
-        The body and its steps.
-    steps
-        The body as a model at each step.
-    values
-        Those (steps, numbers) of the numbers that have steps.
-    """
-
-    models: tuple[Mapped, ...]
-    _: KW_ONLY
-    spec: LoadedBody
-    steps: tuple[HyperelasticModel, ...]
-    values: FloatArray
-
-    @property
-    def equations(self) -> Discretisation:
-        """Those of all steps."""
-        return self.steps[0].equations
-
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> PathSolution:
-        """Find the equilibria of all steps at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
-
-        Raises
-        ------
-        SolveError
-            With the step at which the path stops, and the outputs before.
-        """
-        solutions: list[StepSolution] = []
-        directions = np.eye(len(parameters))
-        soon = guess is not None and guess.derivatives and len(directions) <= FEW
-        for label, model, one, given in zip(self.labels, self.steps, self.models, self.guesses(guess), strict=True):
-            known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
-            try:
-                there = one.by.values(parameters[None])[0]
-                found = StepSolution((model.solve(there, mapped(known, one.by)),), len(there), one.by)
-                if soon:  # while its factor is at hand: the next step needs the room
-                    found = replace(found, slopes=found.state_tangent(directions))
-                solutions.append(found)
-            except SolveError as error:
-                stop = error.within(label)
-                stop.work = Work.sum_of([*(before.work for before in solutions), error.work])
-                stop.reached = reached([before.outputs for before in solutions], len(self.outputs))
-                raise stop from error
-        return PathSolution(tuple(solutions), len(parameters), order=self.order, body=self.steps[0])
-
-    def _continued(self, solutions: Sequence[StepSolution]) -> FloatArray | None:
-        """Predict the state (U_local,) of the next step from the last two."""
-        if not solutions:
-            return None
-        last = solutions[-1].state
-        if len(solutions) == 1:
-            return last
-        before, here, there = self.values[len(solutions) - 2 : len(solutions) + 1]
-        step = here - before
-        ahead: float = (there - here) @ step / (step @ step)
-        return last + ahead * (last - solutions[-2].state)
-
-
-def built(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathModel:
-    """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
-    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.stepped))
-    steps = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
-    values = np.array(list(spec.stepped.values())).T
-    extended = eye(len(parameters) + len(spec.stepped), len(parameters), format="csr")
-    maps = [Sparse(extended, np.append(np.zeros(len(parameters)), of_step)) for of_step in values]
-    return PathModel(
-        tuple(Mapped(step, by, parameters) for step, by in zip(steps, maps, strict=True)),
-        tuple(output.name for output in spec.returned),
-        spec.labels,
-        last_first(len(spec.labels)),
-        JoinedSpace(whole.space, len(spec.labels), maps[0].along, whole.space.displacements),
-        spec=spec,
-        steps=steps,
-        values=values,
-    )
-
-
-def last_first(count: int) -> tuple[int, ...]:
-    """Return the order of the states of steps."""
-    return count - 1, *range(count - 1)
-
-
-def reached(known: Sequence[FloatArray], count: int) -> FloatArray:
-    """Return the outputs of the first steps among all, which are NaN."""
-    return np.concatenate([*known, np.full(count - sum(map(len, known)), np.nan)])
-
-
-@dataclass(frozen=True, eq=False)
-class StepSolution(CombinedSolution):
-    """The equilibrium of a step, with derivatives (d, U_local) of its state where they were found with it."""
-
-    solutions: tuple[FiniteElementSolution]
-    slopes: FloatArray | None = None
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        return super().state_tangent(direction) if self.slopes is None else direction @ self.slopes
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        return self.solutions[0].along(self.state_tangent(direction), self._directions(direction))
-
-
-@dataclass(frozen=True, eq=False)
-class PathSolution(CombinedSolution):
-    """The equilibria of all steps with their linearisations."""
-
-    solutions: tuple[StepSolution, ...]
-    _: KW_ONLY
-    body: HyperelasticModel
-
-    def visit(self) -> Discretisation:
-        """Return the equations, set to the last step."""
-        return self.solutions[-1].solutions[0].visit()
-
-    def saturations(self, spare: float) -> list[Saturation | None]:
-        """Calibrate each step on one finer mesh; collective."""
-        finer = self.body.finer_mesh(spare)
-        return [one.solutions[0].saturation(spare, finer) for one in self.solutions]
 
 
 class Increment(NamedTuple):
@@ -198,30 +62,22 @@ class Passed(NamedTuple):
     left: tuple[Past, ...] = ()
 
 
-class HistoryModel(OneByOne):
+class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
     """A body on which tools rub or items remember, along a path or under one load, as a `ForwardModel`.
 
     Every increment is solved from the one before by Newton's method, so that predictions of states are not used.
-
-    Parameters
-    ----------
-    spec
-        The body, and its steps if it has any.
-    comm, parameters
-        As in `HyperelasticModel`.
+    Parameters as of `DiscreteBody`; the equations have the numbers with steps too.
     """
 
-    def __init__(self, spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> None:
-        self.spec, self.parameters = spec, parameters
+    def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...]) -> None:
         steps = spec.stepped
+        super().__init__(spec.whole, comm, (*parameters, *steps))
+        self.spec, self.parameters = spec, parameters
         self.outputs = tuple(output.name for output in spec.returned)
         self.values = np.array(list(steps.values())).T if steps else np.zeros((1, 0))  # (steps, numbers with steps)
-        self.body = HyperelasticModel(spec.whole, comm, (*parameters, *steps))
-        self.equations: Discretisation = self.body.equations
         self._each = spec.increments // len(self.values)
         self.equations.increments = spec.increments
-        self.space = JoinedSpace(self.body.space, len(self.values), self.along, self.body.space.displacements)
-        self.differentiable = True
+        self.space = JoinedSpace(self.space, len(self.values), self.along, self.space.displacements)
 
     def along(self, direction: FloatArray) -> FloatArray:
         """Return a direction (…, d) of the parameters as one of the parameters of the body."""
@@ -261,7 +117,7 @@ class HistoryModel(OneByOne):
         """
         equations, settings = self.equations, self.spec.solver
         equations.linearisation_point.begin()
-        self.body.require_admissible(np.append(parameters, self.values[-1]))
+        self.require_admissible(np.append(parameters, self.values[-1]))
         equations.work = Work()
         stiffer, history, passed = 1.0, list[str](), list[Passed]()
         with equations.time_limit(settings.solve_seconds):
@@ -278,11 +134,8 @@ class HistoryModel(OneByOne):
             self._pass(parameters, increment, passed, stiffer, history)
             if increment.returned:
                 found = Found(passed[-1].state, passed[-1].residual)
-                self.body.refuse_sharp(found)
-                said = self.body.entered(found)
-                if said and stiffer >= STIFFER**RAISES:
-                    raise SolveError(self.body.too_far(said, stiffer))
-                if said:
+                self.refuse_sharp(found)
+                if self.enters(found, stiffer):
                     return False
         return True
 
@@ -330,7 +183,7 @@ class HistoryModel(OneByOne):
     ) -> Never:
         """Raise the reason with the outputs of the steps that were reached."""
         known = HistorySolution(self, parameters, tuple(passed), self.equations.work, stiffer).outputs
-        stop = error.within(self.spec.labels[len(known) // len(self.body.outputs)]) if self.spec.labels else error
+        stop = error.within(self.spec.labels[len(known) // len(self.functionals)]) if self.spec.labels else error
         found = reached([known], len(self.outputs))
         raise type(error)(stop.reason, history, self.equations.work, error.stability, found) from error
 
@@ -353,7 +206,7 @@ class HistorySolution:
         for i, one in enumerate(passed):
             if one.at.returned:
                 self._visit(i)
-                found.append([functional.value() for functional in model.body.functionals])
+                found.append([functional.value() for functional in model.functionals])
         self.outputs = np.array(found).ravel()
         for array in (self.parameters, self.state, self.outputs):
             array.flags.writeable = False
@@ -412,7 +265,7 @@ class HistorySolution:
         found = {}
         for i in (i for i, one in enumerate(self.passed) if one.at.returned):
             size = self._visit(i).size_before
-            functionals = self._model.body.functionals
+            functionals = self._model.functionals
             before = [f.gradient_before() if hasattr(f, "gradient_before") else np.zeros(size) for f in functionals]
             of_state = np.array([f.gradient() for f in functionals])
             found[i] = of_state, np.array(before), np.array([f.partial() for f in functionals])
@@ -448,3 +301,13 @@ class HistorySolution:
         raise not_estimated(self._model.spec.unestimated_with)
 
     saturation = mesh_error
+
+
+def last_first(count: int) -> tuple[int, ...]:
+    """Return the order of the states of steps."""
+    return count - 1, *range(count - 1)
+
+
+def reached(known: Sequence[FloatArray], count: int) -> FloatArray:
+    """Return the outputs of the first steps among all, which are NaN."""
+    return np.concatenate([*known, np.full(count - sum(map(len, known)), np.nan)])
