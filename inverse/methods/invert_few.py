@@ -177,7 +177,7 @@ def invert_few(
         "why": str(verdict),
         "solves": np.array(counted.solves + (0 if chains is None else chains.apart)),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
-        "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in searched.steps]).reshape(-1, 4),
+        "step": np.array(searched.steps).reshape(-1, 4),
         "start_mode": posterior.physical(searched.modes),
         "start_log_posterior": searched.ends,
         "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),

@@ -22,7 +22,7 @@ from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
-from inverse.fields.newton_cg import Mode, find_mode
+from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise_size import SolvedField, infer_noise
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import corrected_field, told
@@ -150,7 +150,7 @@ def invert_field(
         "why": str(verdict),
         "solves": np.array(posterior.counts.solves),
         "products": np.array(mode.products + spectrum.products),
-        "step": _steps(mode),
+        "step": np.array(mode.iterations).reshape(-1, len(COLUMNS["field"])),
         "stiffness_mode": vertices.offset + found.mean,
         "alone_stiffness_std": np.array([_alone_std(found, data.cases == k) for k in range(cases)]),
         "neglected": np.array(spectrum.neglected),
@@ -200,12 +200,6 @@ def _of_stiffness(found: LowRankPosterior, vertices: Vertices, method: Invert, c
         "stiffness_std": std,
         "stiffness_draw": vertices.offset + draws,
     }
-
-
-def _steps(mode: Mode) -> FloatArray:
-    return np.array(
-        [[r.misfit, r.penalty, r.gradient, r.pairs, r.products, r.length, r.solves] for r in mode.iterations]
-    ).reshape(-1, len(COLUMNS["field"]))
 
 
 def _of_mean(
