@@ -67,7 +67,7 @@ def examine(residual: FloatArray, spectrum: Spectrum, neighbours: Neighbours | N
 def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     """Return all pairs of AᵀA of few parameters at a point with derivatives; the noise is no parameter of these."""
     d = len(posterior.inputs.names)
-    root = np.sqrt(posterior.noise.errors.information(posterior.residuals(at.outputs, at.x)[0]))
+    root = np.sqrt(posterior.noise.information(posterior.residuals(at.outputs, at.x)[0]))
     A = posterior.sensitivities(at)[0] * root[:, None]
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T

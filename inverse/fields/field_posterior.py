@@ -164,17 +164,17 @@ class Point:
     @cached_property
     def root(self) -> FloatArray:
         """√ (n,) of the weights of the data for Gauss–Newton: 1 for normal errors, see `inverse.data.noise`."""
-        return np.asarray(np.sqrt(self.posterior.noise.errors.information(self.gaps)))
+        return np.asarray(np.sqrt(self.posterior.noise.information(self.gaps)))
 
     @cached_property
     def residual(self) -> FloatArray:
         """Residuals r (n,); for errors that are not normal, with the same gradient under Gauss–Newton weights."""
-        return np.asarray(self.posterior.noise.errors.score(self.gaps) / self.root)
+        return np.asarray(self.posterior.noise.score(self.gaps) / self.root)
 
     @cached_property
     def misfit(self) -> float:
         """−ln p(y | ξ) without Σ ln σ + (n/2) ln 2π: ½ r·r for normal errors."""
-        minus_log = self.posterior.noise.errors.minus_log(self.gaps) - HALF_LOG
+        minus_log = self.posterior.noise.minus_log(self.gaps) - HALF_LOG
         return float(self.posterior.measured @ minus_log)
 
     @property

@@ -146,8 +146,7 @@ def invert_few(
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
-    errors = posterior.noise.errors
-    residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
+    residual, root = posterior.noise.normal_scores(raw), np.sqrt(posterior.noise.information(raw))
     test = examine(residual, spectrum, data.neighbours())
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
@@ -248,4 +247,4 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
     noise = posterior.noise
     scale = (np.ones(len(draws)) if noise.factor is None else draws[:, -1])[:, None] * noise.scale
     gaps = noise.whitened((outputs - posterior.data) / scale)
-    return {"draw": draws, "draw_log_likelihood": -noise.errors.minus_log(gaps) - np.log(scale)}
+    return {"draw": draws, "draw_log_likelihood": -noise.minus_log(gaps) - np.log(scale)}

@@ -108,7 +108,7 @@ def invert_field(
     log_evidence = solved.log_evidence
     spectrum = found.spectrum
     root = mode.point.root
-    residual = posterior.noise.errors.normal_scores(mode.point.gaps)
+    residual = posterior.noise.normal_scores(mode.point.gaps)
     test = examine(residual, spectrum, data.neighbours())
     samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None

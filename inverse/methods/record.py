@@ -109,7 +109,7 @@ class Problem:
     @property
     def noise(self) -> Noise:
         """The errors of the data, as they are stated."""
-        return Noise(self.data.sigma, self.errors, self.method.noise)
+        return Noise(self.data.sigma, self.errors.dof, self.method.noise)
 
 
 def as_dataset(record: Record) -> xr.Dataset:
