@@ -37,7 +37,6 @@ from inverse.methods.invert import Invert
 from inverse.methods.record import (
     ENDS,
     SOURCES,
-    TRUST,
     Problem,
     Record,
     as_dataset,
@@ -46,7 +45,7 @@ from inverse.methods.record import (
     of_mesh,
     of_motions,
     of_prior,
-    of_test,
+    of_verdict,
 )
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
@@ -154,7 +153,7 @@ def invert_few(
     points, *drawn = _drawn(posterior, one, at, method)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
-        **of_test(test),
+        **of_verdict(verdict, test),
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
         **of_motions(spectrum, posterior.noise, root),
@@ -172,8 +171,6 @@ def invert_few(
         "effective": np.array(found.ess),
         "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),
-        "trust": np.array(TRUST.index(verdict.trust)),
-        "why": str(verdict),
         "solves": np.array(counted.solves + (0 if chains is None else chains.apart)),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
         "step": np.array(searched.steps).reshape(-1, 4),

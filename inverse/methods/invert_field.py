@@ -30,7 +30,6 @@ from inverse.methods.record import (
     COLUMNS,
     ENDS,
     SHOWN,
-    TRUST,
     Problem,
     Record,
     as_dataset,
@@ -39,7 +38,7 @@ from inverse.methods.record import (
     of_mesh,
     of_motions,
     of_prior,
-    of_test,
+    of_verdict,
     ritz,
 )
 
@@ -132,7 +131,7 @@ def invert_field(
     record: Record = {
         **of_motions(spectrum, mode.point.posterior.seen, root),
         **of_data(data, predicted, residual, scale / root, spectrum),
-        **of_test(test),
+        **of_verdict(verdict, test),
         **of_prior(mode.point.whitened, spectrum),
         **of_mesh(mesh, before, np.size(mean["mode"]) - 1),
         **mean,
@@ -146,8 +145,6 @@ def invert_field(
         "effective": np.array(np.nan if weighed is None else weighed.ess),
         "tail": np.array(np.nan if weighed is None else weighed.pareto_k),
         "converged": np.array(converged),
-        "trust": np.array(TRUST.index(verdict.trust)),
-        "why": str(verdict),
         "solves": np.array(posterior.counts.solves),
         "products": np.array(mode.products + spectrum.products),
         "step": np.array(mode.iterations).reshape(-1, len(COLUMNS["field"])),
