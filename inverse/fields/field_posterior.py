@@ -104,6 +104,12 @@ class FieldPosterior:
         """1/σ (n,) of what was measured."""
         return self.measured / self.seen.scale
 
+    @cached_property
+    def constant(self) -> float:
+        """What −ln p(y | ξ) has besides the misfit: Σ ln σ + ½ ln det(I + ŨŨᵀ) + (n/2) ln 2π of what was measured."""
+        weights = self.weights[self.weights > 0]
+        return self.seen.log_determinant - float(np.log(weights).sum()) + len(weights) * HALF_LOG
+
     def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
         return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)
@@ -180,9 +186,7 @@ class Point:
     @property
     def log_likelihood(self) -> float:
         """Ln p(y | ξ)."""
-        weights = self.posterior.weights[self.posterior.weights > 0]
-        more = self.posterior.seen.log_determinant
-        return -self.misfit - more + float(np.log(weights).sum()) - len(weights) * HALF_LOG
+        return -self.misfit - self.posterior.constant
 
     @property
     def penalty(self) -> float:
