@@ -97,7 +97,7 @@ def curved(limit=np.inf):
 def examine_few(posterior, gaussian, neighbours=None):
     """Test the residuals of few parameters at the mode: a solve with derivatives."""
     at = posterior.at(gaussian.mode[None], derivatives=True)
-    residual = posterior.noise.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
+    residual = posterior.noise.normal_scores(posterior.residuals(at.outputs, at.x)[0])
     return examine(residual, spectrum_of(posterior, at), neighbours)
 
 

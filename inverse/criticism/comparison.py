@@ -90,7 +90,7 @@ def criticise(found: Points, posterior: Posterior, data: Measurements) -> Critic
     used = found.weights > 0
     w, x = found.weights[used], found.x[used]
     scale, r = posterior.scale(x), posterior.residuals(found.outputs[used], x)
-    pointwise = -(r**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2
+    pointwise = -posterior.noise.minus_log(r) - np.log(scale)
     log_ratio = np.log(w)[:, None] - pointwise
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
@@ -181,8 +181,11 @@ def comparison(
     whole = {pair: one.assessment.log_evidence for pair, one in found.items()}
     weights = np.array([candidate.weight for candidate in candidates.values()])
 
-    def table(value: Callable[[Compared], Any]) -> Any:
-        return (("model", "group"), np.array([[value(found[name, group]) for group in groups] for name in names]))
+    def table(values: Mapping[Pair, Any]) -> Any:
+        return (("model", "group"), np.array([[values[name, group] for group in groups] for name in names]))
+
+    def each(value: Callable[[Compared], Any]) -> Any:
+        return table({pair: value(one) for pair, one in found.items()})
 
     def totals(values: Mapping[Pair, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
         parts = [[values[name, group] for group in groups if (name, group) in values] for name in names]
@@ -208,19 +211,19 @@ def comparison(
         "variant_log_evidence": (("variant", "model"), np.array(sums)),
         "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
         "variant_probability": (("variant", "model"), chances),
-        "group_log_evidence": table(lambda one: one.assessment.log_evidence[0]),
-        "group_log_evidence_error": table(lambda one: one.assessment.log_evidence[1]),
-        "laplace_log_evidence": table(lambda one: one.assessment.gaussian.log_evidence),
-        "converged": table(lambda one: one.assessment.gaussian.converged),
-        "route": table(lambda one: one.assessment.evidence.route),
-        "why": table(lambda one: one.assessment.evidence.why),
-        "effective": table(lambda one: one.assessment.evidence.ess),
-        "tail": table(lambda one: one.assessment.evidence.pareto_k),
-        "trusted": table(lambda one: one.assessment.known),
-        "trust": table(lambda one: one.verdict.trust),
-        "verdict": table(lambda one: one.verdict.why),
-        "misfit_probability": table(lambda one: one.critic.misfit),
-        "correlation_probability": table(lambda one: one.critic.correlation),
+        "group_log_evidence": each(lambda one: one.assessment.log_evidence[0]),
+        "group_log_evidence_error": each(lambda one: one.assessment.log_evidence[1]),
+        "laplace_log_evidence": each(lambda one: one.assessment.gaussian.log_evidence),
+        "converged": each(lambda one: one.assessment.gaussian.converged),
+        "route": each(lambda one: one.assessment.evidence.route),
+        "why": each(lambda one: one.assessment.evidence.why),
+        "effective": each(lambda one: one.assessment.evidence.ess),
+        "tail": each(lambda one: one.assessment.evidence.pareto_k),
+        "trusted": each(lambda one: one.assessment.known),
+        "trust": each(lambda one: one.verdict.trust),
+        "verdict": each(lambda one: one.verdict.why),
+        "misfit_probability": each(lambda one: one.critic.misfit),
+        "correlation_probability": each(lambda one: one.critic.correlation),
         "score": ("model", scores.sum(axis=1)),
         "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
         "score_behind": ("model", behind.sum(axis=1)),
@@ -236,8 +239,7 @@ def comparison(
     }
     for k, end in enumerate(("", "_error")):
         if checks:
-            values = [[checks[name, group][k] for group in groups] for name in names]
-            variables[f"nested_log_evidence{end}"] = (("model", "group"), np.array(values))
+            variables[f"nested_log_evidence{end}"] = table({pair: pairs[k] for pair, pairs in checks.items()})
         if left_out:
             pairs = [(totals({pair: whole[pair] for pair in rest})[k], totals(rest)[k]) for rest in left_out.values()]
             rows = [np.hypot(ours, without) if k else ours - without for ours, without in pairs]
@@ -248,10 +250,11 @@ def comparison(
     parameters = list(dict.fromkeys(p for one in found.values() for p in one.posterior.names))
     variables |= _by_point(names, groups, parameters, found)
     variables |= _constants(names, groups, parameters, found)
-    if all(one.assessment.chains is not None for one in found.values()):
-        variables["chains"] = table(lambda one: len(one.assessment.chains.draws) * one.assessment.chains.mixed)
-        variables["chain_rhat"] = table(lambda one: one.assessment.chains.rhat.max())
-        variables["chain_effective"] = table(lambda one: one.assessment.chains.ess)
+    chains = {pair: one.assessment.chains for pair, one in found.items() if one.assessment.chains is not None}
+    if chains:
+        variables["chains"] = table({pair: len(one.draws) * one.mixed for pair, one in chains.items()})
+        variables["chain_rhat"] = table({pair: one.rhat.max() for pair, one in chains.items()})
+        variables["chain_effective"] = table({pair: one.ess for pair, one in chains.items()})
     if all(one.mesh is not None for one in found.values()):
         variables |= _meshes(names, data_groups, parameters, found)
     coordinates = {"model": names, "group": groups, "variant": list(variants), "parameter": parameters}

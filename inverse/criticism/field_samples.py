@@ -128,10 +128,7 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
     """
     z = np.random.default_rng(seed).standard_normal((samples, len(mode.whitened)))
     whitened, log_density = bent(mode, found)(z)
-    weights = mode.posterior.weights[mode.posterior.weights > 0]
-    constant = float(np.log(weights).sum()) - len(weights) / 2 * float(np.log(2 * np.pi)) + found.log_determinant / 2
-    constant -= mode.posterior.seen.log_determinant
-    log_weights = log_density + (z**2).sum(axis=1) / 2 + constant
+    log_weights = log_density + (z**2).sum(axis=1) / 2 + (found.log_determinant / 2 - mode.posterior.constant)
     if not np.isfinite(log_weights.max()):
         raise SolveError("the model has no answer at any of the samples of the Gaussian")
     return FieldWeights(mode.posterior.values(whitened), log_weights)

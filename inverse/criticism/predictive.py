@@ -31,16 +31,13 @@ class ResidualTest:
         Its expectation n − tr S: the effective degrees of freedom.
     probability
         Of a larger one. Small: the model does not explain the data; near 1: σ is too large.
-    agreement
-        Σ r_i r_j/Σ r² over neighbours; NaN where there are none.
     agreement_probability
-        Probability of neighbours that agree as much or more.
+        Probability of neighbours that agree as much or more, by Σ r_i r_j/Σ r² over them; NaN where there are none.
     """
 
     square: float
     degrees: float
     probability: float
-    agreement: float
     agreement_probability: float
 
 
@@ -57,20 +54,20 @@ def examine(residual: FloatArray, spectrum: Spectrum, neighbours: Neighbours | N
     scale = float((weights**2).sum()) / total
     probability = float(chdtrc(total / scale, square / scale))
     if neighbours is None or not len(neighbours[0]):
-        return ResidualTest(square, total, probability, np.nan, np.nan)
+        return ResidualTest(square, total, probability, np.nan)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, n))
     # (I − S)^{1/2}: the images are the eigenvectors of S times √λ.
     share = np.divide((1 + values) ** -0.5 - 1, values, out=np.zeros_like(values), where=values > 0)
     drawn = drawn + (drawn @ spectrum.images.T * share) @ spectrum.images
     here = float(agreement(residual[None], neighbours)[0])
     larger = (1 + int((agreement(drawn, neighbours) >= here).sum())) / (DRAWS + 1)
-    return ResidualTest(square, total, probability, here, larger)
+    return ResidualTest(square, total, probability, larger)
 
 
 def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     """Return all pairs of AᵀA of few parameters at a point with derivatives; the noise is no parameter of these."""
     d = len(posterior.inputs.names)
-    root = np.sqrt(posterior.noise.errors.information(posterior.residuals(at.outputs, at.x)[0]))
+    root = np.sqrt(posterior.noise.information(posterior.residuals(at.outputs, at.x)[0]))
     A = posterior.sensitivities(at)[0] * root[:, None]
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T

@@ -39,29 +39,10 @@ class NormalErrors(Settings):
 
     kind: Literal["normal"] = "normal"
 
-    def minus_log(self, r: FloatArray) -> FloatArray:
-        """Return ρ, −ln of the density, of residuals over the scale, of any shape."""
-        return np.asarray(r**2 / 2 + HALF_LOG)
-
-    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
-        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
-        return np.asarray((r**2).sum(axis=1) / 2 + log_scale + r.shape[1] * HALF_LOG)
-
-    def score(self, r: FloatArray) -> FloatArray:
-        """Return ψ = ρ′."""
-        return r
-
-    def information(self, r: FloatArray) -> FloatArray:
-        """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""
-        return np.ones_like(r)
-
-    def turn(self, r: FloatArray) -> FloatArray:
-        """Return (rψ)′, for derivatives by the logarithm of the scale."""
-        return 2 * r
-
-    def normal_scores(self, r: FloatArray) -> FloatArray:
-        """Return standard normal values of the same probabilities."""
-        return r
+    @property
+    def dof(self) -> float | None:
+        """Degrees of freedom: infinitely many."""
+        return None
 
 
 class StudentErrors(Settings):
@@ -77,37 +58,10 @@ class StudentErrors(Settings):
     kind: Literal["student-t"] = "student-t"
     degrees: Annotated[float, Field(ge=1, le=1000)] = 4.0
 
-    def minus_log(self, r: FloatArray) -> FloatArray:
-        """Return ρ, −ln of the density, of residuals over the scale, of any shape."""
-        from scipy.special import gammaln
-
-        nu = self.degrees
-        constant = gammaln(nu / 2) - gammaln((nu + 1) / 2) + np.log(nu * np.pi) / 2
-        return np.asarray((nu + 1) / 2 * np.log1p(r**2 / nu) + constant)
-
-    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
-        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
-        return np.asarray(self.minus_log(r).sum(axis=1) + log_scale)
-
-    def score(self, r: FloatArray) -> FloatArray:
-        """Return ψ = ρ′."""
-        return np.asarray((self.degrees + 1) * r / (self.degrees + r**2))
-
-    def information(self, r: FloatArray) -> FloatArray:
-        """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""
-        nu = self.degrees
-        return np.asarray((nu + 1) ** 2 / ((nu + 3) * (nu + r**2)))
-
-    def turn(self, r: FloatArray) -> FloatArray:
-        """Return (rψ)′, for derivatives by the logarithm of the scale."""
-        nu = self.degrees
-        return np.asarray(2 * nu * (nu + 1) * r / (nu + r**2) ** 2)
-
-    def normal_scores(self, r: FloatArray) -> FloatArray:
-        """Return standard normal values of the same probabilities."""
-        from scipy.special import ndtri, stdtr
-
-        return np.asarray(-np.sign(r) * ndtri(np.maximum(stdtr(self.degrees, -np.abs(r)), 1e-300)))
+    @property
+    def dof(self) -> float | None:
+        """Degrees of freedom."""
+        return self.degrees
 
 
 Errors = Annotated[NormalErrors | StudentErrors, Field(discriminator="kind")]
@@ -156,8 +110,8 @@ class Noise:
     ----------
     sigma
         Stated standard deviations σ (m,) of independent errors; of heavy tails the scales.
-    errors
-        Distribution of the independent errors over their scales.
+    dof
+        Degrees of freedom ν of Student's errors, over their scales; None for normal ones.
     factor
         Prior of s; None for s = 1.
     shared
@@ -167,7 +121,7 @@ class Noise:
     """
 
     sigma: FloatArray
-    errors: NormalErrors | StudentErrors = NORMAL
+    dof: float | None = None
     factor: Distribution | None = None
     shared: FloatArray | None = None
     model: ModelError | None = None
@@ -200,7 +154,7 @@ class Noise:
         more = np.zeros(len(self.sigma))
         if self.model is not None:
             more = more + (self.model.apart / self.model.scale) ** 2
-        if self.errors.kind != "normal":
+        if self.dof is not None:
             more = more + (self._rows**2).sum(axis=0)
         return np.sqrt(self.sigma**2 + more) if self.model is not None or more.any() else self.sigma
 
@@ -213,7 +167,7 @@ class Noise:
     @cached_property
     def _basis(self) -> tuple[FloatArray, FloatArray]:
         """S (k,) and Vᵀ (k, m)."""
-        if not len(self._rows) or self.errors.kind != "normal":
+        if not len(self._rows) or self.dof is not None:
             return np.zeros(0), np.zeros((0, len(self.sigma)))
         _, sizes, basis = np.linalg.svd(self._rows / self.scale, full_matrices=False)
         return sizes, basis
@@ -237,3 +191,43 @@ class Noise:
     def coloured(self, rows: FloatArray) -> FloatArray:
         """Return W⁻¹r (…, m)."""
         return np.asarray(rows + ((rows @ self._basis[1].T) * (self._less / (1 - self._less))) @ self._basis[1])
+
+    # --- independent residuals, over the scale ------------------------------------------------------------------------
+
+    def minus_log(self, r: FloatArray) -> FloatArray:
+        """Return ρ, −ln of the density, of residuals of any shape."""
+        from scipy.special import gammaln
+
+        nu = self.dof
+        if nu is None:
+            return np.asarray(r**2 / 2 + HALF_LOG)
+        constant = gammaln(nu / 2) - gammaln((nu + 1) / 2) + np.log(nu * np.pi) / 2
+        return np.asarray((nu + 1) / 2 * np.log1p(r**2 / nu) + constant)
+
+    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
+        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
+        if self.dof is None:
+            return np.asarray((r**2).sum(axis=1) / 2 + log_scale + r.shape[1] * HALF_LOG)
+        return np.asarray(self.minus_log(r).sum(axis=1) + log_scale)
+
+    def score(self, r: FloatArray) -> FloatArray:
+        """Return ψ = ρ′."""
+        return r if self.dof is None else np.asarray((self.dof + 1) * r / (self.dof + r**2))
+
+    def information(self, r: FloatArray) -> FloatArray:
+        """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""
+        nu = self.dof
+        return np.ones_like(r) if nu is None else np.asarray((nu + 1) ** 2 / ((nu + 3) * (nu + r**2)))
+
+    def turn(self, r: FloatArray) -> FloatArray:
+        """Return (rψ)′, for derivatives by the logarithm of the scale."""
+        nu = self.dof
+        return 2 * r if nu is None else np.asarray(2 * nu * (nu + 1) * r / (nu + r**2) ** 2)
+
+    def normal_scores(self, r: FloatArray) -> FloatArray:
+        """Return standard normal values of the same probabilities."""
+        from scipy.special import ndtri, stdtr
+
+        if self.dof is None:
+            return r
+        return np.asarray(-np.sign(r) * ndtri(np.maximum(stdtr(self.dof, -np.abs(r)), 1e-300)))

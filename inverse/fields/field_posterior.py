@@ -104,6 +104,12 @@ class FieldPosterior:
         """1/σ (n,) of what was measured."""
         return self.measured / self.seen.scale
 
+    @cached_property
+    def constant(self) -> float:
+        """What −ln p(y | ξ) has besides the misfit: Σ ln σ + ½ ln det(I + ŨŨᵀ) + (n/2) ln 2π of what was measured."""
+        weights = self.weights[self.weights > 0]
+        return self.seen.log_determinant - float(np.log(weights).sum()) + len(weights) * HALF_LOG
+
     def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
         return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)
@@ -164,25 +170,23 @@ class Point:
     @cached_property
     def root(self) -> FloatArray:
         """√ (n,) of the weights of the data for Gauss–Newton: 1 for normal errors, see `inverse.data.noise`."""
-        return np.asarray(np.sqrt(self.posterior.noise.errors.information(self.gaps)))
+        return np.asarray(np.sqrt(self.posterior.noise.information(self.gaps)))
 
     @cached_property
     def residual(self) -> FloatArray:
         """Residuals r (n,); for errors that are not normal, with the same gradient under Gauss–Newton weights."""
-        return np.asarray(self.posterior.noise.errors.score(self.gaps) / self.root)
+        return np.asarray(self.posterior.noise.score(self.gaps) / self.root)
 
     @cached_property
     def misfit(self) -> float:
         """−ln p(y | ξ) without Σ ln σ + (n/2) ln 2π: ½ r·r for normal errors."""
-        minus_log = self.posterior.noise.errors.minus_log(self.gaps) - HALF_LOG
+        minus_log = self.posterior.noise.minus_log(self.gaps) - HALF_LOG
         return float(self.posterior.measured @ minus_log)
 
     @property
     def log_likelihood(self) -> float:
         """Ln p(y | ξ)."""
-        weights = self.posterior.weights[self.posterior.weights > 0]
-        more = self.posterior.seen.log_determinant
-        return -self.misfit - more + float(np.log(weights).sum()) - len(weights) * HALF_LOG
+        return -self.misfit - self.posterior.constant
 
     @property
     def penalty(self) -> float:

@@ -16,7 +16,8 @@ steps converge fast enough without them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +36,7 @@ STRONG = 10.0  # λ of these pairs: with them as preconditioner a step takes few
 ROUGH = 0.5  # their accuracy
 
 
-@dataclass(frozen=True)
-class Iteration:
+class Iteration(NamedTuple):
     """One step of the search.
 
     Attributes
@@ -120,9 +120,9 @@ def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tol
             break
         forcing = min(FORCING, float(np.sqrt(size / largest)))
         step, used = conjugate_gradients(here, pairs, forcing, LONG if pairs is None else LONGEST)
-        row = replace(row, products=spent + used)
+        row = row._replace(products=spent + used)
         there, length, solves = _search(here, step)
-        row = replace(row, length=length, solves=solves)
+        row = row._replace(length=length, solves=solves)
         if there is None:
             break
         table.append(row)

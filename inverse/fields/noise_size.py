@@ -113,7 +113,7 @@ class Marginal:
     count
         Number n of data.
     constant
-        Σ ln σ + (n/2) ln 2π.
+        As of the posterior.
     """
 
     values: FloatArray
@@ -128,11 +128,8 @@ class Marginal:
         gap = mode.residual - mode.jvp(mode.whitened)
         values = spectrum.values
         along = (spectrum.images @ gap) ** 2 / np.where(values > 0, values, 1.0)
-        weights = mode.posterior.weights[mode.posterior.weights > 0]
-        constant = len(weights) / 2 * float(np.log(2 * np.pi)) - float(np.log(weights).sum())
-        constant += mode.posterior.seen.log_determinant
         rest = max(float(gap @ gap) - float(along.sum()), 0.0)
-        return cls(values, along, rest, len(weights), constant)
+        return cls(values, along, rest, int(mode.posterior.measured.sum()), mode.posterior.constant)
 
     def log_density(self, s: FloatArray) -> FloatArray:
         """Ln p(y | s) (k,) at factors (k,) on the standard deviations at the mode."""

@@ -195,22 +195,23 @@ def _continued(
     return _weighted([*parts, rest], "importance", why)
 
 
+def _deviation(gaussian: Laplace, density: Density) -> FloatArray:
+    """Squares (n,) of the distances of points from the mode, in standard deviations."""
+    gap = density.x - gaussian.mode
+    return np.asarray(np.einsum("zi,ij,zj->z", gap, gaussian.hessian, gap))
+
+
 def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
     """Difference (n,) of the log posterior from that of the Gaussian."""
-    deviation = density.x - gaussian.mode
-    quadratic = gaussian.log_posterior - np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) / 2
-    return np.asarray(density.log_posterior - quadratic)
+    return np.asarray(density.log_posterior - (gaussian.log_posterior - _deviation(gaussian, density) / 2))
 
 
 def _is_gaussian(gaussian: Laplace, density: Density) -> bool:
     """Whether the posterior is the Gaussian at all points, up to rounding; it is zero where the model has no answer."""
-    here = density.log_posterior
-    misfit = _from_gaussian(gaussian, density)
+    here, misfit = density.log_posterior, _from_gaussian(gaussian, density)
     lost = ~np.isfinite(here)
-    if not (np.abs(misfit[~lost]) <= ROUNDED * (1 + np.abs(here[~lost]))).all():
-        return False
-    deviation = density.x[lost] - gaussian.mode
-    return bool((np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) > -2 * np.log(ROUNDED)).all())
+    near = np.abs(misfit[~lost]) <= ROUNDED * (1 + np.abs(here[~lost]))
+    return bool(near.all() and (_deviation(gaussian, density)[lost] > -2 * np.log(ROUNDED)).all())
 
 
 def _expected(drawn: Evidence, opening: Proposal, proposal: Proposal) -> float:

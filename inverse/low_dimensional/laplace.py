@@ -15,6 +15,7 @@ which is exact for models that are linear in normal parameters (D. J. C. MacKay,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +35,7 @@ ROUNDED = 1e-12  # gain over the log posterior that is rounding
 DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One iteration of the search: start, log posterior, squared Newton decrement, damping."""
 
     start: int

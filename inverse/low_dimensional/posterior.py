@@ -167,7 +167,7 @@ class Posterior:
     def _misfit(self, residual: FloatArray, x: FloatArray) -> FloatArray:
         """−ln of the likelihood (n,) of independent residuals (n, m) at x (n, c)."""
         logs = np.log(self.scale(x)).sum(axis=1) + self.noise.log_determinant
-        return np.asarray(self.noise.errors.misfit(residual, logs) + np.log(self.inputs.admitted))
+        return np.asarray(self.noise.misfit(residual, logs) + np.log(self.inputs.admitted))
 
     def potential(self, x: FloatArray, model: ForwardModel) -> tuple[float, FloatArray]:
         """Return −ln p(y | x) + ½|x|² at x (c,), and its gradient (c,), by one solve of the model and one adjoint.
@@ -185,7 +185,7 @@ class Posterior:
         if noise.model is not None:
             outputs = outputs + noise.model.at(point)
         residual = self.residuals(outputs, here)
-        score = noise.errors.score(residual)
+        score = noise.score(residual)
         pull = (noise.whitened(score) / self.scale(here))[0]  # W is symmetric
         weights = np.zeros(len(model.outputs))
         np.add.at(weights, np.arange(len(weights))[self.which], pull)
@@ -202,7 +202,6 @@ class Posterior:
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
         """Solve at the points x (n, c)."""
         d, m = len(self.inputs.names), self.data.size
-        errors = self.noise.errors
         n, c = x.shape
         points = self.inputs.from_normals(x[:, :d])[0]
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
@@ -217,15 +216,15 @@ class Posterior:
             return plain
         A = np.zeros((n, m, c))
         A[:, :, :d] = self.sensitivities(replace(plain, tangents=found.tangents))
-        score = errors.score(residual)
+        score = self.noise.score(residual)
         gradient = x + np.einsum("zm,zmc->zc", score, A)
-        curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, errors.information(residual), A)
+        curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, self.noise.information(residual), A)
         if self.noise.factor is not None:
             s, s_slope = self.noise.factor.from_normal(x[:, d])
             ln_s_slope = s_slope / s
             # r falls with ln s: d(Σρ + m ln s)/d ln s = m − r·ψ; the second derivatives are exact in ln s.
             gradient[:, d] += (m - (residual * score).sum(axis=1)) * ln_s_slope
-            turn = errors.turn(residual)
+            turn = self.noise.turn(residual)
             cross = -np.einsum("zm,zmc->zc", turn, A) * ln_s_slope[:, None]
             curvature[:, d, :] += cross
             curvature[:, :, d] += cross

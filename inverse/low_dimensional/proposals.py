@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -26,16 +25,6 @@ WORTHWHILE = 1 / 3  # share of its points that a first proposal is worth if the 
 TRIED = 1024  # draws of Laplace's Gaussian to find that
 
 Map = Callable[[FloatArray], FloatArray]  # points (n, c) → a number (n,) for each
-
-
-class Proposal(Protocol):
-    """A density of which points are drawn."""
-
-    def draw(self, cubes: FloatArray) -> FloatArray:
-        """Map points (n, c + 1) of the unit cube to points (n, c)."""
-
-    def log_over_prior(self, x: FloatArray) -> FloatArray:
-        """Ln of the density at x (n, c) over that of the prior, (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +108,9 @@ class Elliptical:
         else:
             log_density = -square / 2
         return np.asarray(log_density - np.linalg.slogdet(self.root)[1] - log_prior)
+
+
+Proposal = Mixture | Elliptical  # a density of which points are drawn
 
 
 def joint(over_prior: Sequence[Map], shares: Sequence[float], x: FloatArray) -> FloatArray:

@@ -37,7 +37,6 @@ from inverse.methods.invert import Invert
 from inverse.methods.record import (
     ENDS,
     SOURCES,
-    TRUST,
     Problem,
     Record,
     as_dataset,
@@ -46,7 +45,7 @@ from inverse.methods.record import (
     of_mesh,
     of_motions,
     of_prior,
-    of_test,
+    of_verdict,
 )
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
@@ -146,8 +145,7 @@ def invert_few(
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
-    errors = posterior.noise.errors
-    residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
+    residual, root = posterior.noise.normal_scores(raw), np.sqrt(posterior.noise.information(raw))
     test = examine(residual, spectrum, data.neighbours())
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
@@ -155,7 +153,7 @@ def invert_few(
     points, *drawn = _drawn(posterior, one, at, method)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
-        **of_test(test),
+        **of_verdict(verdict, test),
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
         **of_motions(spectrum, posterior.noise, root),
@@ -173,11 +171,9 @@ def invert_few(
         "effective": np.array(found.ess),
         "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),
-        "trust": np.array(TRUST.index(verdict.trust)),
-        "why": str(verdict),
         "solves": np.array(counted.solves + (0 if chains is None else chains.apart)),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
-        "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in searched.steps]).reshape(-1, 4),
+        "step": np.array(searched.steps).reshape(-1, 4),
         "start_mode": posterior.physical(searched.modes),
         "start_log_posterior": searched.ends,
         "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),
@@ -248,4 +244,4 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
     noise = posterior.noise
     scale = (np.ones(len(draws)) if noise.factor is None else draws[:, -1])[:, None] * noise.scale
     gaps = noise.whitened((outputs - posterior.data) / scale)
-    return {"draw": draws, "draw_log_likelihood": -noise.errors.minus_log(gaps) - np.log(scale)}
+    return {"draw": draws, "draw_log_likelihood": -noise.minus_log(gaps) - np.log(scale)}

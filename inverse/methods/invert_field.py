@@ -22,7 +22,7 @@ from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
-from inverse.fields.newton_cg import Mode, find_mode
+from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise_size import SolvedField, infer_noise
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import corrected_field, told
@@ -30,7 +30,6 @@ from inverse.methods.record import (
     COLUMNS,
     ENDS,
     SHOWN,
-    TRUST,
     Problem,
     Record,
     as_dataset,
@@ -39,7 +38,7 @@ from inverse.methods.record import (
     of_mesh,
     of_motions,
     of_prior,
-    of_test,
+    of_verdict,
     ritz,
 )
 
@@ -108,7 +107,7 @@ def invert_field(
     log_evidence = solved.log_evidence
     spectrum = found.spectrum
     root = mode.point.root
-    residual = posterior.noise.errors.normal_scores(mode.point.gaps)
+    residual = posterior.noise.normal_scores(mode.point.gaps)
     test = examine(residual, spectrum, data.neighbours())
     samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
@@ -132,7 +131,7 @@ def invert_field(
     record: Record = {
         **of_motions(spectrum, mode.point.posterior.seen, root),
         **of_data(data, predicted, residual, scale / root, spectrum),
-        **of_test(test),
+        **of_verdict(verdict, test),
         **of_prior(mode.point.whitened, spectrum),
         **of_mesh(mesh, before, np.size(mean["mode"]) - 1),
         **mean,
@@ -146,11 +145,9 @@ def invert_field(
         "effective": np.array(np.nan if weighed is None else weighed.ess),
         "tail": np.array(np.nan if weighed is None else weighed.pareto_k),
         "converged": np.array(converged),
-        "trust": np.array(TRUST.index(verdict.trust)),
-        "why": str(verdict),
         "solves": np.array(posterior.counts.solves),
         "products": np.array(mode.products + spectrum.products),
-        "step": _steps(mode),
+        "step": np.array(mode.iterations).reshape(-1, len(COLUMNS["field"])),
         "stiffness_mode": vertices.offset + found.mean,
         "alone_stiffness_std": np.array([_alone_std(found, data.cases == k) for k in range(cases)]),
         "neglected": np.array(spectrum.neglected),
@@ -200,12 +197,6 @@ def _of_stiffness(found: LowRankPosterior, vertices: Vertices, method: Invert, c
         "stiffness_std": std,
         "stiffness_draw": vertices.offset + draws,
     }
-
-
-def _steps(mode: Mode) -> FloatArray:
-    return np.array(
-        [[r.misfit, r.penalty, r.gradient, r.pairs, r.products, r.length, r.solves] for r in mode.iterations]
-    ).reshape(-1, len(COLUMNS["field"]))
 
 
 def _of_mean(

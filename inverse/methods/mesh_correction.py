@@ -176,7 +176,7 @@ def corrected_few(
         tangents = at.tangents[0, posterior.which]
         found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, data, tangents)
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
-        root = np.sqrt(noise.errors.information(posterior.residuals(at.outputs, x)))[0]
+        root = np.sqrt(noise.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
         deviations = np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T))
         rest = found.error if mesh is None else found.error - mesh.at(point[None])[0]

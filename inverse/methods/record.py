@@ -18,6 +18,7 @@ from forward.model import FloatArray
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.predictive import ResidualTest
+from inverse.criticism.verdict import Verdict
 from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared, determined
@@ -109,7 +110,7 @@ class Problem:
     @property
     def noise(self) -> Noise:
         """The errors of the data, as they are stated."""
-        return Noise(self.data.sigma, self.errors, self.method.noise)
+        return Noise(self.data.sigma, self.errors.dof, self.method.noise)
 
 
 def as_dataset(record: Record) -> xr.Dataset:
@@ -187,9 +188,11 @@ def ritz(spectrum: Spectrum, rows: NDArray[np.bool_]) -> tuple[FloatArray, Float
     return np.maximum(values[::-1], 0), vectors[:, ::-1].T
 
 
-def of_test(test: ResidualTest) -> Record:
-    """Tests of the model by its residuals."""
+def of_verdict(verdict: Verdict, test: ResidualTest) -> Record:
+    """How far a posterior can be trusted, and tests of the model by its residuals."""
     return {
+        "trust": np.array(TRUST.index(verdict.trust)),
+        "why": str(verdict),
         "residual_square": np.array(test.square),
         "residual_degrees": np.array(test.degrees),
         "residual_probability": np.array(test.probability),

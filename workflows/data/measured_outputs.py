@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
@@ -146,11 +146,13 @@ class MeasuredOutputs(Settings):
             sets, found = read_files(
                 self.files, folder, lambda path: known(read_outputs(path, names, steps, self.reader))
             )
-        elif self.tables is not None:
-            sets, found = _of_tables(self.tables, folder, model, known)
         else:
             try:
-                sets, found = (DataSet(name=STATED, file=""),), (known(stated(self.outputs, names)),)
+                if self.tables is None:
+                    one, values = DataSet(name=STATED, file=""), stated(self.outputs, names)
+                else:
+                    one, values = _of_tables(self.tables, folder, model)
+                sets, found = (one,), (known(values),)
             except DataError as error:
                 raise StudyError(*(f"data: {line}" for line in error.args)) from None
         seen = np.unique(np.concatenate([one.axes for one in found if one is not None]))
@@ -178,9 +180,7 @@ class MeasuredOutputs(Settings):
                     yield ("data", block, name), f"not an output of the model; {nearest(name, names)}", name
 
 
-def _of_tables(
-    tables: Mapping[str, str], folder: Path, model: ModelSpec, known: Callable[[Measurements], Measurements]
-) -> Found:
+def _of_tables(tables: Mapping[str, str], folder: Path, model: ModelSpec) -> tuple[DataSet, Measurements]:
     """Read the tables of joined models, one of each at most, as one data set."""
     names, parts, paths, wrong = tuple(output.name for output in model.returned), [], [], list[str]()
     for name, file in tables.items():
@@ -204,12 +204,8 @@ def _of_tables(
         paths.append(path)
     if wrong:
         raise StudyError(*wrong)
-    try:
-        measured = known(reduce(Measurements.with_rows, parts))
-    except DataError as error:
-        raise StudyError(*(f"data: {line}" for line in error.args)) from None
     digest = sha256("".join(map(digest_of, paths)).encode()).hexdigest()[:16]
-    return (DataSet(name=TABLES, file=", ".join(tables.values()), digest=digest),), (measured,)
+    return DataSet(name=TABLES, file=", ".join(tables.values()), digest=digest), reduce(Measurements.with_rows, parts)
 
 
 def check_signs(found: Measurements, model: ModelSpec) -> None:

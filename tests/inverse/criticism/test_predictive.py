@@ -71,7 +71,7 @@ def test_few_data_of_many_parameters():
     found = examine_few(posterior, laplace(posterior))
     assert found.degrees == pytest.approx(1 / 4)  # y ~ N(0, 1 + 3), and r = −y/4
     assert found.probability == pytest.approx(stats.chi2(1).sf(4 / 4), rel=1e-8)
-    assert np.isnan(found.agreement)
+    assert np.isnan(found.agreement_probability)
 
 
 @pytest.mark.unit

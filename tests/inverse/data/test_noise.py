@@ -33,25 +33,23 @@ NOISE = LogNormal(mean=1.2, std=0.6)
 
 
 def posterior(errors, noise=None):
-    return Posterior(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), VALUES, Noise(SIGMA, errors, noise))
+    return Posterior(Inputs({"a": PRIOR}), SerialEvaluate(MODEL), VALUES, Noise(SIGMA, errors.dof, noise))
 
 
 @pytest.mark.parametrize("errors", [NormalErrors(), HEAVY, StudentErrors(degrees=1)])
 def test_densities_scores_and_normal_scores(errors):
-    r = np.linspace(-6, 6, 25)
+    r, noise = np.linspace(-6, 6, 25), Noise(np.ones(25), errors.dof)
     density = stats.norm() if errors.kind == "normal" else stats.t(errors.degrees)
-    np.testing.assert_allclose(errors.minus_log(r), -density.logpdf(r), rtol=1e-12)
+    np.testing.assert_allclose(noise.minus_log(r), -density.logpdf(r), rtol=1e-12)
     h = 1e-5
-    np.testing.assert_allclose(
-        errors.score(r), (errors.minus_log(r + h) - errors.minus_log(r - h)) / (2 * h), atol=1e-9
-    )
-    turned = [(r + k * h) * errors.score(r + k * h) for k in (-1, 1)]
-    np.testing.assert_allclose(errors.turn(r), (turned[1] - turned[0]) / (2 * h), atol=1e-8)
-    np.testing.assert_allclose(stats.norm.cdf(errors.normal_scores(r)), density.cdf(r), rtol=1e-9)
-    assert np.isfinite(errors.normal_scores(np.array([1e6, -1e6]))).all()
+    np.testing.assert_allclose(noise.score(r), (noise.minus_log(r + h) - noise.minus_log(r - h)) / (2 * h), atol=1e-9)
+    turned = [(r + k * h) * noise.score(r + k * h) for k in (-1, 1)]
+    np.testing.assert_allclose(noise.turn(r), (turned[1] - turned[0]) / (2 * h), atol=1e-8)
+    np.testing.assert_allclose(stats.norm.cdf(noise.normal_scores(r)), density.cdf(r), rtol=1e-9)
+    assert np.isfinite(noise.normal_scores(np.array([1e6, -1e6]))).all()
     # Fisher's information is the mean of what stands for the second derivative.
-    mean = density.expect(lambda x: float(errors.information(np.array(x))))
-    assert mean == pytest.approx(density.expect(lambda x: float(errors.score(np.array(x))) ** 2), rel=1e-6)
+    mean = density.expect(lambda x: float(noise.information(np.array(x))))
+    assert mean == pytest.approx(density.expect(lambda x: float(noise.score(np.array(x))) ** 2), rel=1e-6)
 
 
 @pytest.mark.unit
@@ -136,7 +134,7 @@ def test_fields_have_the_same_errors():
     data = np.append(VALUES, np.nan)  # one that was not measured
     slopes = np.append(SLOPES, 1.0)
     model = FunctionModel(lambda p: slopes * p[0], ("a",), tuple(map(str, range(16))), lambda p: slopes[:, None])
-    field = FieldPosterior(model, data, Noise(np.full(16, 0.2), HEAVY), Line())
+    field = FieldPosterior(model, data, Noise(np.full(16, 0.2), HEAVY.dof), Line())
     x = np.array([0.3])
     h = 1e-6
     slope = (field.at(x + h).cost - field.at(x - h).cost) / (2 * h)

@@ -128,7 +128,7 @@ def test_errors_that_are_shared_are_a_covariance():
     log = 0.5 * np.linalg.slogdet(covariance)[1] - np.log(sigma).sum()
     assert noise.log_determinant == pytest.approx(log)
     np.testing.assert_allclose(noise.coloured(noise.whitened(r)), r)
-    wider = Noise(sigma, StudentErrors(), shared=shared)
+    wider = Noise(sigma, StudentErrors().dof, shared=shared)
     np.testing.assert_allclose(wider.scale**2, np.diag(covariance))
     # What data say about a motion, given unknowns of unit prior: dense linear algebra.
     J = rng.normal(size=(7, 2))

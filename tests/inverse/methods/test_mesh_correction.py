@@ -177,7 +177,7 @@ def test_whitening_is_the_root_of_the_inverse():
     np.testing.assert_allclose(W.T @ W, np.linalg.inv(gamma), rtol=1e-9, atol=1e-9)
     half_log_det = np.linalg.slogdet(gamma)[1] / 2
     assert white.log_determinant + np.log(white.scale).sum() == pytest.approx(half_log_det, rel=1e-9)
-    heavy = Noise(SIGMA, StudentErrors(), model=mesh)
+    heavy = Noise(SIGMA, StudentErrors().dof, model=mesh)
     np.testing.assert_allclose(heavy.scale**2, np.diag(gamma), rtol=1e-12)
     assert heavy.log_determinant == 0
 
