@@ -14,13 +14,13 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
-from forward.reduced.limits import mistakes
 from forward.reduced.modes import AtRest, boxes, enough
 from forward.reduced.newton import stable
 from forward.reduced.outputs import Outputs
 from forward.reduced.reduced_equations import ReducedEquations
 from forward.reduced.rules import STATES, Rules, Training
 from forward.reduced.snapshots import Snapshots, solved
+from forward.reduced.spec import mistakes
 
 OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
 LOOKED_AT = 4  # snapshots at which the larger model must be stable

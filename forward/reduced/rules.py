@@ -326,7 +326,7 @@ class _Normal:
         """Add points, by their products with those that are in (k, b) and among each other (b, b)."""
         k, n = self._count, self._count + len(among)
         if n > len(self._grams):
-            self._grams, self._factors = (_roomier(one, k, 2 * n) for one in (self._grams, self._factors))
+            self._grams, self._factors = (np.pad(one[:k, :k], (0, 2 * n - k)) for one in (self._grams, self._factors))
         self._grams[k:n, :k], self._grams[k:n, k:n] = beside.T, among
         if self._whole and k:
             across = solve_triangular(self._factors[:k, :k], beside, lower=True, check_finite=False)
@@ -371,12 +371,6 @@ class _Normal:
             except LinAlgError:
                 continue
         return np.asarray(np.linalg.lstsq(gram, right, rcond=1e-10)[0])
-
-
-def _roomier(corner: FloatArray, k: int, size: int) -> FloatArray:
-    found = np.zeros((size, size))
-    found[:k, :k] = corner[:k, :k]
-    return found
 
 
 def _raised(gram: FloatArray, more: float) -> FloatArray:
