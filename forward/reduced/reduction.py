@@ -349,15 +349,7 @@ def enriched(data: ReducedData, points: FloatArray, cubature: float = 1e-3) -> R
     """Solve the full model at parameters (k, d), and return a reduced model that holds these too.
 
     Such points are where a reduced model with a tolerance has asked the full one (`ReducedModel.asked`).
-
-    Parameters
-    ----------
-    data
-        The reduced model; it stays as it is.
-    points
-        All its parameters (k, d) at each of the solutions.
-    cubature
-        What the points may miss of the forces, relative.
+    It stays as it is; `cubature` is what the points of the new one may miss of the forces, relative.
 
     Raises
     ------

@@ -93,18 +93,8 @@ class Training:
 class Rules:
     """The points of a body, and the choice among them.
 
-    Parameters
-    ----------
-    equations
-        The body, in one process.
-    works
-        Integrands of virtual works: first that of the energy.
-    whole
-        Which of them keep all their points.
-    densities
-        What else the rule of the energy integrates.
-    numbers
-        Which parameters (p,) integrands take.
+    Of integrands of virtual works, the first of which is that of the energy, whose rule integrates densities of outputs
+    too; `whole` says which keep all their points. Integrands take numbers (p,) among the parameters.
     """
 
     def __init__(
