@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from forward.fem.enriched import EnrichedState
-from forward.fem.linearisation_point import LinearisationPoint
+from forward.fem.linearisation import LinearisationPoint
 from forward.fem.path import HistorySolution, Increment, Passed
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
