@@ -17,11 +17,6 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
-
-def _select(a: Any, b: Any, c: Any, d: Any) -> Any:
-    return np.where(a < b, c, d)
-
-
 SELECT = "select"  # of (a, b, c, d): c where a < b, d elsewhere
 OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {  # how many nodes each takes; files know it by its place here
     "sqrt": (1, np.sqrt),
@@ -39,7 +34,7 @@ OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {  # how many nodes each
     "div": (2, np.divide),
     "pow": (2, np.power),
     "atan2": (2, np.arctan2),
-    SELECT: (4, _select),
+    SELECT: (4, lambda a, b, c, d: np.where(a < b, c, d)),
     "log1p": (1, np.log1p),
     "expm1": (1, np.expm1),
 }

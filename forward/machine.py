@@ -79,14 +79,9 @@ def compiled_forms() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tissuq"
 
 
-def limits() -> list[Headroom]:
-    """Return what the machine, the limits of this process and its control group leave."""
-    return list(_limits())
-
-
 def headroom() -> Headroom:
     """Return the smallest of the limits."""
-    return min(_limits(), key=lambda one: one.size)
+    return min(limits(), key=lambda one: one.size)
 
 
 def require(size: float, what: str) -> None:
@@ -129,7 +124,8 @@ def require_files(size: float, what: str) -> None:
         raise StopError(f"{what} needs files of {size / MIB:.0f} MiB, {soft / MIB:.3g} MiB are allowed (ulimit -f)")
 
 
-def _limits() -> Iterator[Headroom]:
+def limits() -> Iterator[Headroom]:
+    """Yield what the machine, the limits of this process and its control group leave."""
     yield Headroom(float("inf"), "no limit is known")
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

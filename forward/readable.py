@@ -181,12 +181,6 @@ def and_error(value: float, error: float, unit: str, like: float | None = None) 
     return _with(with_error(value / one, error / one), name)
 
 
-def between(lower: float, upper: float, unit: str, digits: int = 4) -> str:
-    """Write two ends in one fitting unit: 28.78 to 29.06 mm."""
-    one, name = scale(max(abs(lower), abs(upper)), unit)
-    return _with(f"{number(lower / one, digits)} to {number(upper / one, digits)}", name)
-
-
 def place(x: Sequence[float], digits: int = 3) -> str:
     """Write a place (m) in one unit; a coordinate that is rounding beside the others is zero."""
     largest = max(map(abs, x))

@@ -104,16 +104,8 @@ def contradicted(
 ) -> tuple[Finding, ...]:
     """Compare the derivatives of a model with differences of its values; not collective.
 
-    Parameters
-    ----------
-    model
-        Any model of outputs; one without derivatives is not checked.
-    point, scale
-        Parameters (d,), and their scales (d,), such as their standard deviations.
-    where
-        The point in words.
-    middle
-        The solution there, if it is known.
+    A model without derivatives is not checked. Scales (d,) are such as the standard deviations of parameters (d,); the
+    point is `where` in words, and `middle` the solution there, if it is known.
 
     Returns
     -------

@@ -283,18 +283,7 @@ class UmBridgeModel(_External):
 
 
 class Client:
-    """A model of an UM-Bridge server.
-
-    Parameters
-    ----------
-    url
-        Of the server.
-    name
-        Of the model; None for the only one.
-    config
-        Options.
-    seconds
-        Time limit for the answer to one question; None to wait forever.
+    """A model of an UM-Bridge server, by its name, or the only one; answers have a time limit, None to wait forever.
 
     Attributes
     ----------

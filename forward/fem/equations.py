@@ -68,13 +68,13 @@ class Discretisation(Sensitivities):
         self.linearisation_point.moved()
         self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
         for i in self.scalars:  # the other numbers stay
-            if (constant := self._constants.get(self.parameters[i])) is not None:
+            if (constant := self.constants.get(self.parameters[i])) is not None:
                 constant.value = parameters[i]
-        if self._movers:
+        if self.movers:
             self._full_targets = np.zeros(len(self.fixed))
-        for path, mover in self._movers.items():
+        for path, mover in self.movers.items():
             self._full_targets += self._values[path] * mover
-        self._moves = any(self._values[path] != 0 for path in self._movers)
+        self._moves = any(self._values[path] != 0 for path in self.movers)
         self._external = self._size_of_loads()
         for field in self.fields:  # the size of the loads is their size without random fluctuations
             field.set(parameters)
@@ -160,17 +160,17 @@ class Discretisation(Sensitivities):
         All energies are free of stress there.
         """
         tools = tuple(f"loads.{load.label}." for load in self.spec.loads if load.contact)
-        paths = [path for path in self._constants if path.startswith("loads.") and not path.startswith(tools)]
+        paths = [path for path in self.constants if path.startswith("loads.") and not path.startswith(tools)]
         forces: dict[str, FloatArray] = {}
         work, self.work = self.work, Work()  # the first solution is charged no more than the others
         for path in ("", *paths):
             for other in paths:
-                self._constants[other].value = float(other == path)
+                self.constants[other].value = float(other == path)
             forces[path] = self._forces_at_rest() - forces.get("", 0.0)
             if path == "" and self.norm(forces[path]) <= self.rounding(np.zeros(self.size), 0.0):
                 forces[path][:] = 0
         for path in paths:
-            self._constants[path].value = self._values[path]
+            self.constants[path].value = self._values[path]
         self.work = work
         return forces
 

@@ -53,6 +53,12 @@ class Forms:
         Displacement, virtual displacement, deformation gradient and its determinant.
     stored_energy, dilation
         Densities of the stored energy and of the change of volume.
+    unknown
+        The state as the function that forms are written in; in the mixed form, displacements and pressure.
+    constants
+        The numbers of the model in forms, by their paths.
+    virtual_works
+        Forms of the virtual works of the loads, in their order, with the sign of the imbalance.
     """
 
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
@@ -71,25 +77,25 @@ class Forms:
         self._ds, self._tags = meshes.facet_measure(self.mesh, self.facets, spec.body.quadrature)
 
         self._values = {path: scalar.value for path, scalar in spec.scalars.items()}
-        self._constants = {
+        self.constants = {
             path: spaces.constant(self.mesh, value)
             for path, value in self._values.items()
             if not path.startswith("displacements.")
         }
-        self._variables = {path: ufl.variable(constant) for path, constant in self._constants.items()}
+        self._variables = {path: ufl.variable(constant) for path, constant in self.constants.items()}
         self.scalars = np.array([i for i, path in enumerate(parameters) if path in self._values], dtype=np.int64)
         self.fields: tuple[VertexField, ...] = (
             tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
             if beside is None
             else beside.fields
         )
-        self._directions = {path: spaces.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
+        self._directions = {path: spaces.constant(self.mesh, 0.0) for path in parameters if path in self.constants}
         self._load = spaces.constant(self.mesh, 1.0)
 
-        self._state = spaces.function(self.unknowns.whole)
+        self.unknown = spaces.function(self.unknowns.whole)
         self._along = spaces.function(self.unknowns.whole)
         self._variation = ufl.TestFunction(self.unknowns.whole)
-        self.u, self.p = self.unknowns.split(self._state)
+        self.u, self.p = self.unknowns.split(self.unknown)
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
         self._invariants = Invariants(
@@ -111,7 +117,7 @@ class Forms:
         self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
         self._stiffer = spaces.constant(self.mesh, 1.0)  # factor on their stiffness
         self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
-        self._loads = self._virtual_works()
+        self.virtual_works = self._works_of_loads()
         self.symmetric = spec.symmetric
 
     @property
@@ -197,7 +203,7 @@ class Forms:
 
     def derivative(self, form: Any, direction: Any | None = None) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
-        return self._invariants.derivative(form, self._state, self._variation if direction is None else direction)
+        return self._invariants.derivative(form, self.unknown, self._variation if direction is None else direction)
 
     @cached_property
     def volume(self) -> float:
@@ -235,11 +241,6 @@ class Forms:
         expand = ufl.algorithms.expand_derivatives
         return expand(expand(self._invariants.inserted(form)))
 
-    @property
-    def unknown(self) -> Any:
-        """The state as the function that forms are written in; in the mixed form, displacements and pressure."""
-        return self._state
-
     def boundary_of(self, integral: Any) -> str:
         """Return the name of the boundary that an integral of a form is over."""
         tag = np.ravel(integral.subdomain_id())[0]  # a tuple in newer versions
@@ -258,7 +259,7 @@ class Forms:
     def _bilinear(self, form: Any) -> Any:
         return compile.compile_form(self._invariants.inserted(form), self.comm)
 
-    def _virtual_works(self) -> list[Any]:
+    def _works_of_loads(self) -> list[Any]:
         """Forms of the virtual works of the loads, with the sign of the imbalance.
 
         In load steps the numbers of a load are scaled if it is linear in them, otherwise the whole load; tools move.
@@ -291,19 +292,9 @@ class Forms:
         """Form of the virtual work of the stresses."""
         return self._variation_of(self._potential) * self.dx
 
-    @property
-    def virtual_works(self) -> tuple[Any, ...]:
-        """Forms of the virtual works of the loads, in their order, with the sign of the imbalance."""
-        return tuple(self._loads)
-
-    @property
-    def constants(self) -> dict[str, Any]:
-        """The numbers of the model in forms, by their paths."""
-        return self._constants
-
     def is_dead(self, work: Any, paths: Collection[str]) -> bool:
         """Whether the virtual work of a load is a sum of its numbers, each times a force that never changes."""
-        if self._state in work.coefficients() or any(
+        if self.unknown in work.coefficients() or any(
             field.inside(one.integrand()) for field in self.fields for one in work.integrals()
         ):
             return False
@@ -357,13 +348,13 @@ class Forms:
         potential = load.potential(at)
         if potential is None:
             return load.virtual_work(at)
-        return ufl.algorithms.expand_derivatives(ufl.derivative(potential, self._state, self._variation))
+        return ufl.algorithms.expand_derivatives(ufl.derivative(potential, self.unknown, self._variation))
 
     def _imbalance_form(self, change: Callable[[Any], Any | None] = lambda integrand: integrand) -> Any | None:
         """Virtual work of all forces, with each integrand replaced by its `change`; None if all vanish."""
         density = change(self._potential)
         terms = [] if density is None else [self._variation_of(density) * self.dx]
-        for integral in (integral for work in self._loads for integral in work.integrals()):
+        for integral in (integral for work in self.virtual_works for integral in work.integrals()):
             changed = change(integral.integrand())
             if changed is not None:
                 terms.append(ufl.Form([integral.reconstruct(changed)]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,7 +18,6 @@ from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unk
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.items import Items
-from forward.fem.linearisation_point import LinearisationPoint
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
 from forward.solvers.system import ROUGH, TIGHT, LinearSolver
@@ -26,6 +26,45 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 OF_MODULI = 2  # degree of quadrature of their means
+
+
+@dataclass
+class LinearisationPoint:
+    """The point at which a body is set, and the one whose stiffness is factorised.
+
+    Every change of the body is recorded here, so that nothing set or computed at one point is used at another.
+
+    Attributes
+    ----------
+    parameters
+        Parameters (d,) that are set; None if they must be set again.
+    solution
+        The solution whose parameters, load and state are set; None if there is no such solution.
+    factorised
+        The solution to which the current factor belongs; None if there is no such solution.
+    factorised_at
+        State (U_local,) whose stiffness this solve has factorised last; None if it has factorised none.
+    rounding
+        Size of the rounding errors (N) in the forces of the body without loads, once known.
+    """
+
+    parameters: FloatArray | None = None
+    solution: object = None
+    factorised: object = None
+    factorised_at: FloatArray | None = None
+    rounding: float | None = None
+
+    def moved(self) -> None:
+        """Parameters, load or state have changed."""
+        self.solution = None
+
+    def begin(self) -> None:
+        """A solve at another point begins."""
+        self.solution = self.factorised = self.factorised_at = None
+
+    def forget_parameters(self) -> None:
+        """Fields have changed: the parameters must be set again next time, whatever they are."""
+        self.parameters = self.solution = None
 
 
 class Preconditioner(NamedTuple):
@@ -95,7 +134,7 @@ class Linearisation(Forms):
     @cached_property
     def _moduli(self) -> tuple[assembly.PointValues, FloatArray]:
         """∂P along `_along` (n_cells, 9 q) at a few points of the cells, and the weights (q,) of these."""
-        changes = self._invariants.derivative_of(self.stress_of(self._potential), self._state, self._along)
+        changes = self._invariants.derivative_of(self.stress_of(self._potential), self.unknown, self._along)
         points, weights = (of(self.space, OF_MODULI) for of in (spaces.quadrature_points, spaces.quadrature_weights))
         return self.at(ufl.as_vector([changes[a, k] for a in range(3) for k in range(3)]), points, often=True), weights
 
@@ -162,7 +201,8 @@ class Linearisation(Forms):
         owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
         self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
         paths = [path for _, path in owned]
-        self._movers = {
+        # Which prescribed unknowns each number of a prescribed displacement moves: 1, or 0, by its path.
+        self.movers = {
             path: np.array([p == path for p in paths], dtype=float)
             for path in self._values
             if path.startswith("displacements.")
@@ -187,19 +227,14 @@ class Linearisation(Forms):
                 moved |= {(int(n), a): "" for n in nodes}
         return marks, moved
 
-    @property
-    def movers(self) -> dict[str, FloatArray]:
-        """Which prescribed unknowns each number of a prescribed displacement moves: 1, or 0, by its path."""
-        return self._movers
-
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
         self.linearisation_point.moved()
-        self.unknowns.give(self._state, u)
+        self.unknowns.give(self.unknown, u)
 
     def state(self) -> FloatArray:
         """This rank's part (U_local,) of the state that is set."""
-        return self.unknowns.take(self._state.x.array)
+        return self.unknowns.take(self.unknown.x.array)
 
     def displacements(self) -> FloatArray:
         """Displacements (nodes_owned, 3) of the state that is set."""
@@ -243,11 +278,11 @@ class Linearisation(Forms):
         if self.symmetric:
             return self._of_stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
-        works = list(zip(self.spec.loads, self._loads, strict=True))
+        works = list(zip(self.spec.loads, self.virtual_works, strict=True))
         rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
         found = self.derivative(rest, trial)
         for _, load, at in self._rubbing:
-            pressed = ufl.derivative(load.potential(at), self._state, self._variation)
+            pressed = ufl.derivative(load.potential(at), self.unknown, self._variation)
             found += self.derivative(ufl.algorithms.expand_derivatives(pressed), trial)
             found += load.rubbing_stiffness(at, self.unknowns.split(trial)[0])
         followers = [work for load, work in works if not load.symmetric and not load.contact and load.written]
@@ -314,7 +349,7 @@ class Linearisation(Forms):
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right; rows of prescribed unknowns hold their values."""
-        if self._moves or self._movers:
+        if self._moves or self.movers:
             known = right[self.fixed]
             if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
                 w = np.zeros_like(right)

@@ -27,7 +27,7 @@ class Sensitivities(Linearisation):
         terms = [
             direction * ufl.diff(integrand, self._variables[path])
             for path, direction in self._directions.items()
-            if self._constants[path] in present
+            if self.constants[path] in present
         ]
         terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
         return sum(terms[1:], terms[0]) if terms else None
@@ -84,9 +84,9 @@ class Sensitivities(Linearisation):
         right = -self.parameter_forces()
         for i, path in enumerate(self.parameters[j] for j in self.scalars):
             right[i, self.fixed] = 0
-            if path in self._movers:
+            if path in self.movers:
                 w = np.zeros(right.shape[1])
-                w[self.fixed] = float(self._load.value) * self._movers[path]
+                w[self.fixed] = float(self._load.value) * self.movers[path]
                 right[i] -= self.stiffness_times(w)
                 right[i, self.fixed] = w[self.fixed]
         return right

@@ -150,25 +150,22 @@ def interpolation(equations: Discretisation, places: FloatArray, directions: Flo
     if not len(moving):
         return csr_matrix((len(places), equations.size))
     points, numbers = np.unique(places[moving], axis=0, return_inverse=True)
-    found, distances = spaces.point_weights(equations.space, points)
+    mine, nodes, weights, distances = spaces.point_rows(equations.space, points)
     far = np.flatnonzero(distances > max(tolerance(body), body.longest_edge))
     if len(far):
         where = ", ".join(f"{x:g}" for x in points[far[0]])
         raise ValueError(f"({where}) lies {distances[far[0]]:.3g} m outside the mesh")
-    nodes = layout.nodes()
-    mine = {i: (nodes[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
-    held = {i: here for part in equations.comm.allgather(mine) for i, here in part.items()}
+    at, w = np.empty(nodes.shape, dtype=np.int64), np.empty(weights.shape)
+    for theirs, canonical, some in equations.comm.allgather((mine, layout.nodes()[nodes[mine]], weights[mine])):
+        at[theirs], w[theirs] = canonical, some
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
-    rows, columns, values = [], [], []
-    for row, i in zip(moving, numbers.ravel(), strict=True):
-        at, w = held[i]
-        owned = local[at] >= 0
-        for axis in np.flatnonzero(directions[row]):
-            rows.append(np.full(owned.sum(), row))
-            columns.append(3 * local[at][owned] + axis)
-            values.append(directions[row, axis] * w[owned])
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    which, axes = np.nonzero(directions[moving])
+    columns = local[at[numbers.ravel()[which]]]
+    owned = columns >= 0
+    values = directions[moving][which, axes][:, None] * w[numbers.ravel()[which]]
+    rows = np.repeat(moving[which], owned.sum(axis=1))
+    entries = values[owned], (rows, (3 * columns + axes[:, None])[owned])
     return csr_matrix(entries, shape=(len(places), equations.size))
 
 

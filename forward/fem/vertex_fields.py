@@ -33,8 +33,8 @@ class VertexField:
     ----------
     positions
         Indices (k,) of its coefficients among the parameters.
-    log
-        Logarithm of the factor, as a variable of forms.
+    function, log
+        Logarithm of the factor, as the function that forms are written in, and as a variable of these.
     direction
         Change of the logarithm, as a function of forms.
     test
@@ -59,16 +59,11 @@ class VertexField:
         self._modes = None if modes is None else np.ascontiguousarray(modes[self._vertices])
         if self._modes is not None:
             self._expansion = None  # every rank keeps only its part
-        self._function = spaces.function(self._space)
-        self.log = ufl.variable(self._function)
+        self.function = spaces.function(self._space)
+        self.log = ufl.variable(self.function)
         self.direction = spaces.function(self._space)
         self.test = ufl.TestFunction(self._space)
         self.set(np.zeros(len(parameters)))
-
-    @property
-    def function(self) -> Any:
-        """The logarithm of the factor, as the function that forms are written in."""
-        return self._function
 
     @property
     def factor(self) -> Any:
@@ -77,11 +72,11 @@ class VertexField:
 
     def inside(self, integrand: Any) -> bool:
         """Whether an integrand depends on the field, and the field on parameters."""
-        return len(self.positions) > 0 and self._function in ufl.algorithms.extract_coefficients(integrand)
+        return len(self.positions) > 0 and self.function in ufl.algorithms.extract_coefficients(integrand)
 
     def set(self, parameters: FloatArray) -> None:
         """Set the field to parameters (d,); collective."""
-        _give(self._function, self._offset + self._values(parameters))
+        _give(self.function, self._offset + self._values(parameters))
 
     def set_direction(self, direction: FloatArray) -> None:
         """Set the change of the field to that along a direction (d,) of the parameters; collective."""
@@ -109,7 +104,7 @@ class VertexField:
         rows = []
         for point in points:
             self.set(point)
-            rows.append(np.exp(spaces.interpolate(self._function, space)))
+            rows.append(np.exp(spaces.interpolate(self.function, space)))
         parts = self._comm.gather((positions, np.array(rows)))
         if parts is None:
             return None

@@ -13,7 +13,7 @@ from __future__ import annotations
 import cmath
 import inspect
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
 
@@ -128,15 +128,9 @@ def volumetric(energy: str | Energy) -> Energy | None:
 def isochoric(energy: str | Energy) -> Energy:
     """Return an energy without its volumetric part, as a function of all its measures and constants."""
     shape, volume = _parts(energy_of(energy))
-    return partial(_without_volume if volume is None else _of_shape, shape)
-
-
-def _of_shape(shape: Energy, ops: Any, *measures: Any, **values: Any) -> Any:
-    return shape(ops, *measures[:-1], **{name: values[name] for name in constants(shape)})
-
-
-def _without_volume(energy: Energy, ops: Any, *measures: Any, **values: Any) -> Any:
-    return energy(ops, *measures, **(values | {QUADRATIC: 0}))
+    if volume is None:
+        return lambda ops, *measures, **values: shape(ops, *measures, **(values | {QUADRATIC: 0}))
+    return lambda ops, *measures, **values: shape(ops, *measures[:-1], **{c: values[c] for c in constants(shape)})
 
 
 def splits(energy: str | Energy) -> bool:

@@ -332,7 +332,8 @@ def reading(
             stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
             if not derivatives:
                 return stress, np.zeros((0, *shape))
-            (*of_x, by_xy), (*of_z, by_zy), (*of_y, by_yy) = np.split(_broadcast(forms.mixed(here), shape), 3)
+            mixed = np.array([np.broadcast_to(one, shape) for one in forms.mixed(here)])
+            (*of_x, by_xy), (*of_z, by_zy), (*of_y, by_yy) = np.split(mixed, 3)
             found = [a * one + b * other for one, other in zip(of_x, of_z, strict=True)]
             if free:
                 by_lateral = a * by_xy + b * by_zy + slope * stress
@@ -341,10 +342,6 @@ def reading(
         return stress, np.where(np.isfinite(stress), by_constant, np.nan)
 
     return read
-
-
-def _broadcast(values: Sequence[Any], shape: tuple[int, ...]) -> FloatArray:
-    return np.array([np.broadcast_to(one, shape) for one in values])
 
 
 class _Forms(NamedTuple):

@@ -26,7 +26,7 @@ class PointDisplacement(Observable):
         """Prepare the evaluation."""
         from forward.fem.dolfinx import spaces
 
-        (found,), (distance,) = spaces.point_weights(equations.space, np.array([self.at]))
+        (mine,), (nodes,), (weights,), (distance,) = spaces.point_rows(equations.space, np.array([self.at]))
         spec = equations.spec.body
         # Points outside boxes and blocks were refused before; the mesh may cut their curved faces.
         most = tolerance(spec) if spec.kind == "mesh" else max(tolerance(spec), spec.longest_edge)
@@ -37,8 +37,7 @@ class PointDisplacement(Observable):
                 f"expected at most {most:.3g} m"
             )
         probe = spaces.function(equations.space)
-        if found is not None:
-            nodes, weights = found
+        if mine:
             probe.x.array[3 * nodes + AXES.index(self.component)] = weights
         # Weights of ghost nodes are sent to the ranks that own them.
         return Linear(equations, equations.with_pressures(spaces.sum_ghosts(probe)))

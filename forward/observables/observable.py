@@ -74,14 +74,8 @@ class Observable(Settings):
     def enriched(self, coarse: Functional, equations: Equations, up: Callable[[FloatArray], FloatArray]) -> Functional:
         """Prepare the evaluation in elements of one degree more, for the error of the mesh; collective.
 
-        Parameters
-        ----------
-        coarse
-            The functional of the body.
-        equations
-            The same body in elements of one degree more.
-        up
-            Takes vectors (U_local,) of the body to the same functions there.
+        `coarse` is the functional of the body, and `up` takes vectors (U_local,) of the body to the same functions
+        there.
         """
         return self.functional(equations)
 

@@ -78,12 +78,6 @@ def _spread() -> Any | None:
     return _compiled(_SPREAD, "", "spread")
 
 
-def _in_lanes(real: str, end: str) -> str:
-    """Declare functions for several points in the lanes of a processor at once; not every library of C has them."""
-    functions = (f"log{end}({real})", f"exp{end}({real})", f"pow{end}({real}, {real})")
-    return "".join(f'__attribute__((simd("notinbranch"))) {real} {one};\n' for one in functions)
-
-
 def _source(tape: Tape, varying: int, real: str, end: str) -> tuple[str, str]:
     """Return C for a tape, and what it can do without."""
     first = tape.inputs + len(tape.constants)
@@ -116,7 +110,9 @@ def _source(tape: Tape, varying: int, real: str, end: str) -> tuple[str, str]:
         (inside if varies else outside).append(f"const {real} t{k} = {value};")
         names.append(f"t{k}")
     inside += [f"out[{m} * n + q] = {names[i]};" for m, i in enumerate(tape.outputs.tolist())]
-    in_lanes = _in_lanes(real, end)
+    # Functions for several points in the lanes of a processor at once; not every library of C has them.
+    functions = (f"log{end}({real})", f"exp{end}({real})", f"pow{end}({real}, {real})")
+    in_lanes = "".join(f'__attribute__((simd("notinbranch"))) {real} {one};\n' for one in functions)
     lines = [
         "#include <math.h>",
         *in_lanes.splitlines(),

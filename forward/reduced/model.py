@@ -229,12 +229,9 @@ class ReducedModel(OneByOne):
             found = in_steps(self.way, self.level, self.data, whole, work)
         return ReducedSolution(self, parameters, whole, *found, work)
 
-    def first(self, whole: FloatArray) -> FloatArray:
-        """Return what the snapshots say of the coordinates of the modes at parameters (d,)."""
-        return self._predictor(whole)
-
     @cached_property
-    def _predictor(self) -> Callable[[FloatArray], FloatArray]:
+    def first(self) -> Callable[[FloatArray], FloatArray]:
+        """Returns what the snapshots say of the coordinates of the modes at parameters (d,)."""
         return predictor(self.data, self.level)
 
 

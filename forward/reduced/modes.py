@@ -334,16 +334,8 @@ class AtRest:
     ) -> tuple[FloatArray, int, NDArray[np.bool_]]:
         """Return modes (k, U_local) of blocks, how many of them a model has, and which cells are kept in full.
 
-        Parameters
-        ----------
-        rows
-            Snapshots (s, U_local).
-        labels
-            The block of each cell.
-        full
-            Places (f, 3) whose blocks are kept in full.
-        most, more
-            How many modes the model has besides those of such blocks, and the larger one besides.
+        Blocks of cells are told by labels, those kept in full by places (f, 3) in them; `most` and `more` are how many
+        modes the model has besides those of such blocks, and the larger one besides.
 
         Raises
         ------

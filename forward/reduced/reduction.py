@@ -14,13 +14,13 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
-from forward.reduced.limits import mistakes
 from forward.reduced.modes import AtRest, boxes, enough
 from forward.reduced.newton import stable
 from forward.reduced.outputs import Outputs
 from forward.reduced.reduced_equations import ReducedEquations
 from forward.reduced.rules import STATES, Rules, Training
 from forward.reduced.snapshots import Snapshots, solved
+from forward.reduced.spec import mistakes
 
 OF_ADJOINTS = 3  # modes of states that the larger model has besides, for one of adjoints
 LOOKED_AT = 4  # snapshots at which the larger model must be stable
@@ -349,15 +349,7 @@ def enriched(data: ReducedData, points: FloatArray, cubature: float = 1e-3) -> R
     """Solve the full model at parameters (k, d), and return a reduced model that holds these too.
 
     Such points are where a reduced model with a tolerance has asked the full one (`ReducedModel.asked`).
-
-    Parameters
-    ----------
-    data
-        The reduced model; it stays as it is.
-    points
-        All its parameters (k, d) at each of the solutions.
-    cubature
-        What the points may miss of the forces, relative.
+    It stays as it is; `cubature` is what the points of the new one may miss of the forces, relative.
 
     Raises
     ------

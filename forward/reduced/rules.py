@@ -93,18 +93,8 @@ class Training:
 class Rules:
     """The points of a body, and the choice among them.
 
-    Parameters
-    ----------
-    equations
-        The body, in one process.
-    works
-        Integrands of virtual works: first that of the energy.
-    whole
-        Which of them keep all their points.
-    densities
-        What else the rule of the energy integrates.
-    numbers
-        Which parameters (p,) integrands take.
+    Of integrands of virtual works, the first of which is that of the energy, whose rule integrates densities of outputs
+    too; `whole` says which keep all their points. Integrands take numbers (p,) among the parameters.
     """
 
     def __init__(
@@ -326,7 +316,7 @@ class _Normal:
         """Add points, by their products with those that are in (k, b) and among each other (b, b)."""
         k, n = self._count, self._count + len(among)
         if n > len(self._grams):
-            self._grams, self._factors = (_roomier(one, k, 2 * n) for one in (self._grams, self._factors))
+            self._grams, self._factors = (np.pad(one[:k, :k], (0, 2 * n - k)) for one in (self._grams, self._factors))
         self._grams[k:n, :k], self._grams[k:n, k:n] = beside.T, among
         if self._whole and k:
             across = solve_triangular(self._factors[:k, :k], beside, lower=True, check_finite=False)
@@ -371,12 +361,6 @@ class _Normal:
             except LinAlgError:
                 continue
         return np.asarray(np.linalg.lstsq(gram, right, rcond=1e-10)[0])
-
-
-def _roomier(corner: FloatArray, k: int, size: int) -> FloatArray:
-    found = np.zeros((size, size))
-    found[:k, :k] = corner[:k, :k]
-    return found
 
 
 def _raised(gram: FloatArray, more: float) -> FloatArray:

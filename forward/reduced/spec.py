@@ -22,6 +22,7 @@ from forward.spec import ModelSpec
 
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges
+    from forward.loaded import LoadedBody
     from forward.materials.admissible import Materials
 
 LETTERS = 16  # of a hash
@@ -305,6 +306,24 @@ def _shape(body: Hyperelastic, numbers: set[str]) -> dict[str, Any]:
     whole = body.model_dump(mode="json", exclude_none=True, exclude={*_APART})
     found: dict[str, Any] = json.loads(json.dumps(whole), object_hook=bare)
     return found | {"body": whole["body"]}
+
+
+def mistakes(spec: LoadedBody) -> Iterator[str]:
+    """Say what of a body cannot be reduced, one line each."""
+    rubbing = [load.label for load in spec.loads if load.contact and not load.symmetric]
+    if rubbing:
+        yield (
+            f"a reduced model has no friction, which depends on the way that a tool went, expected friction = 0 of "
+            f"{', '.join(rubbing)}"
+        )
+    for load in (load for load in spec.loads if not load.written):
+        yield f"the load '{load.label}' is no form and cannot be reduced, expected loads that are written as forms"
+    known = {"displacement", "mean-displacement", "max-displacement", "reaction", "strain-energy", "volume-change"}
+    known |= {"max-von-mises", "force", "contact-area"}
+    for output in spec.outputs:
+        kind = str(getattr(output, "kind"))  # noqa: B009 - every output has a kind
+        if kind not in known and "." not in kind:
+            yield f"the output '{output.name}' of kind '{kind}' cannot be reduced"
 
 
 def without_answer(told: Mapping[str, Any]) -> Iterator[Finding]:

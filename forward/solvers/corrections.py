@@ -84,18 +84,11 @@ def predict_correct(
 
 def straight(state: FloatArray, slope: FloatArray, known: list[tuple[float, FloatArray]], t: float) -> FloatArray:
     """Predict the state (U_local,) after a fraction t of the path from a state, as in `predict_correct`."""
-    return np.asarray(state + t * slope + t**2 * _line(known, t))
-
-
-def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:
-    """Value at t of the line through the last two known points, of the constant through one, or zero."""
-    if not known:
-        return 0.0
-    (b, q) = known[-1]
-    if len(known) == 1:
-        return q
-    (a, p) = known[-2]
-    return np.asarray(p + (t - a) / (b - a) * (q - p))
+    bend: FloatArray | float = known[-1][1] if known else 0.0
+    if len(known) > 1:  # the line through the last two
+        (a, p), (b, q) = known[-2:]
+        bend = p + (t - a) / (b - a) * (q - p)
+    return np.asarray(state + t * slope + t**2 * bend)
 
 
 class Mixed(NamedTuple):

@@ -199,16 +199,8 @@ def settled(
 ) -> Steps[Found]:
     """Return the equilibrium that is joined to rest: the one found, unless an audit ends elsewhere.
 
-    Parameters
-    ----------
-    found
-        A stable equilibrium at full load, with what a tangent predicted for it.
-    way
-        The path from a reference on which it was found.
-    before
-        The state (U_local,) from which it was predicted, if not that of the reference.
-    audit
-        Whether it was drawn at random.
+    The one found is stable at full load, with what a tangent predicted for it: on the way from a reference, or from a
+    state `before` (U_local,). An audit is drawn at random.
 
     Raises
     ------

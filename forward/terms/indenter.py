@@ -111,9 +111,8 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        found |= {axis: Scalar(value, tools.Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
-        pointing = zip(POINTING, self.along, strict=True)
-        return found | {name: Scalar(component, tools.Pointing, name) for name, component in pointing}
+        placed = zip(("x", "y", "z", *POINTING), (*self.at, *self.along), strict=True)
+        return found | {name: Scalar(value, tools.Placed, name) for name, value in placed}
 
     @property
     def size(self) -> float:
@@ -134,8 +133,8 @@ class Indenter(Term):
         """Unit vector of its direction."""
         return unit_vector(self.direction)
 
-    def resistance(self, modulus: float, extent: float) -> tools.Stiffness:
-        """Return the stiffness that keeps the penetration small.
+    def resistance(self, modulus: float, extent: float) -> tuple[float, float]:
+        """Return the stiffness that keeps the penetration small, and the width over which contact sets in.
 
         Of a body with modulus E/(1 − ν²) (Pa) and this extent (m) along the direction, by the formulas at the top.
         """
@@ -149,7 +148,7 @@ class Indenter(Term):
             case _:
                 slope = ROUND * 2 / math.pi * modulus / self._moved.size
         width = BORNE * extent if self.shape == "plane" and self.depth == 0 else SMOOTH * self.penetration * self._depth
-        return tools.Stiffness(MARGIN * slope / self.penetration, width)
+        return MARGIN * slope / self.penetration, width
 
     @property
     def _depth(self) -> float:

@@ -28,51 +28,30 @@ NUMPY = SimpleNamespace(
 )
 
 
-class Position(Settings):
-    """Where a tool is.
+class Placed(Settings):
+    """Where a tool is, and how it points.
 
     Parameters
     ----------
     x, y, z
         Of its tip (m) before it is moved.
+    direction_x, direction_y, direction_z
+        Components of its direction; their length does not matter.
     """
 
     x: Annotated[float, Unit("m")]
     y: Annotated[float, Unit("m")]
     z: Annotated[float, Unit("m")]
-
-
-class Pointing(Settings):
-    """How a tool points.
-
-    Parameters
-    ----------
-    direction_x, direction_y, direction_z
-        Components of its direction; their length does not matter.
-    """
-
     direction_x: Annotated[float, Unit("1")]
     direction_y: Annotated[float, Unit("1")]
     direction_z: Annotated[float, Unit("1")]
 
 
-class Stiffness(NamedTuple):
-    """How a tool resists penetration.
-
-    Attributes
-    ----------
-    value
-        Pressure per penetration (Pa/m).
-    width
-        Range of gaps (m) over which contact sets in.
-    """
-
-    value: float
-    width: float
-
-
 class Touch(NamedTuple):
-    """A gap (m) in UFL, and how the tool resists where it closes (as `Stiffness`)."""
+    """How a tool resists penetration, in UFL: a gap (m), and pressure per penetration (Pa/m) where it closes.
+
+    Contact sets in over a `width` of gaps (m).
+    """
 
     gap: Any
     stiffness: Any

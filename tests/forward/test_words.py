@@ -6,7 +6,6 @@ import pytest
 
 from forward.readable import (
     and_error,
-    between,
     duration,
     interval,
     number,
@@ -86,7 +85,6 @@ def test_units_of_the_right_size(value, unit, expected):
 def test_quantities():
     assert quantity(0.12279, 0.00015, "m") == "12.279\u00a0cm"
     assert and_error(0.12311, 0.00009, "m") == "12.311 ± 0.009\u00a0cm"
-    assert between(0.02878, 0.02906, "m") == "2.878 to 2.906\u00a0cm"
     assert interval(0.11, 0.137, "m", 0.12) == "11.0–13.7\u00a0cm"
     assert [percent(p) for p in (0.71, 0.032, 1e-4, 0.9996, 1.0)] == [
         "71\u00a0%",

@@ -99,5 +99,5 @@ class Reduce(Method):
             return
         if self.case is not None:
             yield ("method", "case"), "a body has no load cases, expected none", self.case
-        for said in named("forward.reduced.limits:mistakes")(spec):
+        for said in named("forward.reduced.spec:mistakes")(spec):
             yield ("model",), said, spec.kind

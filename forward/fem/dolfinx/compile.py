@@ -22,13 +22,9 @@ from forward.native import FLAGS, processor
 T = TypeVar("T")
 
 
-def _cache_directory() -> Path:
-    """Folder of compiled code for this kind of processor, this Python and these flags."""
-    made_for = [processor(), str(sysconfig.get_config_var("SOABI")), version.VERSION, *FLAGS]
-    return compiled_forms() / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
-
-
-_CACHE = _cache_directory()
+# Folder of compiled code for this kind of processor, this Python and these flags.
+_MADE_FOR = " ".join([processor(), str(sysconfig.get_config_var("SOABI")), version.VERSION, *FLAGS])
+_CACHE = compiled_forms() / f"forms-{hashlib.sha256(_MADE_FOR.encode()).hexdigest()[:12]}"
 
 
 def cache_folder() -> Path:
@@ -83,7 +79,10 @@ def compiled(name: str, make: Callable[[Path], T], comm: Any, beside: str = "") 
     if comm.bcast(folder.is_dir() if comm.rank == 0 else None):
         return make(folder)
     with _lock(folder.name) if comm.rank == 0 else nullcontext():
-        place = comm.bcast(_vacant(folder) if comm.rank == 0 else None)
+        place = folder
+        if comm.rank == 0 and not folder.is_dir():  # it may have appeared
+            place = Path(tempfile.mkdtemp(dir=_CACHE))
+        place = comm.bcast(place)
         try:
             made = make(place)
             comm.barrier()  # everyone has loaded it
@@ -94,11 +93,6 @@ def compiled(name: str, make: Callable[[Path], T], comm: Any, beside: str = "") 
             if comm.rank == 0 and place != folder:
                 shutil.rmtree(place, ignore_errors=True)
     return made
-
-
-def _vacant(folder: Path) -> Path:
-    """Where to compile: in a new folder, unless the folder itself has appeared."""
-    return folder if folder.is_dir() else Path(tempfile.mkdtemp(dir=_CACHE))
 
 
 def compile_form(form: Any, comm: Any, name: str = "") -> Any:

@@ -88,6 +88,7 @@ class SingleSolver:
         self._double: DirectSolver | None = None
         self._use_double = False
         self._x, self._b = stiffness.matrix.createVecs()
+        self._library: Any = library()
 
     @property
     def in_single(self) -> bool:
@@ -106,7 +107,7 @@ class SingleSolver:
 
     def _made_single(self) -> bool:
         """Assemble, and make a factor that is good enough; False if there is none."""
-        found = library()
+        found = self._library
         if found is None:
             return False
         expected = self._stiffness.expected
@@ -148,9 +149,7 @@ class SingleSolver:
 
     def _once(self, rows: NDArray[np.float32], *, transpose: bool = False) -> None:
         """Solve with the factor for rows (k, n) in PETSc's order, in place."""
-        found = library()
-        assert found is not None
-        status = found.solve(self._factor, rows.ctypes.data, len(rows), int(transpose and not self._symmetric))
+        status = self._library.solve(self._factor, rows.ctypes.data, len(rows), int(transpose and not self._symmetric))
         assert status >= 0, status
 
     def _scaled(self, rights: FloatArray, *, transpose: bool = False) -> FloatArray:
@@ -220,9 +219,8 @@ class SingleSolver:
             self._double.release()
 
     def _end(self) -> None:
-        found = library()
-        if found is not None and self._factor:
-            found.end(self._factor)
+        if self._factor:
+            self._library.end(self._factor)
         self._factor, self._analysed = None, False
 
     def __del__(self) -> None:
@@ -234,16 +232,14 @@ class SingleSolver:
         if self._use_double:
             assert self._double is not None
             return self._double.negative_eigenvalues()
-        found = library()
-        return int(found.told(self._factor, 12)) if self._symmetric and found is not None else None
+        return int(self._library.told(self._factor, 12)) if self._symmetric else None
 
     def memory(self) -> int:
         """Return the bytes of the last factor with its working memory, in whole megabytes; 0 before."""
         if self._use_double:
             assert self._double is not None
             return self._double.memory()
-        found = library()
-        return 10**6 * int(found.told(self._factor, 22)) if found is not None and self._analysed else 0
+        return 10**6 * int(self._library.told(self._factor, 22)) if self._analysed else 0
 
 
 def _entries(matrix: Any, *, half: bool) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:

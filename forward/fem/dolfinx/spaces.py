@@ -112,15 +112,6 @@ def point_rows(space: Any, points: FloatArray) -> tuple[NDArray[np.bool_], NDArr
     return every.argmin(axis=0) == comm.rank, some, np.asarray(values), every.min(axis=0)
 
 
-def point_weights(
-    space: Any, points: FloatArray
-) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
-    """Return the same point by point: nodes and weights, None for those of other ranks; and the distances."""
-    mine, nodes, weights, distances = point_rows(space, points)
-    rows = zip(mine, nodes, weights, strict=True)
-    return [(its, np.array(row)) if own else None for own, its, row in rows], distances
-
-
 def quadrature_points(space: Any, degree: int) -> FloatArray:
     """Reference points (q, 3) of the quadrature rule of the integrals."""
     points, _ = basix.make_quadrature(version.cell_type(space), degree)

@@ -7,7 +7,7 @@ import pytest
 
 from forward.fem.enriched import EnrichedState
 from forward.fem.history import HistorySolution, Increment, Passed
-from forward.fem.linearisation_point import LinearisationPoint
+from forward.fem.linearisation import LinearisationPoint
 from forward.fem.solution import FiniteElementSolution
 from forward.model import Stability, Work
 

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic, Path
 from forward.model import Guess, ModelError, ReferenceSolution, SolveError, Stability
-from forward.reduced.limits import mistakes
+from forward.reduced.spec import mistakes
 from forward.specimen import Specimen
 from forward.terms.acting import Entries
 from forward.terms.term import Item

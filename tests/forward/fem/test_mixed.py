@@ -135,7 +135,7 @@ def test_a_state_has_a_canonical_order(form):
     equations.set_state(state)
     np.testing.assert_array_equal(equations.state(), state)
     equations.set_state(0 * state)
-    np.testing.assert_array_equal(equations.unknowns.take(equations._state.x.array), 0)
+    np.testing.assert_array_equal(equations.unknowns.take(equations.unknown.x.array), 0)
 
 
 def test_fields_are_those_of_displacements_and_predictions_hold_pressures():

@@ -15,12 +15,12 @@ from forward.materials.material import MATERIALS
 from forward.model import InadmissibleError, ModelError
 from forward.reduced.data import load, save
 from forward.reduced.integrands import of_density, of_form
-from forward.reduced.limits import mistakes
 from forward.reduced.model import ReducedModel
 from forward.reduced.newton import outside_of
 from forward.reduced.outputs import NEAR_PEAK
 from forward.reduced.reduction import Reduction, Sizes, enriched
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
+from forward.reduced.spec import mistakes
 
 pytestmark = pytest.mark.fem
 
