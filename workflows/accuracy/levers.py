@@ -353,10 +353,7 @@ def factor(before: Sequence[int], after: Sequence[int]) -> float:
 def rate_of(meshes: Sequence[Assessed]) -> float:
     """The rate at which errors fall with the size of cells, by the last two meshes."""
     known = {factor(meshes[0].cells, one.cells): one.size for one in meshes if one.size > 0}
-    if len(known) < 2:
-        return RATE
-    (coarse, before), (fine, after) = list(known.items())[-2:]
-    return float(np.clip(np.log(before / after) / np.log(fine / coarse), *RATES))
+    return _rate(list(known.items()), *RATES) or RATE
 
 
 def rate_seen(meshes: Sequence[Assessed], degree: int, d: int) -> float | None:
@@ -365,7 +362,12 @@ def rate_seen(meshes: Sequence[Assessed], degree: int, d: int) -> float | None:
     Coarse meshes may show too little: none is believed to be less than what is assumed elsewhere.
     """
     known = {one.unknowns: one.size for one in meshes if one.size > 0}
+    return _rate(sorted(known.items()), RATE, 2 * degree, d)
+
+
+def _rate(known: Sequence[tuple[float, float]], least: float, most: float, d: int = 1) -> float | None:
+    """The rate by the last two of how fine meshes are and their errors; None of fewer."""
     if len(known) < 2:
         return None
-    (coarse, before), (fine, after) = sorted(known.items())[-2:]
-    return float(np.clip(d * np.log(before / after) / np.log(fine / coarse), RATE, 2 * degree))
+    (coarse, before), (fine, after) = known[-2:]
+    return float(np.clip(d * np.log(before / after) / np.log(fine / coarse), least, most))

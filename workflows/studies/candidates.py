@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -44,12 +43,13 @@ class CandidateBlock(Settings):
         return inputs_of(self.parameters, self.correlations)
 
     def restricted(self, spec: ModelSpec | None) -> Inputs:
-        """The random parameters, restricted to those that make materials, where there are some."""
-        return self.inputs
+        """The random parameters, restricted to those that make materials of a model, where there are some."""
+        materials = None if spec is None else spec.materials(self.inputs.names)
+        return self.inputs if materials is None else self.inputs.within(materials)
 
-    @abstractmethod
     def units(self, spec: ModelSpec | None) -> dict[str, str]:
-        """SI units of its numbers, of which some are parameters."""
+        """SI units of the numbers of its model, of which some are parameters."""
+        return {} if spec is None else {path: number.unit for path, number in spec.scalars.items()}
 
 
 class CandidateModel(TestedMaterial, CandidateBlock):
@@ -106,15 +106,6 @@ class ModelCandidate(CandidateBlock):
     """
 
     model: dict[str, Any] = Field(default={})
-
-    def restricted(self, spec: ModelSpec | None) -> Inputs:
-        """The random parameters, restricted to those that make materials, where there are some."""
-        materials = None if spec is None else spec.materials(self.inputs.names)
-        return self.inputs if materials is None else self.inputs.within(materials)
-
-    def units(self, spec: ModelSpec | None) -> dict[str, str]:
-        """SI units of the numbers of the model."""
-        return {} if spec is None else {path: number.unit for path, number in spec.scalars.items()}
 
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of the priors does not fit the model."""
@@ -178,21 +169,21 @@ class OfCandidates(StudyKind):
         found: dict[str, str] = self.candidates[name].units(self.of_candidates.get(name))
         return found
 
-    def models_and_mistakes(self) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
-        """Find the place of each candidate, its model (None if it is none), and what is wrong with it."""
+    def models_and_mistakes(self) -> Iterator[tuple[ModelSpec | None, list[Mistake]]]:
+        """Find the model of each candidate (None if it is none), and what is wrong with it."""
         for name, block in self.changes.items():
             place, candidate = ("candidates", name), self.candidates[name]
             try:
                 spec = spec_of(block)
             except ValidationError as error:
                 lines = error.errors(include_url=False)
-                yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
+                yield None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
                 continue
             wrong = [*candidate.mistakes(spec), *spec.mistakes_of_mesh()]
             if spec.coefficients:
                 message = "random fields, expected numbers only: candidates have few parameters"
                 wrong.append((("model", "fields"), message, len(spec.coefficients)))
-            yield place, spec, [((*place, *where), message, given) for where, message, given in wrong]
+            yield spec, [((*place, *where), message, given) for where, message, given in wrong]
 
 
 def spec_of(block: Mapping[str, Any]) -> ModelSpec:

@@ -209,7 +209,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython):
                 yield (block,), "those of each candidate are its own, expected none of the model", list(given)
                 return
         first = True
-        for _, spec, wrong in self.models_and_mistakes():
+        for spec, wrong in self.models_and_mistakes():
             yield from wrong
             if spec is None:
                 continue

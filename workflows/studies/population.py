@@ -252,7 +252,9 @@ class PopulationJob(Job):
                 found = job.run(ensemble, part, progress, blocks)
                 if found is None:
                     return None, ""
-                self._keep(job, f"{specimen}, {times}")
+                self.own.append(job.own_seconds)
+                for label, solved in job.evaluations.items():
+                    self.solved[f"{specimen}, {times}" if label == "/" else f"{specimen}, {times}/{label}"] = solved
                 return draws_in(job.labelled(found), one.method.kind), ""
             except (ValueError, StudyError, SolveError) as error:
                 return None, "; ".join(map(str, error.args))
@@ -275,11 +277,6 @@ class PopulationJob(Job):
             return fitted
 
         return ensemble.led(task, lambda asked: again(*asked))
-
-    def _keep(self, job: Job, label: str) -> None:
-        self.own.append(job.own_seconds)
-        for part, found in job.evaluations.items():
-            self.solved[label if part == "/" else f"{label}/{part}"] = found
 
 
 def _prior(study: PopulationStudy, names: Sequence[str]) -> Inputs:

@@ -222,7 +222,7 @@ class Selection(SelectionBlocks, FromPython):
         if self.data.quantity == DisplacementFile.quantity and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
             yield ("method", "check"), message, self.method.check
-        for _, spec, mistakes in self.models_and_mistakes():
+        for spec, mistakes in self.models_and_mistakes():
             yield from mistakes
             if spec is not None:
                 yield from self.mistakes_of_ranks(spec)

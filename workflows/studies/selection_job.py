@@ -39,8 +39,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
     motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
-        moved = {pair: evaluate.on(f"{'/'.join(pair)}/{MOVED}") for pair in motions}
-        shared = {pair: motion.errors_by(moved[pair]) for pair, motion in motions.items()}
+        shared = {(n, g): motion.errors_by(evaluate.on(f"{n}/{g}/{MOVED}")) for (n, g), motion in motions.items()}
 
         def recorded(name: str, group: str) -> Evaluate:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
@@ -55,10 +54,6 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
                 return Finer(None, why[name])
             return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
-        def itself(name: str, group: str) -> ForwardModel:
-            found: ForwardModel = makers[name, group]()
-            return found
-
         return method.run(
             study.models,
             study.data_groups,
@@ -67,7 +62,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
             look if why else None,
             ensemble.say,
             shared or None,
-            itself,
+            lambda *pair: makers[pair](),
         )
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
