@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.bodies.geometry import AXES
+from forward.combine import Recorded
 from forward.model import FloatArray, ModelError, SolveError
 from forward.scalars import Mistake
 from forward.specimen import Observed
@@ -16,7 +17,7 @@ from inverse.data.measurements import Measurements
 from inverse.designs.fields import of_field
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.kept import Kept, KeptModel
+from uq.evaluation.kept import Kept, KeptSolves
 from workflows.data.designs import files
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import has_mesh
@@ -155,7 +156,7 @@ def _of_field(
 
     def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
         solving.append(Kept(checkpoint, ensemble.group, names[number]))
-        kept = KeptModel(model, solving[-1], solved)
+        kept = Recorded(model, KeptSolves(solving[-1], solved))
         whitened = method.whitened(number, len(model.parameters))
         try:
             solution = kept.solve(prior.root(whitened))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.combine import Recorded
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.finer import Finer
@@ -18,7 +19,7 @@ from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.kept import Kept, KeptModel
+from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
@@ -211,9 +212,9 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
         """Solve other models, on finer meshes or at moved points, which are no solves of the model."""
         return SerialEvaluate(model, kept=kept(name))
 
-    def states_of(name: str, model: ForwardModel) -> KeptModel:
+    def states_of(name: str, model: ForwardModel) -> Recorded:
         """Keep the solves for what is predicted from a field."""
-        return KeptModel(model, kept(name))
+        return Recorded(model, KeptSolves(kept(name)))
 
     invert_field = _inverting_field(study, made, ensemble, states_of) if study.field else None
     predicted = None if study.predict is None or study.field else _predicted(study, ensemble)
@@ -243,7 +244,7 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
         seen = made.observed(number)
         problem = _problem(study, number, seen, on, ensemble.say)
         if invert_field is not None:
-            return invert_field(names[number], KeptModel(seen.model, kept(names[number]), solved), problem)
+            return invert_field(names[number], Recorded(seen.model, KeptSolves(kept(names[number]), solved)), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
         near = partial(Nearby.at, seen.model, spread=study.inputs.std)
         cheap = None if reduced is None else reduced(seen.model)
@@ -293,7 +294,7 @@ def _by_expansion(
 
 
 def _inverting_field(
-    study: InversionBlocks, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
+    study: InversionBlocks, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], Recorded]
 ) -> Callable[[str, ForwardModel, Problem], xr.Dataset]:
     """Return what inverts a data set, by its name, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
