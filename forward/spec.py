@@ -177,7 +177,7 @@ class ModelSpec(Settings):
 
     @property
     def parts(self) -> Mapping[str, ModelSpec]:
-        """The models that it joins, by name; none by default."""
+        """The models that it joins, by name, whose bodies, tools and modules are its own; none by default."""
         return {}
 
     def path_of(self, name: str, path: str) -> str:
