@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, eye
 
+from forward.affine import Affine, Sparse, along, picked, times
 from forward.model import (
     FloatArray,
     ForwardModel,
@@ -25,12 +25,7 @@ from forward.model import (
     Stability,
     Work,
 )
-from forward.pointwise import OfModel, OneByOne
-
-
-def times(matrix: csr_matrix, rows: FloatArray) -> FloatArray:
-    """Return the product (…, n) of a matrix (n, m) with a vector (m,), or with each of k rows (k, m)."""
-    return np.asarray((matrix @ np.asarray(rows).T).T)
+from forward.pointwise import Known, OfModel, OneByOne
 
 
 class OfOne(OfModel, OneByOne):
@@ -70,11 +65,6 @@ class Rows(OfOne):
         return CombinedSolution((self.model.solve(parameters, guess),), len(parameters), S=self.S)
 
 
-def picked(which: Sequence[int] | NDArray[np.int64], count: int) -> csr_matrix:
-    """Return the matrix (n, count) that takes n of so many numbers, by their places."""
-    return eye(count, format="csr")[np.array(which, dtype=np.int64)]
-
-
 def taking(model: ForwardModel, which: Sequence[int] | NDArray[np.int64], names: tuple[str, ...]) -> Mapped:
     """Return a model as one of other parameters, of which it takes some, by their places."""
     return Mapped(model, Sparse(picked(which, len(names)), np.zeros(len(which))), names)
@@ -92,47 +82,6 @@ def selected(model: ForwardModel, which: Sequence[int]) -> Rows:
 def sums_of(model: ForwardModel) -> tuple[ForwardModel, csr_matrix]:
     """Return of which model's outputs (m,) those of a model (n,) are sums, and their weights (n, m): its own, or S."""
     return (model.model, model.S) if isinstance(model, Rows) else (model, eye(len(model.outputs), format="csr"))
-
-
-class Affine(Protocol):
-    """An affine map p = A q + b of parameters q (d,) to parameters p (D,)."""
-
-    def values(self, points: FloatArray) -> FloatArray:
-        """Return p (n, D) of points q (n, d)."""
-
-    def along(self, directions: FloatArray) -> FloatArray:
-        """Return A q (n, D) of directions q (n, d)."""
-
-    def back(self, gradients: FloatArray) -> FloatArray:
-        """Return gradients (n, d) by q of gradients (n, D) by p."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sparse:
-    """An affine map by a sparse matrix.
-
-    Parameters
-    ----------
-    A
-        (D, d).
-    b
-        (D,).
-    """
-
-    A: csr_matrix
-    b: FloatArray
-
-    def values(self, points: FloatArray) -> FloatArray:
-        """Return p (n, D) of points q (n, d)."""
-        return times(self.A, points) + self.b
-
-    def along(self, directions: FloatArray) -> FloatArray:
-        """Return A q (n, D) of directions q (n, d)."""
-        return times(self.A, directions)
-
-    def back(self, gradients: FloatArray) -> FloatArray:
-        """Return gradients (n, d) by q of gradients (n, D) by p."""
-        return times(self.A.T, gradients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +121,6 @@ def mapped(guess: Guess | None, by: Affine) -> Guess | None:
     spread = None if near.spread is None else along(by, near.spread)
     there = ReferenceSolution(by.values(near.parameters[None])[0], near.state, spread, near.joined)
     return replace(guess, reference=there)
-
-
-def along(by: Affine, directions: FloatArray) -> FloatArray:
-    """Return A q (…, D) of directions q (…, d)."""
-    return by.along(np.atleast_2d(directions)).reshape(*np.shape(directions)[:-1], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +188,37 @@ class Joined(OneByOne):
                     raise
                 raise error.within(self.labels[k]) from error
         return CombinedSolution(tuple(found), len(parameters), order=self.order)
+
+
+Record = Callable[[ForwardModel, FloatArray, Callable[[], Solution]], Solution | Known]
+"""Returns the solution of a model at parameters (d,), by solving, or what was recorded of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded(OfOne):
+    """A model whose solutions are recorded.
+
+    One of which the values are known is solved for only where more is asked of it: from its state, which meets the
+    tolerance already, so that derivatives are the same.
+
+    Parameters
+    ----------
+    model
+        The model.
+    record
+        Where its solutions are found.
+    """
+
+    model: ForwardModel
+    record: Record
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
+        """Return the solution at `parameters` (d,), solved for or recorded; errors as for the model."""
+        point = np.array(parameters)
+        found = self.record(self.model, point, lambda: self.model.solve(point, guess))
+        if not isinstance(found, Known):
+            return found
+        return RecordedSolution(found, lambda: self.model.solve(point, replace(guess or Guess(), state=found.state)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,6 +387,21 @@ class CombinedSolution:
             all_of([0.0 if one is None else one.shifts for one in parts], 0.0),
             all_of([0.0 if one is None else one.doubts for one in parts], math.nan),
         )
+
+
+class RecordedSolution(CombinedSolution):
+    """A solution whose values are known; it is solved for once anything else is asked of it."""
+
+    residual, converged, stability, work = 0.0, True, Stability.NOT_TESTED, Work()  # known, and not of `solutions`
+
+    def __init__(self, known: Known, solve: Callable[[], Solution]) -> None:
+        self.outputs, self.state, self.residual, self.converged, self.stability, self.work = known
+        self._solve = solve
+
+    @cached_property
+    def solutions(self) -> tuple[Solution, ...]:
+        """The one of the model itself."""
+        return (self._solve(),)
 
 
 def side_by_side(states: Sequence[FloatArray], order: Sequence[int]) -> FloatArray:

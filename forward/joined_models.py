@@ -89,35 +89,10 @@ class JoinedModels(ModelSpec):
         return self.models
 
     @property
-    def bodies(self) -> tuple[Any, ...]:
-        """The bodies with meshes of all models."""
-        return tuple(body for model in self.models.values() for body in model.bodies)
-
-    @property
     def hidden(self) -> str:
         """That errors of meshes are not estimated where it is sampled."""
         of = [f"'{name}'" for name, model in self.models.items() if model.bodies]
         return f"the error of the mesh of {', '.join(of)} is not estimated where models are joined" if of else ""
-
-    @property
-    def touched(self) -> bool:
-        """Whether tools touch any of the models."""
-        return any(model.touched for model in self.models.values())
-
-    @property
-    def unrefined(self) -> bool:
-        """Whether the mesh of any is still to be refined."""
-        return any(model.unrefined for model in self.models.values())
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that the user has written for any of them."""
-        return tuple(dict.fromkeys(module for model in self.models.values() for module in model.modules))
-
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns of the equations of all models."""
-        return sum(model.unknowns for model in self.models.values())
 
     def materials(self, parameters: Collection[str] = ()) -> Materials | None:
         """Return the materials of all models, which are of one kind, as functions of some numbers, by their paths."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import repeat
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,6 +73,17 @@ class OfModel:
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
         return displacements(self.model)
+
+
+class Known(NamedTuple):
+    """The values of a solution, as of `Solution`, without its linearisation."""
+
+    outputs: FloatArray
+    state: FloatArray
+    residual: float
+    converged: bool
+    stability: Stability
+    work: Work
 
 
 class ExplicitSolution:

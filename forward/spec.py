@@ -137,12 +137,12 @@ class ModelSpec(Settings):
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules that the user has written for it: results are not continued once their source has changed."""
-        return ()
+        return tuple(dict.fromkeys(module for part in self.parts.values() for module in part.modules))
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns of its equations; 0 if there are none."""
-        return 0
+        return sum(part.unknowns for part in self.parts.values())
 
     def materials(self, parameters: Collection[str] = ()) -> Materials | None:
         """Return its materials as functions of some of its numbers, by their paths, if it has any."""
@@ -177,7 +177,7 @@ class ModelSpec(Settings):
 
     @property
     def parts(self) -> Mapping[str, ModelSpec]:
-        """The models that it joins, by name; none by default."""
+        """The models that it joins, by name, whose bodies, tools and modules are its own; none by default."""
         return {}
 
     def path_of(self, name: str, path: str) -> str:
@@ -187,12 +187,12 @@ class ModelSpec(Settings):
     @property
     def bodies(self) -> tuple[Any, ...]:
         """The bodies with meshes that it consists of."""
-        return ()
+        return tuple(body for part in self.parts.values() for body in part.bodies)
 
     @property
     def touched(self) -> bool:
         """Whether tools touch it: richer elements seldom follow the edge of the area in contact."""
-        return False
+        return any(part.touched for part in self.parts.values())
 
     @property
     def adaptive(self) -> bool:
@@ -202,7 +202,7 @@ class ModelSpec(Settings):
     @property
     def unrefined(self) -> bool:
         """Whether that is still to be done."""
-        return False
+        return any(part.unrefined for part in self.parts.values())
 
     @property
     def largest_bytes(self) -> float:

@@ -184,17 +184,10 @@ class Specimen(Solid):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the load cases before anything is solved, each once."""
-        return (
-            *dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings),
-            *self._of_shared_paths(),
-        )
-
-    def _of_shared_paths(self) -> Iterator[Finding]:
-        """Say which paths stand for several numbers, none of which is a parameter."""
+        """Findings about the load cases before anything is solved, each once, and about paths of several numbers."""
+        found = dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings)
         paths = shared_paths(self.cases)
-        if paths:
-            yield Finding("paths-shared", "note", {"paths": ", ".join(paths)})
+        return (*found, *([Finding("paths-shared", "note", {"paths": ", ".join(paths)})] if paths else ()))
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
         """Find that outputs are not known, and random fields whose coefficients cannot be drawn."""
@@ -272,15 +265,7 @@ class Specimen(Solid):
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
-        """Mesh the body and compile the forms of every case on a communicator; collective.
-
-        Parameters
-        ----------
-        comm
-            mpi4py communicator of the ranks that share the model.
-        parameters
-            As in `Hyperelastic.build`.
-        """
+        """Mesh the body and compile the forms of every case, as `Hyperelastic.build` does of one; collective."""
         return named("forward.fem.joined:specimen")(self, comm, parameters)
 
     @model_validator(mode="after")

@@ -108,11 +108,6 @@ def counted(spec: Any) -> bool:
     return body.structured and (body.cell, body.degree) == ("hexahedron", 2) and not _touched(spec)
 
 
-def _thin(fine: Any, own: Any) -> bool:
-    """Whether cells of a finer mesh of a box or block are thinner at some faces than its own are."""
-    return not fine.structured or fine.grading != own.grading
-
-
 def _parts(body: Any) -> int:
     """Into how many parts edges of cells are divided where there are fields; linear cells become quadratic first."""
     return 1 if body.degree == 1 and min(body.cells) >= FEWEST else 2
@@ -184,7 +179,8 @@ def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | J
     spec = model.spec
     fine, beside = finer(spec), graded(spec)
     otherwise = None
-    if spec.body.structured and _thin(fine.body, spec.body):
+    thin = not fine.body.structured or fine.body.grading != spec.body.grading  # cells, at some faces
+    if spec.body.structured and thin:
         equal, less = (_hurried(_on(spec, times, thin=False), spec.solver.minimum_load_step) for times in (TIMES, 1.0))
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import eye
 
+from forward.affine import Sparse
 from forward.bodies.geometry import AXES
-from forward.combine import CombinedSolution, Joined, Mapped, Sparse, mapped, taking
+from forward.combine import CombinedSolution, Joined, Mapped, mapped, taking
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import relative
 from forward.fem.equations import Discretisation

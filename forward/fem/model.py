@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import cached_property, partial
 from itertools import chain, groupby, islice, repeat
-from typing import TypeVar
 
 import numpy as np
 
@@ -26,10 +25,10 @@ from forward.solvers.steps import Task, failed, finish_all
 from forward.solvers.system import Found
 from forward.solvers.way import Way
 
-P = TypeVar("P")
 
-
-def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool, Iterator[tuple[P, Guess]]]]:
+def by_reference(
+    pairs: Iterable[tuple[FloatArray, Guess | None]],
+) -> Iterator[tuple[bool, Iterator[tuple[FloatArray, Guess]]]]:
     """Group consecutive points, with their guesses, by the reference from which their states are predicted.
 
     Yields
@@ -39,7 +38,7 @@ def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool
     """
     last: ReferenceSolution | None = None
 
-    def reference(pair: tuple[P, Guess | None]) -> ReferenceSolution | None:
+    def reference(pair: tuple[FloatArray, Guess | None]) -> ReferenceSolution | None:
         nonlocal last
         guess = pair[1]
         if guess is None or guess.state is None or guess.reference is None:

@@ -275,25 +275,6 @@ class FiniteElementSolution:
             errors, change, found.energy, found.relative, found.work, nonlinearity=far, stored=found.stored
         )
 
-    def _saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
-        """Find the state in elements of two degrees more too, and the factors of state and energy; collective.
-
-        None where that takes too much memory, or is too rough.
-        """
-        model = self._model
-        self.visit()
-        twice = model.enriched_twice
-        if twice is None:
-            return None
-        once, found = self.enriched_state, self.estimated(twice)
-        n = 3 * model.equations.nodes_owned
-        seen, more = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
-        products = model.equations.total(np.array([seen @ seen, seen @ more]))
-        degree = model.spec.body.degree
-        (of_state,) = factors(products[0], products[1], degree)
-        (of_energy,) = factors(once.energy, found.energy, degree)
-        return twice, found, float(of_state), float(of_energy)
-
     def saturation(self, spare: float = math.inf, finer: Calibrating[Self] | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
@@ -327,14 +308,21 @@ class FiniteElementSolution:
         return self._by_degrees()
 
     def _by_degrees(self) -> Saturation:
-        """Calibrate estimates by elements of two degrees more; typical values where that takes too much memory."""
-        seen, degree = self.mesh_error().outputs, self._model.spec.body.degree
-        saturated = self._saturated()
-        if saturated is None:
+        """Calibrate estimates by elements of two degrees more; typical values where that is too much or too rough."""
+        model = self._model
+        seen, degree = self.mesh_error().outputs, model.spec.body.degree
+        self.visit()
+        twice = model.enriched_twice
+        if twice is None:
             return typical(seen, degree)
-        twice, state, of_state, of_energy = saturated
-        more = self._seen(twice.equations, state.state, lambda: twice.values(self, state)) - self.outputs
-        return Saturation(factors(seen, more, degree), of_state, of_energy)
+        once, found = self.enriched_state, self.estimated(twice)
+        n = 3 * model.equations.nodes_owned
+        own, change = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
+        products = model.equations.total(np.array([own @ own, own @ change]))
+        (of_state,) = factors(products[0], products[1], degree)
+        (of_energy,) = factors(once.energy, found.energy, degree)
+        more = self._seen(twice.equations, found.state, lambda: twice.values(self, found)) - self.outputs
+        return Saturation(factors(seen, more, degree), float(of_state), float(of_energy))
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:
         """Return contributions of this rank's cells to the mesh error of outputs, by `weights` (m,); collective.

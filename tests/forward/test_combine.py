@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
-from forward.combine import Joined, Mapped, Rows, Sparse, selected
+from forward.affine import Sparse
+from forward.combine import Joined, Mapped, Rows, selected
 from forward.conformance import check_derivatives
 from forward.fem.finer import FromStart, Otherwise, limit
 from forward.model import MeshError, Saturation, Work

@@ -5,16 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.combine import CombinedSolution, OfOne
 from forward.model import (
     FloatArray,
     ForwardModel,
-    Guess,
     InadmissibleError,
     Solution,
     SolveError,
@@ -23,6 +20,7 @@ from forward.model import (
     gathered,
     scattered,
 )
+from forward.pointwise import Known
 from uq.evaluation.checkpoint import read
 from uq.evaluation.request import Evaluations, Failure
 
@@ -86,76 +84,48 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class KeptModel(OfOne):
-    """A model in one rank group whose solutions are kept, failures included.
-
-    A solution on disk is solved for again only where it is asked for a derivative: from its state, which meets the
-    tolerance already, so that the derivative is the same. Collective over the group.
+class KeptSolves:
+    """The solves of a model that one rank group keeps on disk, failures included (`forward.combine.Record`).
 
     Parameters
     ----------
-    model
-        The model.
     kept
-        Where its solutions are kept and found.
+        Where they are kept and found.
     log
         Every solve is added to it, without its point, which may have as many numbers as the mesh has nodes.
     """
 
-    model: ForwardModel
     kept: Kept
     log: list[Evaluations] = field(default_factory=list)
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
-        """Return the solution at parameters (d,), the stored one if there is one; errors as for the model."""
+    def __call__(self, model: ForwardModel, point: FloatArray, solve: Callable[[], Solution]) -> Solution | Known:
+        """Return the solution at a point (d,), or its values if they are on disk; collective over the group.
+
+        Raises
+        ------
+        SolveError
+            As the model does, or did.
+        """
         solutions: list[Solution] = []
-        point = np.array(parameters)
 
         def solved() -> Evaluations:
             begin = time.process_time()
             try:
-                solutions.append(self.model.solve(point, guess))
+                solutions.append(solve())
             except SolveError as error:
-                return _recorded(self.model, point, error, time.process_time() - begin)
-            return _recorded(self.model, point, solutions[0], time.process_time() - begin)
+                return _recorded(model, point, error, time.process_time() - begin)
+            return _recorded(model, point, solutions[0], time.process_time() - begin)
 
         block, _ = self.kept.found(point, solved)
         self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
+        work, stability = Work(*block.work[0].tolist()), Stability(block.stability[0])
         for failure in block.failures:
             refused = InadmissibleError if failure.inadmissible else SolveError
-            work, stability = Work(*block.work[0].tolist()), Stability(block.stability[0])
             raise refused(failure.reason, failure.history, work, stability)
         if solutions:
             return solutions[0]
-        state = scattered(self.model, block.fields)[0]
-        return KeptSolution(block, state, lambda: self.model.solve(point, replace(guess or Guess(), state=state)))
-
-
-class KeptSolution(CombinedSolution):
-    """A solution whose values are stored; its model solves for it once anything else is asked.
-
-    Parameters
-    ----------
-    block
-        What is stored of it.
-    state
-        This rank's part (U_local,) of the state.
-    solve
-        Returns the solution of the model itself.
-    """
-
-    residual, converged, stability, work = 0.0, True, Stability.NOT_TESTED, Work()  # stored, not asked of `solutions`
-
-    def __init__(self, block: Evaluations, state: FloatArray, solve: Callable[[], Solution]) -> None:
-        self._solve = solve
-        self.outputs, self.state = block.outputs[0], state
-        self.residual, self.converged = float(block.residuals[0]), bool(block.converged[0])
-        self.stability, self.work = Stability(block.stability[0]), Work(*block.work[0].tolist())
-
-    @cached_property
-    def solutions(self) -> tuple[Solution, ...]:
-        """That of the model itself."""
-        return (self._solve(),)
+        state, residual = scattered(model, block.fields)[0], float(block.residuals[0])
+        return Known(block.outputs[0], state, residual, bool(block.converged[0]), stability, work)
 
 
 def _recorded(model: ForwardModel, point: FloatArray, found: Solution | SolveError, seconds: float) -> Evaluations:

@@ -293,7 +293,8 @@ def _of_field(
     method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Measurements
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
-    from uq.evaluation.kept import Kept, KeptModel
+    from forward.combine import Recorded
+    from uq.evaluation.kept import Kept, KeptSolves
 
     prior = spec.fields[0].prior(spec.body)
     names = [f"draw {number}" for number in range(method.draws)]
@@ -302,7 +303,7 @@ def _of_field(
 
     def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
         solving.append(Kept(checkpoint, ensemble.group, names[number]))
-        kept = KeptModel(model, solving[-1], solved)
+        kept = Recorded(model, KeptSolves(solving[-1], solved))
         whitened = method.whitened(number, len(model.parameters))
         try:
             solution = kept.solve(prior.root(whitened))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.combine import Recorded
 from forward.fem.finer import extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
@@ -20,7 +21,7 @@ from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.kept import Kept, KeptModel
+from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
@@ -255,7 +256,7 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
         seen = made.observed(number)
         problem = _problem(study, number, seen, on, ensemble.say)
         if invert_field is not None:
-            return invert_field(names[number], KeptModel(seen.model, kept(names[number]), solved), problem)
+            return invert_field(names[number], Recorded(seen.model, KeptSolves(kept(names[number]), solved)), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
         near = partial(Nearby.at, seen.model, spread=study.inputs.std)
         return _inverted(study, made, seen, problem, full, reduced(seen.model), near)
@@ -313,7 +314,7 @@ def _inverting_field(
     if predicted is not None:
         from workflows.studies.predicted import of_field
 
-        predicting = of_field(study, lambda name: KeptModel(predicted, kept(name)))
+        predicting = of_field(study, lambda name: Recorded(predicted, KeptSolves(kept(name))))
 
     def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
         posterior = FieldPosterior(states, problem.data.values, problem.noise, prior, progress=ensemble.count)

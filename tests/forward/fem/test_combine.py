@@ -5,7 +5,8 @@ import pytest
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from forward.combine import Joined, Mapped, Rows, Sparse, selected
+from forward.affine import Sparse
+from forward.combine import Joined, Mapped, Rows, selected
 from forward.conformance import check_derivatives
 from forward.fem.finer import FromStart, limit
 from forward.hyperelastic import Hyperelastic, Path

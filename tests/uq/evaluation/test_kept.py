@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from forward.combine import Recorded
 from forward.model import Guess, InadmissibleError, SolveError
 from forward.pointwise import FunctionModel, OneByOne
 from tests.states import WithState
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.kept import Kept, KeptModel
+from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Request
 
 NAMES = ("a", "b")
@@ -66,7 +67,7 @@ def counted():
 
 
 def kept(folder, label="one", identity="study"):
-    return KeptModel(counted(), Kept(Checkpoint(folder, identity), MPI.COMM_SELF, label))
+    return Recorded(counted(), KeptSolves(Kept(Checkpoint(folder, identity), MPI.COMM_SELF, label)))
 
 
 def use(model):
@@ -91,9 +92,9 @@ def test_nothing_is_solved_twice(tmp_path):
         np.testing.assert_array_equal(one, other)
     assert again.model.asked == asked
     assert [guess is not None and guess.state is not None for guess in again.model.guesses] == [True, True]
-    assert [one.work.tolist() for one in again.log] == [one.work.tolist() for one in first.log]
-    assert [one.seconds.tolist() for one in again.log] == [one.seconds.tolist() for one in first.log]
-    again.kept.forget()
+    assert [one.work.tolist() for one in again.record.log] == [one.work.tolist() for one in first.record.log]
+    assert [one.seconds.tolist() for one in again.record.log] == [one.seconds.tolist() for one in first.record.log]
+    again.record.kept.forget()
     assert not list((tmp_path / "evaluations").iterdir())
 
 
@@ -117,7 +118,7 @@ def test_other_models_and_studies_are_others(tmp_path):
 def test_a_damaged_solution_is_computed_again(tmp_path, capsys):
     first = kept(tmp_path)
     found = use(first)
-    path = first.kept.checkpoint.path(first.kept.keys[0])
+    path = first.record.kept.checkpoint.path(first.record.kept.keys[0])
     bytes_ = bytearray(path.read_bytes())
     bytes_[-8] ^= 1
     path.write_bytes(bytes(bytes_))
@@ -167,6 +168,6 @@ def test_failures_are_kept(tmp_path, at, kind):
             model.solve(np.array(at))
         assert type(raised.value) is kind
         assert model.model.asked == asked
-        assert len(model.log[0].failures) == 1
+        assert len(model.record.log[0].failures) == 1
         told.append((raised.value.reason, raised.value.history))
     assert told[0] == told[1]
