@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -105,9 +106,8 @@ def dependence(results: Results) -> Iterator[Block]:
         "standard normal coordinates)."
     )
     dataset = results.dataset
-    models = [str(model) for model in dataset.model.values]
+    models, names = ([str(name) for name in dataset[over].values] for over in ("model", "variant"))
     chances = dataset["variant_probability"].transpose("variant", "model").to_numpy()
-    names = [str(variant) for variant in dataset.variant.values]
     yield Table(("", *models), [(n, *(percent(float(p)) for p in row)) for n, row in zip(names, chances, strict=True)])
     of = [[dataset.sel(model=model, variant=name) for name in names] for model in models]  # models have longer names
     rows = [(model, *(written(o, "variant_log_evidence") for o in row)) for model, row in zip(models, of, strict=True)]
@@ -176,56 +176,36 @@ def averaged_candidates(results: Results) -> Iterator[Block]:
 def constants(results: Results) -> Iterator[Block]:
     """Constants of the models: posteriors and priors."""
     dataset, study = results.dataset, results.study
-    yield posteriors(results)
+    rows = []
+    for model, group, name in product(map(str, dataset.model.values), dataset.group.values, dataset.parameter.values):
+        one = dataset.sel(model=model, group=group, parameter=name)
+        if np.isfinite(float(one["constant_mode"])):
+            unit, like = results.parameter_unit(str(name), model), float(one["constant_mean"])
+            values = (
+                *(one[f"constant_{which}"] for which in ("mode", "mean", "std")),
+                *one["constant_quantiles"].values,
+            )
+            rows.append((model, str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
+    head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
+    yield Table(head, rows, text={0, 1, 2})
     several, best = dataset.sizes["group"] > 1, by_probability(dataset, dataset["log_evidence"])[0]
     yield Heading("Posteriors of the constants" + (f" of {best}" if several else ""), level=3)
-    pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
-    yield Pictures.of(
-        *(
-            (plots.corner(dataset, model, group, study.units_of(model)), f"{model}{f' ({group})' if several else ''}")
-            for model, group in pairs
-            if not several or model == best
-        )
-    )
+    drawn = []
+    for model, group in product(map(str, dataset.model.values), map(str, dataset.group.values)):
+        if not several or model == best:
+            ax = plots.corner(dataset, model, group, study.units_of(model))
+            drawn.append((ax, f"{model}{f' ({group})' if several else ''}"))
+    yield Pictures.of(*drawn)
     yield Heading("Candidates and priors", level=3)
-    yield Table.of(
-        [
-            (name, constant, prior)
-            for name, one in study.candidates.items()
-            for constant, prior in one.parameters.items()
-        ],
-        {
-            "candidate": lambda one: one[0],
-            "model": lambda one: study.described(one[0]),
-            "constant": lambda one: one[1],
-            "prior": lambda one: law(one[2].model_dump()),
-            "unit": lambda one: results.parameter_unit(one[1], one[0]),
-        },
-        text=range(5),
-    )
+    rows = [
+        (name, study.described(name), constant, law(prior.model_dump()), results.parameter_unit(constant, name))
+        for name, one in study.candidates.items()
+        for constant, prior in one.parameters.items()
+    ]
+    yield Table(("candidate", "model", "constant", "prior", "unit"), rows, text=range(5))
     if study.data.source:
         yield Heading("Data", level=3)
         yield Text("\n".join(study.data.source))
-
-
-def posteriors(results: Results) -> Table:
-    """Posterior of every constant."""
-    dataset = results.dataset
-    rows = []
-    for model in dataset.model.values:
-        for group in dataset.group.values:
-            one = dataset.sel(model=model, group=group)
-            for name in dataset.parameter.values:
-                of_name = one.sel(parameter=name)
-                if np.isnan(float(of_name["constant_mode"])):
-                    continue
-                unit = results.parameter_unit(str(name), str(model))
-                low, high = of_name["constant_quantiles"].values
-                values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
-                like = float(of_name["constant_mean"])
-                rows.append((str(model), str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
-    head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
-    return Table(head, rows, text={0, 1, 2})
 
 
 @section("probability", heading="Is the best one good?")
@@ -258,14 +238,11 @@ def held_out(results: Results) -> Iterator[Block]:
     """Whole tests, predicted from the others."""
     yield Text("Whole tests, predicted from the others: ln of the density of all data in the test.")
     dataset = results.dataset
-    scores, errors = dataset["held_out_score"], dataset["held_out_score_error"]
     rows = []
-    for model in ranking(scores.sum("left_out")):
-        cells = [
-            with_error(float(value), float(error))
-            for value, error in zip(scores.sel(model=model).values, errors.sel(model=model).values, strict=True)
-        ]
-        total = with_error(float(scores.sel(model=model).sum()), float(np.sqrt((errors.sel(model=model) ** 2).sum())))
+    for model in ranking(dataset["held_out_score"].sum("left_out")):
+        scores = estimate_of(dataset.sel(model=model), "held_out_score")
+        cells = (with_error(*of) for of in zip(scores.value.tolist(), scores.error.tolist(), strict=True))
+        total = with_error(float(scores.value.sum()), float(np.sqrt((scores.error**2).sum())))
         rows.append((model, *cells, total))
     yield Table(("model", *map(str, dataset.left_out.values), "sum"), rows)
 
