@@ -164,12 +164,15 @@ def places(results: Results) -> Iterator[Block]:
     several = results.dataset.sizes["data_set"] > 1
     tools = places_of(model)
     for one in first(results):
-        found, drawn = list(_outputs(one, model)), []
+        found, drawn = [], []
+        for k in np.flatnonzero(one["datum_axis"].to_numpy() >= len(AXES)).tolist():
+            case = model.cases[int(one["datum_case"][k])]
+            output = case.outputs[int(one["datum_axis"][k]) - len(AXES)]
+            found.append((k, case.name, output.name, output.unit))
         for name, unit in dict.fromkeys((name, unit) for *_, name, unit in found):
-            mine = {k: case for k, case, *kind in found if kind == [name, unit]}
+            mine = {k: of for k, of, *kind in found if kind == [name, unit]}
             ax = maps.forces(one, list(mine), list(mine.values()), named(name, unit))
-            words = f"{name} by load case, measured and predicted with the most probable parameters."
-            drawn.append((ax, words))
+            drawn.append((ax, f"{name} by load case, measured and predicted with the most probable parameters."))
         if len(tools) >= LEAST and "draw" in one:
             lump = next((item.label for item in model.inclusions), "")
             ax = maps.told(one, tools, model.body.bounds, lump)
@@ -179,9 +182,9 @@ def places(results: Results) -> Iterator[Block]:
         yield Pictures.of(*drawn)
         alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
         rows = []
-        for k, case, name, unit in found:
-            told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
-            rows.append((case, name, *misses(one.isel(datum=k), unit), *told))
+        for k, of, name, unit in found:
+            told = [number(float(alone[of]), 3) if of in alone else ""] if alone else []
+            rows.append((of, name, *misses(one.isel(datum=k), unit), *told))
         more = ["information alone (nat)"] if alone else []
         yield Table(["load case", "output", *MISSES, *more], rows, text={0, 1})
 
@@ -194,14 +197,6 @@ def places_of(model: Specimen) -> dict[str, FloatArray]:
         if len(tools) == 1:
             found[case.name] = np.array(tools[0].at, dtype=float)
     return found
-
-
-def _outputs(one: xr.Dataset, model: Specimen) -> Iterator[tuple[int, str, str, str]]:
-    """Go through data that are outputs: number, load case, name and unit."""
-    for k in np.flatnonzero(one["datum_axis"].to_numpy() >= len(AXES)):
-        case = model.cases[int(one["datum_case"][k])]
-        output = case.outputs[int(one["datum_axis"][k]) - len(AXES)]
-        yield int(k), case.name, output.name, output.unit
 
 
 MISSES = ("measured", "predicted", "residual over its error")

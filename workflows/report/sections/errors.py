@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,18 @@ def error_budget(results: Results) -> Iterator[Block]:
             "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
             "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
         )
-        yield table(results, shown)
+        rows = []
+        for output, name in product(np.array(results.outputs)[counting(results)].tolist(), shown):
+            one, unit = single(results.of(output), name), results.unit(output)
+            total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
+            value = results.value(output, one.value, total if np.isfinite(total) else one.error)
+            sampling, whole = (margin(error, unit, like=one.value) for error in (one.error, total))
+            of_mesh, corrected = "not known", NONE
+            if np.isfinite(one.mesh):
+                of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
+                corrected = and_error(one.corrected, one.left, unit)
+            rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
+        yield Table(("estimate", "value", "sampling", "mesh", "total error", "corrected"), rows)
 
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
@@ -103,24 +115,6 @@ def sentence(results: Results, name: str) -> str:
     if zero:
         said.append(f"Zero but for rounding: {', '.join(zero)}.")
     return " ".join(said)
-
-
-def table(results: Results, names: list[str]) -> Table:
-    """The errors of each estimate, and its corrected value."""
-    rows = []
-    for output in np.array(results.outputs)[counting(results)].tolist():
-        of_output, unit = results.of(output), results.unit(output)
-        for name in names:
-            one = single(of_output, name)
-            total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
-            value = results.value(output, one.value, total if np.isfinite(total) else one.error)
-            sampling, whole = (margin(error, unit, like=one.value) for error in (one.error, total))
-            of_mesh, corrected = "not known", NONE
-            if np.isfinite(one.mesh):
-                of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
-                corrected = and_error(one.corrected, one.left, unit)
-            rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
-    return Table(("estimate", "value", "sampling", "mesh", "total error", "corrected"), rows)
 
 
 @section(heading="Tolerance", when=lambda results: "accuracy" in results.summary)

@@ -240,8 +240,18 @@ def derivative_based(results: Results) -> Iterator[Block]:
     )
     for output in results.drawn:
         yield Heading(output, level=3)
-        yield bounds(results, output)
-        of = results.of(output)
+        of, rows = results.of(output), []
+        for name in results.parameters:
+            one = of.sel(parameter=name)
+            slope = per(results.unit(output), results.parameter_unit(name))
+            squared = with_unit(written(one, "dgsm"), slope if slope == "1" else f"({slope})²")
+            total = written(one, "sobol_total") if "sobol_total" in one else NONE
+            bound = results.cells(("total_bound",), {"output": output, "parameter": name})
+            share, constant = number(float(one["local_share"])), number(float(one["poincare"]))
+            rows.append((name, share, squared, constant, total, *bound))
+        head = ("parameter", "share of the local variance", "mean squared derivative", "Poincaré constant")
+        heads = results.heads({"total_bound": "is at most"})
+        yield Table((*head, "total index (expansion)", *heads), rows)
         rows = [(name, written(of.sel(parameter=name), "active_direction")) for name in results.parameters]
         yield Table(("parameter", "leading direction"), rows)
         values = zip(*(of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")), strict=True)
@@ -253,20 +263,3 @@ def derivative_based(results: Results) -> Iterator[Block]:
         yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), spectrum)
         caption = f"{output} against its leading direction: a curve if only that direction matters."
         yield Pictures.of((plots.active_summary(dataset, output), caption))
-
-
-def bounds(results: Results, output: str) -> Table:
-    """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
-    of_output = results.of(output)
-    rows = []
-    for name in results.parameters:
-        of = of_output.sel(parameter=name)
-        slope = per(results.unit(output), results.parameter_unit(name))
-        squared = with_unit(written(of, "dgsm"), slope if slope == "1" else f"({slope})²")
-        total = written(of, "sobol_total") if "sobol_total" in of else NONE
-        bound = results.cells(("total_bound",), {"output": output, "parameter": name})
-        share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
-        rows.append((name, share, squared, constant, total, *bound))
-    head = ("parameter", "share of the local variance", "mean squared derivative", "Poincaré constant")
-    bound = results.heads({"total_bound": "is at most"})
-    return Table((*head, "total index (expansion)", *bound), rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -37,7 +37,31 @@ def evidences(results: Results) -> Iterator[Block]:
         "factors are those of Kass and Raftery. Probabilities say which candidate is true, if one is; the weights "
         "of stacking are those with which their mixture predicts left-out data best, whether or not one is true."
     )
-    yield _evidences(dataset)
+    order = ranking(dataset["log_evidence"])
+    of = {model: dataset.sel(model=model) for model in order}
+
+    def stacking(model: str) -> str:
+        share = single(of[model], "stacking")
+        return f"{with_error(100 * share.value, 100 * share.error)} %"
+
+    def sampled(model: str) -> str:
+        found = estimate_of(of[model], "nested_log_evidence")
+        return with_error(float(np.nansum(found.value)), float(np.sqrt(np.nansum(found.error**2))))
+
+    columns: dict[str, Callable[[str], str]] = {
+        "model": str,
+        "ln Z": lambda model: written(of[model], "log_evidence"),
+        "by Laplace alone": lambda model: number(float(of[model]["laplace_log_evidence"].sum()), 6),
+        "ln of the first's Bayes factor": lambda model: (
+            "" if model == order[0] else with_error(*bayes_factor(dataset, order[0], model))
+        ),
+        "which is": lambda model: "" if model == order[0] else grade(bayes_factor(dataset, order[0], model)[0]),
+        "before": lambda model: f"{number(100 * float(of[model]['prior_probability']), 3)} %",
+        "P(model | data)": lambda model: f"{number(100 * float(of[model]['probability']), 4)} %",
+        **({"stacking": stacking} if "stacking" in dataset else {}),
+        **({"ln Z by nested sampling": sampled} if "nested_log_evidence" in dataset else {}),
+    }
+    yield replace(Table.of(order, columns, text={0, 4}), strong=0)
     yield Pictures.of(
         (plots.evidence_bars(dataset), "ln Z minus that of the most probable model, with three standard errors."),
         (plots.probability_bars(dataset), "Probability of each model, and with other errors, data and priors."),
@@ -59,42 +83,6 @@ def evidences(results: Results) -> Iterator[Block]:
         },
         text={0, 1, 3, 4, 7},
         long={4},
-    )
-
-
-def _evidences(dataset: xr.Dataset) -> Table:
-    """Evidence, Bayes factor and probability of each model, nested sampling beside it."""
-    order = ranking(dataset["log_evidence"])
-    nested, stacked = "nested_log_evidence" in dataset, "stacking" in dataset
-    of = {model: dataset.sel(model=model) for model in order}
-
-    def stacking(model: str) -> str:
-        share = single(of[model], "stacking")
-        return f"{with_error(100 * share.value, 100 * share.error)} %"
-
-    def sampled(model: str) -> str:
-        found = estimate_of(of[model], "nested_log_evidence")
-        return with_error(float(np.nansum(found.value)), float(np.sqrt(np.nansum(found.error**2))))
-
-    return replace(
-        Table.of(
-            order,
-            {
-                "model": str,
-                "ln Z": lambda model: written(of[model], "log_evidence"),
-                "by Laplace alone": lambda model: number(float(of[model]["laplace_log_evidence"].sum()), 6),
-                "ln of the first's Bayes factor": lambda model: (
-                    "" if model == order[0] else with_error(*bayes_factor(dataset, order[0], model))
-                ),
-                "which is": lambda model: "" if model == order[0] else grade(bayes_factor(dataset, order[0], model)[0]),
-                "before": lambda model: f"{number(100 * float(of[model]['prior_probability']), 3)} %",
-                "P(model | data)": lambda model: f"{number(100 * float(of[model]['probability']), 4)} %",
-                **({"stacking": stacking} if stacked else {}),
-                **({"ln Z by nested sampling": sampled} if nested else {}),
-            },
-            text={0, 4},
-        ),
-        strong=0,
     )
 
 
