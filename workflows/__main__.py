@@ -41,8 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from workflows.config.mistakes import StudyError
 
     try:
-        code = int(options.command(options))
+        found: int | str = options.command(options)
+        sys.stdout.write(found if isinstance(found, str) else "")
         sys.stdout.flush()
+        code = DONE if isinstance(found, str) else found
     except (StudyError, ModelError) as error:
         return _end(str(error), BAD)
     except (SolveError, StopError) as error:
@@ -106,8 +108,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def added(name: str, command: Callable[[argparse.Namespace], int], said: str) -> argparse.ArgumentParser:
-        """Add a command, and say in a line what it does."""
+    def added(name: str, command: Callable[[argparse.Namespace], int | str], said: str) -> argparse.ArgumentParser:
+        """Add a command, which returns an exit code or what is printed, and say in a line what it does."""
         found = commands.add_parser(name, help=said)
         found.set_defaults(command=command)
         return found
@@ -182,12 +184,10 @@ def _load(options: argparse.Namespace) -> StudyKind:
     return study
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: argparse.Namespace) -> str:
     from workflows.run.plan import plan
 
-    study = _load(options)
-    sys.stdout.write("\n".join([f"{options.study}: a valid study", *plan(study)]) + "\n")
-    return DONE
+    return "\n".join([f"{options.study}: a valid study", *plan(_load(options))]) + "\n"
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -256,27 +256,24 @@ def _live(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _init(options: argparse.Namespace) -> int:
+def _init(options: argparse.Namespace) -> str:
     from workflows.starter import starter
 
-    sys.stdout.write(starter(options.kind))
-    return DONE
+    return starter(options.kind)
 
 
-def _completion(options: argparse.Namespace) -> int:
+def _completion(options: argparse.Namespace) -> str:
     from workflows.completion import completion
 
-    sys.stdout.write(completion(options.shell, _parser()))
-    return DONE
+    return completion(options.shell, _parser())
 
 
-def _schema(options: argparse.Namespace) -> int:
+def _schema(options: argparse.Namespace) -> str:
     import json
 
     from workflows.config.study import schema
 
-    sys.stdout.write(json.dumps(schema(), indent=2, ensure_ascii=False) + "\n")
-    return DONE
+    return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 if __name__ == "__main__":

@@ -107,8 +107,13 @@ class Handler(BaseHTTPRequestHandler):
         self.connection.settimeout(SECONDS_TO_SEND)
         self.send_response(status)
         self._send(answer)
-        if self._unread:
-            self._linger()
+        if self._unread:  # read on for a moment: closing a connection with unread bytes would discard the answer
+            self.wfile.flush()
+            with contextlib.suppress(OSError):
+                self.connection.shutdown(socket.SHUT_WR)
+                rest = _Deadline(self.connection, 2.0)
+                while rest.readinto(bytearray(2**16)):
+                    pass
 
     def _send(self, answer: dict[str, Any]) -> None:
         body = json.dumps(answer).encode()
@@ -116,15 +121,6 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
-
-    def _linger(self) -> None:
-        """Read on for a moment: closing a connection with unread bytes would discard the answer."""
-        self.wfile.flush()
-        with contextlib.suppress(OSError):
-            self.connection.shutdown(socket.SHUT_WR)
-            rest = _Deadline(self.connection, 2.0)
-            while rest.readinto(bytearray(2**16)):
-                pass
 
     def _check_origin(self) -> None:
         """Refuse requests from browser pages, also under a name that was made to point to this host."""
@@ -211,12 +207,7 @@ def listen(host: str, port: int, option: str) -> socket.socket:
 def foreign(headers: Message, called: str | None) -> str:
     """Say why a request is that of a page elsewhere, which a browser shows; empty if it is not.
 
-    Parameters
-    ----------
-    headers
-        Of the request.
-    called
-        The name of a server that answers this machine alone; None for others, which have any name.
+    A server that answers this machine alone is `called` by a name; others (None) have any.
     """
     host, origin = headers.get("Host"), headers.get("Origin")
     if called is not None and host is not None and not _is_local(host, called):

@@ -150,15 +150,12 @@ class Service:
         if not model.meshed:
             raise RefusalError(f"config: a model of kind '{model.kind}' has no options")
         level = options.get("level", 0)
+        said = f"config.level: {shown(level)}, expected"
         if type(level) is not int or level < 0 or (level > 0 and model.coefficients):
-            message = (
-                f"config.level: {shown(level)}, expected a number of refinements, and 0 where there are random fields"
-            )
-            raise RefusalError(message)
+            raise RefusalError(f"{said} a number of refinements, and 0 where there are random fields")
+        if level > 0 and 8 ** min(level, 20) * model.unknowns > MOST_UNKNOWNS:
+            raise RefusalError(f"{said} a mesh of at most {MOST_UNKNOWNS:,} unknowns")
         try:
-            if level > 0 and 8 ** min(level, 20) * model.unknowns > MOST_UNKNOWNS:
-                message = f"config.level: {shown(level)}, expected a mesh of at most {MOST_UNKNOWNS:,} unknowns"
-                raise RefusalError(message)
             refined = model.refined(level)
             return refined.solved_to(options["tolerance"]) if "tolerance" in options else refined
         except ValidationError as error:
@@ -230,21 +227,9 @@ def _settle(job: _Job, service: Service) -> None:
 
 
 def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
-    """Serve the model of a study until the process is interrupted.
+    """Serve the model of a study until the process is interrupted; return the number of answers that were computed.
 
-    Parameters
-    ----------
-    sampled
-        The model with its random parameters.
-    port, host
-        Where requests are accepted: port 0 is any free one, host 0.0.0.0 also accepts those of other machines.
-    quiet
-        Print nothing.
-
-    Returns
-    -------
-    int
-        Number of answers that were computed.
+    Port 0 is any free one, host 0.0.0.0 also accepts requests of other machines.
 
     Raises
     ------

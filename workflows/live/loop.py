@@ -307,16 +307,23 @@ class Loop:
         """Return the answer to a line."""
         begin = time.perf_counter()
         own: dict[str, Any] = {}
+        names = self._data.parameters
         try:
             table = _table(line)
             number = table.pop("id", None)
             if isinstance(number, str) or (number is not None and np.isfinite(number)):
                 own = {"id": number}
-            self._set({str(path): _number(value, strict=True) for path, value in table.items()})
-        except _UnknownError as error:
-            return {**own, "error": str(error)}
+            values = {str(path): _number(value, strict=True) for path, value in table.items()}
         except (ValueError, TypeError, OverflowError, RecursionError):
             return {**own, "error": "expected a table of numbers by parameter, in JSON"}
+        for path in values:
+            if path not in names:
+                expected = f"expected one of: {', '.join(names)}"
+                return {**own, "error": f"'{path}' is not a parameter, {expected}"}
+        self._now = self._now.copy()
+        for path, value in values.items():
+            self._now[names.index(path)] = value
+            self._uncertain[names.index(path)] = 0.0  # what is set is known
         frame = self.stream.linear(self._now) if late else self.stream.frame(self._now, WITHIN)
         beyond, doubt = outside_of(self._data, self._now), self._doubt
         unknown = np.full(len(frame.outputs), np.nan)
@@ -340,16 +347,6 @@ class Loop:
         if self._refused or self.stream.lost:
             return self._refused or FAR
         return UNBALANCED if self.stream.unbalanced else ""
-
-    def _set(self, values: dict[str, float]) -> None:
-        names = self._data.parameters
-        for path in values:
-            if path not in names:
-                raise _UnknownError(f"'{path}' is not a parameter, expected one of: {', '.join(names)}")
-        self._now = self._now.copy()
-        for path, value in values.items():
-            self._now[names.index(path)] = value
-            self._uncertain[names.index(path)] = 0.0  # what is set is known
 
     # --- the other processes -----------------------------------------------------------------------------------------
 
@@ -396,10 +393,6 @@ class Loop:
             except OSError:  # the page has ended; frames go on
                 self._selector.unregister(self._view)
                 self._view = None
-
-
-class _UnknownError(ValueError):
-    """A parameter that the model does not have."""
 
 
 def _known(values: Any) -> list[float | None]:

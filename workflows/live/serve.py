@@ -26,20 +26,9 @@ def real_time() -> bool:
 
 
 def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False, secret: bool = True) -> None:
-    """Serve a reduced model until the user ends it.
+    """Serve a reduced model until the user ends it, with a page at another port unless that is None.
 
-    Parameters
-    ----------
-    path
-        The file.
-    host, port
-        Where clients connect.
-    page
-        Port of the page; None for no page.
-    quiet
-        Say nothing.
-    secret
-        Serve only those who have the token.
+    Where it is `secret`, only those who have the token are served.
 
     Raises
     ------

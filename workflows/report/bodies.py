@@ -34,15 +34,9 @@ DIMMEST = 1e-3  # of the largest contribution of a cell: smaller ones have its c
 
 
 def body(dataset: xr.Dataset, shown: str = "") -> Figure:
-    """Draw the body of some results, deformed, coloured by a quantity.
+    """Draw the body of results with fields, deformed, coloured by the first quantity whose name begins like this.
 
-    Parameters
-    ----------
-    dataset
-        Results with fields.
-    shown
-        How the name of the quantity begins, as the report calls it: "Standard deviation", "Total index of the
-        displacement for material.C2"; the first one if nothing is said.
+    Names are those of the report: "Standard deviation", "Total index of the displacement for material.C2".
 
     Raises
     ------
@@ -70,16 +64,11 @@ def still(scene: Scene, quantity: Quantity) -> Figure:
     inner = [inside for inside in scene.insides if inside.shown and len(inside.triangles)]
     equal = _equal(scene, quantity)
     hidden = bool(len(equal[1])) or any(inside.kind == "inside" for inside in inner)
-    faces = [
-        _faces(
-            (moved if inside.points is None else inside.points) @ view.T,
-            inside.triangles,
-            np.tile(_rgb(COLOURS[inside.kind]), (len(inside.triangles), 1)),
-            inside.opacity,
-            culled=False,
-        )
-        for inside in inner
-    ]
+    faces = []
+    for inside in inner:
+        at = (moved if inside.points is None else inside.points) @ view.T
+        paints = np.tile(_rgb(COLOURS[inside.kind]), (len(inside.triangles), 1))
+        faces.append(_faces(at, inside.triangles, paints, inside.opacity, culled=False))
     if len(equal[1]):
         at, between = equal
         faces.append(_faces(at @ view.T, between, np.tile(colours(HALF)[:3], (len(between), 1)), 1.0, culled=False))
@@ -137,10 +126,12 @@ def _painted(
 
     figure = Figure(figsize=SIZE, dpi=DPI)
     ax = figure.add_axes(PLACE)
-    corners, paints = (
-        np.concatenate([np.concatenate([one[k] for one in layer])[_far_first(layer)] for layer in layers])
-        for k in (0, 1)
-    )
+    ordered = []
+    for layer in layers:
+        corners, paints = (np.concatenate(part) for part in zip(*layer, strict=True))
+        far_first = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")
+        ordered.append((corners[far_first], paints[far_first]))
+    corners, paints = (np.concatenate(part) for part in zip(*ordered, strict=True))
     flat = corners[:, :, :2]
     if before is not None:
         ax.add_collection(LineCollection(list(before), colors=BEFORE, linewidths=0.8))
@@ -196,7 +187,3 @@ def _faces(
     light = LEAST + (1 - LEAST) * np.abs(normals[seen] @ LIGHT)
     paints = np.column_stack([rgb[seen] * light[:, None], np.full(int(seen.sum()), alpha)])
     return corners[seen], np.clip(paints, 0, 1)
-
-
-def _far_first(layer: Sequence[tuple[FloatArray, FloatArray]]) -> IntArray:
-    return np.argsort(np.concatenate([corners[:, :, 2].mean(axis=1) for corners, _ in layer]), kind="stable")

@@ -7,9 +7,8 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from pydantic import ValidationError
 
@@ -34,13 +33,8 @@ Parts = list[tuple[str, list[Block]]]  # sections by their names
 def write_report(directory: Path, *, code: bool = False) -> Path:
     """Write report.html beside the results of a study.
 
-    Parameters
-    ----------
-    directory
-        Where the results are.
-    code
-        Run the code that the study names besides what is installed. Without it, what needs such code is left out, and
-        the report and a line on the standard error say so.
+    `code` runs the code that the study names besides what is installed. Without it, what needs such code is left out,
+    and the report and a line on the standard error say so.
 
     Raises
     ------
@@ -173,25 +167,13 @@ def render(title: str, parts: Parts) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Sections below each other; of the first screen, with the body at the side if there is one."""
-
-    sections: Parts
-    top: bool = False
-
-    @property
-    def two(self) -> bool:
-        return any(block.macro == "viewer" for name, blocks in self.sections if name == "body" for block in blocks)
-
-
-def _grouped(parts: Parts) -> list[_Group]:
-    """Put the sections of the first screen into one group, the others before and after it into others."""
+def _grouped(parts: Parts) -> list[dict[str, Any]]:
+    """Put the sections of the first screen, with the body at the side if there is one, into a group of their own."""
     numbers = [i for i, (name, _) in enumerate(parts) if name in TOP]
-    if not numbers:
-        return [_Group(parts)]
-    first, last = numbers[0], numbers[-1] + 1
-    return [_Group(parts[:first]), _Group(parts[first:last], top=True), _Group(parts[last:])]
+    first, last = (numbers[0], numbers[-1] + 1) if numbers else (0, 0)
+    two = any(block.macro == "viewer" for name, blocks in parts if name == "body" for block in blocks)
+    groups = ((parts[:first], False), (parts[first:last], True), (parts[last:], False))
+    return [{"sections": some, "top": top, "two": two} for some, top in groups if some]
 
 
 def _names(directories: Sequence[Path]) -> list[str]:
@@ -203,39 +185,26 @@ def _names(directories: Sequence[Path]) -> list[str]:
 
 def side_by_side(studies: Mapping[str, Results]) -> Iterator[Block]:
     """Costs, and then the estimates of each output."""
-    told = {name: results.summary for name, results in studies.items()}
-    yield Table.of(
-        told,
-        {
-            "study": str,
-            "method": lambda name: str(told[name]["method"]),
-            "solves": lambda name: f"{told[name]['evaluations']:,}",
-            "failed": lambda name: f"{told[name]['failed']:,}",
-            "CPU time": lambda name: duration(told[name]["cpu_seconds"]),
-            "wall time": lambda name: duration(told[name]["wall_seconds"]),
-        },
-        text={0, 1},
-    )
+    rows: list[tuple[str, ...]] = []
+    for name, results in studies.items():
+        told = results.summary
+        counts, times = (f"{told[key]:,}" for key in ("evaluations", "failed")), ("cpu_seconds", "wall_seconds")
+        rows.append((name, str(told["method"]), *counts, *(duration(told[key]) for key in times)))
+    yield Table(("study", "method", "solves", "failed", "CPU time", "wall time"), rows, text={0, 1})
     yield Text("± is one standard error.")
     for output in dict.fromkeys(output for results in studies.values() for output in results.outputs):
         yield Heading(output)
-        yield _estimates(studies, output)
+        rows = []
+        for name, results in studies.items():
+            shown = [NONE] * 3
+            if output in results.outputs:
+                shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
+                shown.append(size(float(results.of(output)["nominal"]), results.unit(output), 6))
+            rows.append((name, *shown))
+        yield Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)
         datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
         if datasets:
             yield Pictures.of(
                 (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
                 (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
             )
-
-
-def _estimates(studies: Mapping[str, Results], output: str) -> Table:
-    """Estimates of an output by several studies."""
-    rows: list[tuple[str, ...]] = []
-    for name, results in studies.items():
-        if output not in results.outputs:
-            rows.append((name, NONE, NONE, NONE))
-            continue
-        central = size(float(results.dataset["nominal"].sel(output=output)), results.unit(output), 6)
-        shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
-        rows.append((name, *shown, central))
-    return Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)

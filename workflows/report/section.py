@@ -8,7 +8,7 @@ from an installed package, by an entry point ``section.NAME`` of the group ``tis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import NONE, and_error, margin, quantity, size, with_error
+from forward.readable import NONE, and_error, margin, quantity, size
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from uq.estimators.estimate import PARTS, holds, part, single
@@ -114,12 +114,12 @@ class Results:
         rows = [(output, *(self.estimate(output, name) for name in words)) for output in self.outputs]
         return Table(("output", *words.values()), rows)
 
-    def cells(self, names: Sequence[str], at: Mapping[str, str], unit: str = "1") -> Iterator[str]:
+    def cells(self, names: Iterable[str], at: Mapping[str, str], unit: str = "1") -> Iterator[str]:
         """Write estimates somewhere, each followed by the one with the error of the mesh added where there are such."""
         for name in names:
             held = [which for which in PARTS if holds(self.dataset, name, which)]
             one = single(self.dataset[[name, *(part(name, which) for which in held)]].sel(at), name)
-            yield with_error(one.value, one.error) if unit == "1" else and_error(one.value, one.error, unit)
+            yield and_error(one.value, one.error, unit)
             if "corrected" in held:
                 yield NONE if np.isnan(one.corrected) else and_error(one.corrected, one.left, unit)
 
@@ -142,10 +142,10 @@ class Results:
         return solves(self.summary)
 
 
-def written(of: Mapping[Any, Any], name: str, unit: str | None = None) -> str:
+def written(of: Mapping[Any, Any], name: str, unit: str = "1") -> str:
     """Write one estimate and its error of sampling, in a unit if it has one."""
     one = single(of, name)
-    return with_error(one.value, one.error) if unit is None else and_error(one.value, one.error, unit)
+    return and_error(one.value, one.error, unit)
 
 
 class Section(ABC):
@@ -174,16 +174,9 @@ class Section(ABC):
 def section(
     *needs: str, heading: str = "", level: Level = 2, when: Callable[[Results], bool] | None = None
 ) -> Callable[[Content], type[Section]]:
-    """Make a section of a function from results to blocks, under a heading that is always the same.
+    """Make a section of a function from results to blocks, under a heading if that is always the same.
 
-    Parameters
-    ----------
-    needs
-        Variables of the results without which there is nothing to say.
-    heading, level
-        What stands above it, if that does not depend on the results.
-    when
-        Whether it applies to results that hold what it needs.
+    It applies to results that hold the variables that it `needs`, `when` that is so.
     """
 
     def made(content: Content) -> type[Section]:

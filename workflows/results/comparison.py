@@ -53,19 +53,12 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
         ("correlation_probability", "follow one another along the tests, as errors would not"),
     ):
         chances = of_model[name]
-        bad = [
-            str(group) for group, p in zip(dataset.group.values, chances.values, strict=True) if p * asked < SUSPICIOUS
-        ]
-        if bad:
-            where = f" in {', '.join(bad)}" if dataset.sizes["group"] > 1 else ""
-            smallest = float(chances.min())
-            told = chance(smallest)
+        bad = dataset.group.values[(chances * asked < SUSPICIOUS).to_numpy()]
+        if len(bad):
+            where = f" in {', '.join(map(str, bad))}" if dataset.sizes["group"] > 1 else ""
+            told = chance(float(chances.min()))
             said.append(f"{words}{where} (p {told if told.startswith('<') else f'= {told}'})")
     return said
-
-
-def _by(P: float) -> str:
-    return f"a probability of {percent(P)}".replace("\u00a0", " ").replace("of above", "above")
 
 
 def findings(dataset: xr.Dataset) -> list[Finding]:
@@ -73,19 +66,13 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     order = by_probability(dataset, dataset["log_evidence"])
     best = order[0]
     P = float(dataset["probability"].sel(model=best))
-    said: list[Finding] = []
+    said = [Finding("only-candidate", "note", {"best": best})]
     if len(order) > 1:
         ln_B, error = bayes_factor(dataset, best, order[1])
-        values = {
-            "best": best,
-            "probability": _by(P),
-            "second": order[1],
-            "factor": with_error(ln_B, error),
-            "grade": grade(ln_B) if ln_B >= 0 else AGAINST,
-        }
-        said.append(Finding("most-probable", "note", values))
-    else:
-        said.append(Finding("only-candidate", "note", {"best": best}))
+        by = f"a probability of {percent(P)}".replace("\u00a0", " ").replace("of above", "above")
+        values = {"best": best, "probability": by, "second": order[1], "factor": with_error(ln_B, error)}
+        values["grade"] = grade(ln_B) if ln_B >= 0 else AGAINST
+        said = [Finding("most-probable", "note", values)]
     wrong = conflicts(dataset, best)
     if wrong:
         said.append(Finding("best-of-bad", "warning", {"best": best, "wrong": "; and ".join(wrong)}))
@@ -94,7 +81,12 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
         said.append(Finding("left-out-predicted", "warning", {"other": predicts}))
-    said += _stacked(dataset, order)
+    # Left-out data may be predicted better by a mixture of candidates than by the most probable one.
+    weights = dataset["stacking"].sel(model=order)
+    if 1 - float(weights[0]) >= MIXED + 2 * float(dataset["stacking_error"].sel(model=best)):
+        shares = {name: 100 * float(weights.sel(model=name)) for name in ranking(weights)}
+        parts = ", ".join(f"{name} {share:.2g} %" for name, share in shares.items() if share)
+        said.append(Finding("mixture-predicted", "note", {"parts": parts}))
     if "held_out_score" in dataset:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
@@ -130,14 +122,8 @@ def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
 def untrusted(found: xr.Dataset, judged: xr.Dataset, wrong: Collection[str]) -> Iterator[Finding]:
     """Find evidences that cannot be trusted; where no finer mesh was looked at, that is said elsewhere.
 
-    Parameters
-    ----------
-    found
-        The comparison, judged by the weights of its points.
-    judged
-        The same, judged by derivatives and meshes too.
-    wrong
-        Candidates with wrong derivatives, of which that is said.
+    The comparison was `found` by the weights of its points, and `judged` by derivatives and meshes too. Of candidates
+    with wrong derivatives that is said.
     """
     for model in by_probability(found, found["log_evidence"]):
         for group in found.group.values:
@@ -175,16 +161,8 @@ def doubts_of_selection(
 ) -> list[Finding]:
     """Say what is doubtful about the most probable candidate: its constants, its errors, outliers.
 
-    Parameters
-    ----------
-    dataset
-        What was found.
-    candidates
-        Their random constants, by name.
-    noise
-        Prior of the factor on the errors, if it was inferred.
-    units
-        SI units of the constants, by candidate and name.
+    Candidates and SI units of their constants are by their names; `noise` is the prior of the factor on the errors, if
+    it was inferred.
     """
     from inverse.criticism import doubts as criticism
     from inverse.criticism.weights import resampled
@@ -298,18 +276,6 @@ def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     return found.transpose(*corrected.dims)
 
 
-def _stacked(dataset: xr.Dataset, order: list[str]) -> list[Finding]:
-    """Say that left-out data are predicted better by a mixture of candidates than by the most probable one."""
-    weights = dataset["stacking"].sel(model=order)
-    others = 1 - float(weights[0])
-    if others < MIXED + 2 * float(dataset["stacking_error"].sel(model=order[0])):
-        return []
-    parts = ", ".join(
-        f"{name} {100 * float(weights.sel(model=name)):.2g} %" for name in ranking(weights) if weights.sel(model=name)
-    )
-    return [Finding("mixture-predicted", "note", {"parts": parts})]
-
-
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:
     """Return ln of the Bayes factor of one model over another, and its standard error."""
     values, errors = (dataset[name] for name in ("log_evidence", "log_evidence_error"))
@@ -330,14 +296,7 @@ def arviz_groups(
     Draws of the constants of every model before and after the data, in each group of data; ln of the density of each
     datum at these draws, one variable for each model; the data.
 
-    Parameters
-    ----------
-    candidates
-        With their priors, by name.
-    factor, seed
-        Prior of the factor on the errors, if it was inferred, and the seed of draws before the data.
-    found
-        What was found.
+    `factor` is the prior of the factor on the errors, if it was inferred, and `seed` that of draws before the data.
     """
     import xarray as xr
 

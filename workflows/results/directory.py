@@ -136,32 +136,24 @@ def write_fields(
 ) -> Path | None:
     """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
 
-    Displacements are in one file; what each data set says about the interior is in one file each, its
-    points with what was measured and predicted there in another; a mesh that was
-    refined is in one with what its cells add to errors; every tool is in one, at its depth.
-    Names of arrays end with their unit in parentheses.
-
-    Parameters
-    ----------
-    units_of
-        Returns the units of the parameters of a model, by its label.
+    Every tool is in a file of its own, at its depth, a mesh that was refined with what its cells add to errors, and
+    displacements; what each data set says about the interior, and its points with what was measured and predicted
+    there. Names of arrays end with their unit in parentheses; `units_of` returns those of the parameters of a model.
     """
     grids: dict[str, Callable[[], Grid]] = {}
-    if "cell_nodes" in dataset and "data_set" in dataset.dims:
-        names = dataset.data_set.values
-        grids = {str(name): partial(body_grid, dataset.sel(data_set=name)) for name in names}
-        if "datum_axis" in dataset:
-            seen = {str(name): dataset.sel(data_set=name) for name in names if bool(dataset["ok"].sel(data_set=name))}
-            grids |= {f"points-{name}": partial(points_grid, one) for name, one in seen.items() if has_points(one)}
-    elif "cell_nodes" in dataset:
-        grids = {"displacement": partial(body_grid, dataset)}
-    path = None
-    if "mesh_indicator" in dataset:
-        grids = {"mesh": partial(mesh_grid, dataset)} | grids
     if "cell_nodes" in dataset:
         points = dataset["node_position"].to_numpy()
-        grids = {f"tool-{tool.label}": partial(tool_grid, tool, points) for tool in tools_of(dataset)} | grids
-    of_parameters = units_of("/") if "field_derivative" in dataset else {}
+        grids |= {f"tool-{tool.label}": partial(tool_grid, tool, points) for tool in tools_of(dataset)}
+    if "mesh_indicator" in dataset:
+        grids["mesh"] = partial(mesh_grid, dataset)
+    if "cell_nodes" in dataset and "data_set" in dataset.dims:
+        sets = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
+        grids |= {name: partial(body_grid, one) for name, one in sets.items()}
+        seen = {name: one for name, one in sets.items() if "datum_axis" in one and bool(one["ok"]) and has_points(one)}
+        grids |= {f"points-{name}": partial(points_grid, one) for name, one in seen.items()}
+    elif "cell_nodes" in dataset:
+        grids["displacement"] = partial(body_grid, dataset)
+    path, of_parameters = None, units_of("/") if "field_derivative" in dataset else {}
     for name, grid in grids.items():
         directory.mkdir(exist_ok=True)
         path = directory / f"{name}.vtu"

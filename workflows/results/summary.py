@@ -78,10 +78,6 @@ def of_meshes(found: xr.Dataset) -> Part:
     return {"error": _number(size), "corrected": corrected, "solves": int(solves) if np.isfinite(solves) else 0}
 
 
-def _synthetic(dataset: xr.Dataset) -> Part:
-    return {"data": int(np.isfinite(dataset["values"]).sum())}
-
-
 def _design(dataset: xr.Dataset) -> Part:
     chosen = dataset.isel(candidate=dataset["chosen"].to_numpy())
     place = [[None if np.isnan(x) else x for x in at] for at in chosen["candidate_place"].to_numpy().tolist()]
@@ -145,25 +141,18 @@ def _by(dimension: str, found: xr.Dataset, names: Mapping[str, str]) -> Any:
 
 def _methods(dataset: xr.Dataset) -> Part:
     """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
-    gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
+    found = dataset.assign({f"{name}_gain_{key}": of for name in ESTIMATED for key, of in gains(dataset, name).items()})
     methods: dict[str, list[dict[str, Any]]] = {}
     for i, name in enumerate(dataset["row_method"].to_numpy().tolist()):
-        row = dataset.isel(row=i)
-        outputs = {
-            str(output): {
-                estimated: {
-                    **{key: _number(of_output[f"{estimated}_{key}"]) for key in NUMBERS},
-                    **{key: bool(of_output[f"{estimated}_{key}"]) for key in ("resolved", "understated")},
-                    **{
-                        f"gain_{key}": _number(of.isel(row=i).sel(output=output))
-                        for key, of in gained[estimated].items()
-                    },
-                }
+        row, outputs = found.isel(row=i), {}
+        for output in map(str, dataset.output.values):
+            of = row.sel(output=output)
+            outputs[output] = {
+                estimated: {key: _number(of[f"{estimated}_{key}"]) for key in NUMBERS}
+                | {key: bool(of[f"{estimated}_{key}"]) for key in ("resolved", "understated")}
+                | {key: _number(of[f"{estimated}_{key}"]) for key in ("gain_solves", "gain_cpu", "gain_textbook")}
                 for estimated in ESTIMATED
             }
-            for output in dataset.output.values
-            for of_output in [row.sel(output=output)]
-        }
         methods.setdefault(name, []).append(
             {
                 "cost": int(row["solves"]),
@@ -218,7 +207,7 @@ class _Told:
 
 _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what each needs
     ({"alone_eigenvalue"}, _inversion),
-    ({"clean"}, _synthetic),
+    ({"clean"}, lambda dataset: {"data": int(np.isfinite(dataset["values"]).sum())}),
     ({"random_equal"}, _design),
     ({"probability"}, _comparison),
     ({"row_method"}, _methods),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,9 +27,8 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
 
     What estimates outputs has a table of them; other studies have the answers that their report begins with.
     """
-    severe = [one for one in summary["findings"] if one["severity"] != "note"]
-    notes = [one for one in summary["findings"] if one["severity"] == "note"]
-    lines = _said(severe)
+    said = [(one["severity"], f"{one['severity']}: {one['text']}") for one in summary["findings"]]
+    lines = [line for severity, line in said if severity != "note"]
     if "outputs" not in summary or "methods" in summary:
         lines += answers(dataset, summary, study)
     sets = summary.get("data_sets", {}).items()
@@ -46,11 +46,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
         lines.append(words.joined(summary["joined"], summary["work"]))
     if "note" in summary:
         lines.append(summary["note"])
-    return "\n".join([*lines, *_said(notes)]) + "\n"
-
-
-def _said(findings: Sequence[Mapping[str, str]]) -> list[str]:
-    return [f"{one['severity']}: {one['text']}" for one in findings]
+    return "\n".join([*lines, *(line for severity, line in said if severity == "note")]) + "\n"
 
 
 def answers(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind) -> Iterator[str]:
@@ -113,12 +109,8 @@ def _bars(summary: Mapping[str, Any]) -> list[str]:
 
 def _table(rows: Sequence[Row]) -> Iterator[str]:
     """Columns side by side, the first to the left, numbers to the right; a row of one cell is as wide as it is."""
-    count = max(map(len, rows))
-    whole = [row for row in rows if len(row) > 1]
-    widths = [max(len(row[i]) for row in whole if len(row) > i) for i in range(count)]
+    columns = list(zip_longest(*(row for row in rows if len(row) > 1), fillvalue=""))
+    first, *widths = (max(map(len, column)) for column in columns)
     for row in rows:
-        cells = [
-            row[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=False)),
-        ]
+        cells = [row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], widths, strict=False))]
         yield ("  ".join(cells) if len(row) > 1 else row[0]).rstrip()

@@ -19,8 +19,7 @@ def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
     if not need:
         return None
     for limit in sorted(limits(), key=lambda one: one.size):
-        wanted = need + of_program(limit)
-        wanted *= 1 if limit.of_each_process else rank_groups
+        wanted = (need + of_program(limit)) * (1 if limit.of_each_process else rank_groups)
         if wanted > limit.size:
             return Finding("memory", "warning", {"needed": wanted / MIB, "limit": limit})
         largest, what = study.growth

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
-from uq.evaluation.request import Evaluations
 from uq.findings import add
 from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
@@ -54,30 +53,21 @@ DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
 def run(
-    study: StudyKind,
-    name: str,
-    directory: Path,
-    *,
-    quiet: bool = False,
-    silent: bool = False,
-    report: bool = True,
+    study: StudyKind, name: str, directory: Path, *, quiet: bool = False, silent: bool = False, report: bool = True
 ) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
+    If it fails before anything is solved, or because the model has no answer worth keeping, the directory is left as it
+    was.
+
     Parameters
     ----------
-    study
-        What to compute.
     name
-        Name of the study in results.
-    directory
-        Where results go; made if it does not exist.
+        Of the study, in its results.
     quiet
         Print only errors and, off the terminal, a line of progress a minute.
     silent
         Not even that line.
-    report
-        Whether report.html is written.
 
     Returns
     -------
@@ -95,11 +85,6 @@ def run(
         If the study cannot be finished because the model has no answer.
     StopError
         If there is no memory, or no space on disk; finished work is kept.
-
-    Notes
-    -----
-    If it fails before anything is solved, or because the model has no answer worth keeping, the directory is left as it
-    was.
     """
     try:
         with ExitStack() as held:
@@ -138,11 +123,10 @@ def _run(
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
-    say = _say if world.rank == 0 and not quiet else lambda _: None
+    ensemble.say = _say if world.rank == 0 and not quiet else lambda _: None
     checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
-    ensemble.say = say
     try:
-        study = study.prepared(ensemble, directory, say)
+        study = study.prepared(ensemble, directory, ensemble.say)
         progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
         checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
         job = ensemble.together(lambda: study.job(ensemble, name, directory, checkpoint))
@@ -158,24 +142,23 @@ def _run(
             return DONE
         progress.close()
         evaluations = job.evaluations
-        dataset = _complete(study, name, dataset, job, evaluations)
+        dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+        add(dataset, *study.findings)
+        dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
+        add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
+        dataset = job.finished(dataset, evaluations)
         own_code.keep(directory, study, loaded)
-        wall = time.monotonic() - begin
-        summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
-        _leave(directory, dataset, evaluations, summary, checkpoint, job, study.units_of)
-        _tell(directory, "" if quiet else closing_words(dataset, summary, study), report=report)
+        took = time.monotonic() - begin
+        summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, took)
+        _leave(study, directory, dataset, summary, checkpoint, job)
+        # What was found need not wait for pictures.
+        sys.stdout.write("" if quiet else closing_words(dataset, summary, study))
+        sys.stdout.flush()
+        if report:
+            _report(directory)
+        if not quiet and (directory / "report.html").exists():
+            sys.stdout.write(f"report: {directory / 'report.html'}\n")
         return exit_code(summary)
-
-
-def _complete(
-    study: StudyKind, name: str, dataset: xr.Dataset, job: Job, evaluations: dict[str, Evaluations]
-) -> xr.Dataset:
-    """Add to results what the study and all evaluations say."""
-    dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
-    add(dataset, *study.findings)
-    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
-    add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
-    return job.finished(dataset, evaluations)
 
 
 def _warn_of_memory(study: StudyKind, world: Any, *, quiet: bool) -> None:
@@ -211,35 +194,19 @@ def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
 
 
 def _leave(
-    directory: Path,
-    dataset: xr.Dataset,
-    evaluations: dict[str, Evaluations],
-    summary: dict[str, Any],
-    checkpoint: Checkpoint,
-    job: Job,
-    units_of: Callable[[str], Mapping[str, str]],
+    study: StudyKind, directory: Path, dataset: xr.Dataset, summary: dict[str, Any], checkpoint: Checkpoint, job: Job
 ) -> None:
     """Write all results, in an order that is safe against a kill."""
     write_dataset(directory / "results.nc", dataset, job.arviz_groups(dataset))
-    write_fields(directory / "fields", dataset, units_of)
+    write_fields(directory / "fields", dataset, study.units_of)
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         write_text(directory / name, text)
-    checkpoint.consolidate(evaluations)
+    checkpoint.consolidate(job.evaluations)
     # The summary marks the study as finished: only then may the blocks be removed.
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
-
-
-def _tell(directory: Path, words: str, *, report: bool) -> None:
-    """Print the last words, if there are any, and then draw the report: what was found need not wait for pictures."""
-    sys.stdout.write(words)
-    sys.stdout.flush()
-    if report:
-        _report(directory)
-    if words and (directory / "report.html").exists():
-        sys.stdout.write(f"report: {directory / 'report.html'}\n")
 
 
 def _report(directory: Path) -> None:
@@ -381,17 +348,8 @@ def results_of(
 ) -> xr.Dataset:
     """Run a study and return its results; under mpirun collective, and the results are those of the first rank.
 
-    Parameters
-    ----------
-    study
-        What `load` returns, or `tissuq.Study(...)`.
-    directory
-        Where results go; an interrupted study there is continued, a finished one is read. By default nothing is written
-        to disk.
-    quiet
-        Print no progress.
-    report
-        Write report.html too, if there is a directory.
+    An interrupted study in the directory is continued, a finished one read. Without a directory nothing is written to
+    disk, and there is no report.
 
     Returns
     -------

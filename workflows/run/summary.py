@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,6 @@ from workflows.run.version import commit, versions
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.request import Evaluations
-    from uq.evaluation.tasks import Outcome
     from workflows.studies.job import Job
     from workflows.studies.study import StudyKind
 
@@ -27,21 +24,13 @@ LISTED = 50  # failures that are listed; evaluations.h5 has all
 
 
 def summarised(
-    study: StudyKind,
-    name: str,
-    dataset: xr.Dataset,
-    job: Job,
-    ranks: int,
-    rank_groups: int,
-    wall: float,
+    study: StudyKind, name: str, dataset: xr.Dataset, job: Job, ranks: int, rank_groups: int, wall: float
 ) -> dict[str, Any]:
     """Return the contents of summary.json: the study, its results, their cost, and the versions that made them."""
     from forward.model import WORK
 
-    evaluations, outcomes = job.evaluations, job.outcomes
-    every = evaluations.values()
-    done = _of_tasks(outcomes, every) if outcomes else _of_solves(study, evaluations)
-    seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
+    every, done = job.evaluations.values(), _counts(study, job)
+    seconds = sum(one.seconds for one in job.outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
     stability, joined = failure_domain.counts(every), failure_domain.joined_counts(every)
     none = np.zeros(len(WORK), dtype=np.int64)
@@ -74,41 +63,29 @@ def summarised(
     }
 
 
-def _of_solves(study: StudyKind, evaluations: Mapping[str, Evaluations]) -> dict[str, Any]:
-    """Number of solves, and which failed."""
-    explains = study.explains
-    failed = [
-        (label, failure)
-        for label, found in evaluations.items()
-        for failure in found.failures
-        if not (explains and failure.inadmissible)
+def _counts(study: StudyKind, job: Job) -> dict[str, Any]:
+    """Number of solves, or of data sets that were inverted side by side, and which failed."""
+    evaluations, outcomes, explains = job.evaluations, job.outcomes, study.explains
+    solves = [(label, failure) for label, found in evaluations.items() for failure in found.failures]
+    failures: list[dict[str, Any]] = [
+        {"parameters": {"data_set": float(k)}, "reason": one.reason}
+        for k, one in enumerate(outcomes)
+        if one.dataset is None
     ]
-    return {
-        "evaluations": sum(len(found.points) for found in evaluations.values()),
-        "failed": len(failed),
-        **({"zero_likelihood": _unlikely(evaluations.values())} if explains else {}),
-        "failures": [
+    if not outcomes:
+        failures = [
             {
                 **({} if label == "/" else {"model": label}),
                 "parameters": dict(zip(study.parameters_of(label), failure.parameters, strict=True)),
                 "reason": failure.reason,
             }
-            for label, failure in failed[:LISTED]
-        ],
-    }
-
-
-def _of_tasks(outcomes: Sequence[Outcome], evaluations: Iterable[Evaluations]) -> dict[str, Any]:
-    """Number of data sets that were inverted side by side, and which failed."""
-    failed = [(number, one.reason) for number, one in enumerate(outcomes) if one.dataset is None]
+            for label, failure in solves
+            if not (explains and failure.inadmissible)
+        ]
+    unlikely = sum(failure.inadmissible for _, failure in solves)  # at parameters for which there is no model
     return {
-        "evaluations": len(outcomes),
-        "failed": len(failed),
-        "zero_likelihood": _unlikely(evaluations),
-        "failures": [{"parameters": {"data_set": float(k)}, "reason": reason} for k, reason in failed[:LISTED]],
+        "evaluations": len(outcomes) or sum(len(found.points) for found in evaluations.values()),
+        "failed": len(failures),
+        **({"zero_likelihood": unlikely} if outcomes or explains else {}),
+        "failures": failures[:LISTED],
     }
-
-
-def _unlikely(evaluations: Iterable[Evaluations]) -> int:
-    """Number of solves at parameters for which there is no model."""
-    return sum(failure.inadmissible for found in evaluations for failure in found.failures)

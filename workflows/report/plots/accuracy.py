@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +37,9 @@ SPAN = 1e-5  # of the largest error: smaller ones have a number, but no bar, so 
 
 
 def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax: Axes | None = None) -> Axes:
-    """Draw the errors of an estimate of each output by source, relative to the estimate.
+    """Draw the errors of an estimate (`of`, in words) of outputs by source (`PART_COLOURS`), relative to the estimate.
 
-    Parameters
-    ----------
-    names
-        Of the outputs.
-    parts
-        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN where not estimated.
-    of
-        The estimate, in words.
+    NaN where they are not estimated.
     """
     from matplotlib.ticker import LogLocator, NullLocator
 
@@ -64,19 +57,15 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
         ax.barh(at, drawn - left, left=left, height=0.9 * height, color=PART_COLOURS[name], label=name)
         for y, value, end in zip(at, values, drawn, strict=True):
             text = f"{number(100 * value, 2)} %" if np.isfinite(value) else "not estimated"
-            seen = end > left
-            _beside(ax, text if seen else f"{name} {text}", end, y, DARK if seen else PART_COLOURS[name])
+            text, colour = (text, DARK) if end > left else (f"{name} {text}", PART_COLOURS[name])
+            beside: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": colour}
+            ax.annotate(text, (end, y), xytext=(3, 0), **beside)
     ax.set_xscale("log")
     ax.set_xlim(left, 8 * largest)
     ax.xaxis.set_major_locator(LogLocator(numticks=5))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(lambda x, _: f"{number(100 * x, 1)} %")
     return finished(ax, f"error of the {of}, relative to it", above=len(parts))
-
-
-def _beside(ax: Axes, text: str, x: float, y: float, colour: str = DARK) -> None:
-    """Write the number of a bar at its end."""
-    ax.annotate(text, (x, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8, color=colour)
 
 
 def mesh_variance(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
@@ -153,12 +142,7 @@ def _level_axis(dataset: xr.Dataset, ax: Axes | None) -> Axes:
 
 
 def _log2(
-    ax: Axes,
-    levels: NDArray[np.int64],
-    values: NDArray[np.float64],
-    colour: str,
-    label: str,
-    linestyle: str = "-",
+    ax: Axes, levels: NDArray[np.int64], values: FloatArray, colour: str, label: str, linestyle: str = "-"
 ) -> None:
     some = values != 0
     ax.plot(levels[some], np.log2(np.abs(values[some])), color=colour, marker="o", linestyle=linestyle, label=label)
@@ -173,9 +157,8 @@ def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax
         at = estimate_of(found, "cycle_value")
         error, size = at.mesh, np.abs(at.value + at.mesh)
         relative = np.divide(np.abs(error), size, out=np.full(len(size), np.nan), where=size > 0)
-        ax.plot(
-            unknowns, np.where(relative > 0, relative, np.nan), "o-", color=colour, markersize=4, label=text_of(output)
-        )
+        relative = np.where(relative > 0, relative, np.nan)
+        ax.plot(unknowns, relative, "o-", color=colour, markersize=4, label=text_of(output))
     ax.axhline(tolerance, color=PLAIN, linestyle=":", label="tolerance")
     return finished(ax, "unknowns", "estimated relative error of the mesh", log="xy")
 
@@ -193,30 +176,18 @@ def errors(
 ) -> Axes:
     """Draw the root mean square error of each method of a comparison against its cost, both logarithmic.
 
-    Hollow markers are errors that the reference cannot resolve; dashed lines over the solves are the fitted rates.
-
-    Parameters
-    ----------
-    dataset
-        Results of ``method.kind = "compare"``.
-    output
-        Name of the output.
-    estimated
-        The mean or the standard deviation.
-    against
-        The number of solves, or the processor time, with the plain method by the textbook solver too.
+    Hollow markers are errors that the reference cannot resolve; dashed lines over the solves are the fitted rates. Over
+    the processor time there is the plain method by the textbook solver too.
     """
     ax = ax or axes(height=4.2, width=8.6)
     of_output = dataset.sel(output=output)
-    costs, rmse, methods = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
-    resolved, scatter = (of_output[f"{estimated}_{name}"].to_numpy() for name in ("resolved", "rmse_error"))
-    names = [
-        name
-        for name in of_output["estimator"].to_numpy().tolist()
-        if against == "cpu_seconds" or not of_output["derived"].to_numpy()[methods == name].all()
-    ]
-    for i, name in enumerate(names):
-        colour = METHOD_COLOURS[i % len(METHOD_COLOURS)]
+    costs, derived, methods = (of_output[name].to_numpy() for name in (against, "derived", "row_method"))
+    rmse, resolved, scatter = (
+        of_output[f"{estimated}_{name}"].to_numpy() for name in ("rmse", "resolved", "rmse_error")
+    )
+    every = of_output["estimator"].to_numpy().tolist()
+    names = [name for name in every if against == "cpu_seconds" or not derived[methods == name].all()]
+    for name, colour in zip(names, cycle(METHOD_COLOURS), strict=False):
         mine = (methods == name) & (rmse > 0)
         good = mine & resolved
         ax.errorbar(costs[mine], rmse[mine], yerr=scatter[mine], fmt="none", ecolor=colour, capsize=2)
@@ -258,9 +229,8 @@ def estimates(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax = ax or axes(height=3.6)
     ends = [np.inf, 0.0]
     for colour, name in zip(COLOURS, found["output"].values, strict=False):
-        error, estimate = (
-            np.abs(found[f"reduced_{what}"].sel(output=name).to_numpy()) for what in ("error", "estimate")
-        )
+        of = found.sel(output=name)
+        error, estimate = (np.abs(of[f"reduced_{what}"].to_numpy()) for what in ("error", "estimate"))
         good = (error > 0) & (estimate > 0)
         if not good.any():
             continue

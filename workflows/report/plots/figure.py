@@ -165,20 +165,11 @@ def grid(
     inside: tuple[float, float, float, float] = (0.65, 0.5, 0.15, 0.3),
     below: float = 0.0,
 ) -> list[Axes]:
-    """Return axes side by side on a new figure; all lengths are inches.
+    """Return axes side by side on a new figure, so many in a row; all lengths are inches.
 
-    Their places are given by hand: a layout that measures every label takes longer than to draw the picture.
-
-    Parameters
-    ----------
-    count, columns
-        Number of panels, and of those in a row.
-    size
-        Width and height of each panel.
-    inside
-        What its labels take, within it: to the left, below, to the right, above.
-    below
-        Height that is left free under all of them, for a legend.
+    Their places are given by hand: a layout that measures every label takes longer than to draw the picture. Of the
+    width and height of each panel its labels take what is `inside`: to the left, below, to the right, above. The height
+    `below` is left free under all of them, for a legend.
     """
     from matplotlib.figure import Figure
 
@@ -220,6 +211,21 @@ def stacked(ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], col
     for (label, widths), colour in zip(parts.items(), colours, strict=True):
         ax.barh(places, widths, left=left, color=colour, label=label, height=0.6)
         left = left + widths
+
+
+def banded(
+    ax: Axes,
+    x: Any,
+    middle: FloatArray,
+    reach: FloatArray,
+    colour: str,
+    label: str | None,
+    faint: float = 0.22,
+    **line: Any,
+) -> None:
+    """Draw a line with a band around it that reaches as far to both sides."""
+    ax.fill_between(x, middle - reach, middle + reach, color=colour, alpha=faint, linewidth=0)
+    ax.plot(x, middle, color=colour, label=label, **line)
 
 
 def quantity(dataset: xr.Dataset, output: str) -> str:

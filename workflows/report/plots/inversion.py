@@ -26,7 +26,7 @@ from workflows.report.plots.figure import (
     text_of,
 )
 from workflows.report.plots.posterior import density as density_of
-from workflows.report.plots.posterior import pairs
+from workflows.report.plots.posterior import holding, pairs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -130,9 +130,8 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
 def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw directions of a field on a plane."""
     drawn: dict[str, Panel] = {}
-    for n, values in zip(
-        one["shown_number"].to_numpy().astype(int), one["direction_stiffness"].to_numpy(), strict=True
-    ):
+    numbers = one["shown_number"].to_numpy().astype(int)
+    for n, values in zip(numbers, one["direction_stiffness"].to_numpy(), strict=True):
         if n >= 0:
             largest = float(np.abs(values).max())
             drawn[f"{n + 1}: λ = {number(float(one['eigenvalue'][n]), 3)}"] = values, "RdBu_r", (-largest, largest)
@@ -158,17 +157,11 @@ def _panels(cut: Cut, drawn: Mapping[str, Panel], columns: int = 2, size: tuple[
     left, right, below, top = (
         float(end) for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)
     )
-    found = grid(len(drawn), columns, size, AROUND_SLICE)
+    found, extent = grid(len(drawn), columns, size, AROUND_SLICE), (left, right, below, top)
     for ax, (title, (values, colours, (low, high))) in zip(found, drawn.items(), strict=True):
         ends = (low, high) if high > low else (low - 1e-3, high + 1e-3)
-        shown = ax.imshow(
-            cut.values(values),
-            colours,
-            clim=ends,
-            origin="lower",
-            extent=(left, right, below, top),
-            interpolation="none",
-        )
+        at = cut.values(values)
+        shown = ax.imshow(at, colours, clim=ends, origin="lower", extent=extent, interpolation="none")
         ax.set(xlim=cut.lines[0][[0, -1]], ylim=cut.lines[1][[0, -1]])
         ax.set_title(title, fontsize="medium")
         finished(ax, *(f"{'xyz'[axis]} (m)" for axis in cut.along)).locator_params(nbins=3)
@@ -267,10 +260,7 @@ def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[floa
     if len(draws):
         ends = span(draws, np.ones(len(draws)))
         low, high = min(low, ends[0]), max(high, ends[1])
-    wide = high - low
-    if low - 2 * wide < true < high + 2 * wide:
-        low, high = min(low, true - 0.1 * wide), max(high, true + 0.1 * wide)
-    return low, high
+    return holding(low, high, true, 2, 0.1)
 
 
 def _cut(low: float, high: float, posterior: FloatArray, prior: FloatArray) -> tuple[float, float]:
@@ -337,9 +327,8 @@ def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     degrees = one["misfit_degrees"].to_numpy()
     ax.bar(places, one["misfit"].to_numpy(), color=CONTROLLED, width=0.55)
     reach = 2 * np.sqrt(2 * degrees)
-    ax.errorbar(
-        places, degrees, yerr=[np.minimum(reach, degrees), reach], fmt="_", color=DARK, markersize=18, capsize=5
-    )
+    down = np.minimum(reach, degrees)
+    ax.errorbar(places, degrees, yerr=[down, reach], fmt="_", color=DARK, markersize=18, capsize=5)
     ax.set_xticks(places, names, rotation=45 if len(names) > len(COLOURS) else 0)
     return finished(ax, y="|r|²")
 
@@ -355,6 +344,5 @@ def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=DARK)
     for end in (-2, 2):
         ax.axvline(end, color=PLAIN, linestyle="--", linewidth=1)
-    return finished(
-        ax, f"error/standard deviation; {100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2", "density"
-    )
+    within = f"{100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2"
+    return finished(ax, f"error/standard deviation; {within}", "density")

@@ -20,6 +20,7 @@ from workflows.report.plots.figure import (
     LOW,
     PLAIN,
     axes,
+    banded,
     count_axis,
     finished,
     quantity,
@@ -45,94 +46,75 @@ WIDEST = 40  # characters of a name beside a plot
 def running_estimates(
     dataset: xr.Dataset, output: str, counts: Sequence[int], *, controlled: bool = False
 ) -> list[Moments]:
-    """Estimate the moments of an output from the first samples that have an answer, for several numbers of them.
+    """Estimate the moments of an output from the first samples that have an answer, for several numbers (≥ 2) of them.
 
-    Parameters
-    ----------
-    dataset
-        Results of a Monte Carlo study.
-    output
-        Name of the output.
-    counts
-        Numbers of samples, each at least 2.
-    controlled
-        With the tangent at the mean parameters as control variate (for the mean; do not use the standard deviation
-        then), or plain.
+    `controlled` with the tangent at the mean parameters as control variate: for the mean; do not use the standard
+    deviation then. The skewness of the samples counts in the error of a mean, as in the study.
     """
     ok = dataset["ok"].to_numpy()
     nominal = np.asarray(dataset["nominal"].sel(output=output).to_numpy())
     deviations = dataset["values"].sel(output=output).to_numpy()[ok] - nominal
-    if not controlled:
+    if controlled:
+        steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
+        controls = steps @ dataset["derivative"].sel(output=output).to_numpy()
+        coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
+        unused = np.zeros_like(nominal)  # the variance of the control, on which the mean does not depend
+        found = [estimate_from_samples(deviations[:n], controls[:n], nominal, unused, coefficient) for n in counts]
+        left = [deviations[:n] - one.coefficient * controls[:n] for one, n in zip(found, counts, strict=True)]
+    else:
         sums = monomials(deviations, None).cumsum(axis=1)
-        return [_lengthened(estimate(sums[:, n - 1], n, nominal), deviations[:n]) for n in counts]
-    steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
-    controls = steps @ dataset["derivative"].sel(output=output).to_numpy()
-    coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
-    unused = np.zeros_like(nominal)  # the variance of the control, on which the mean does not depend
-    found = [estimate_from_samples(deviations[:n], controls[:n], nominal, unused, coefficient) for n in counts]
-    return [
-        _lengthened(one, deviations[:n] - one.coefficient * controls[:n]) for one, n in zip(found, counts, strict=True)
-    ]
-
-
-def _lengthened(found: Moments, first: NDArray[np.float64]) -> Moments:
-    """Count the skewness of the samples (n,) of a mean in its error, as the study does."""
-    return replace(found, mean_error=found.mean_error * skewed(first))
+        found = [estimate(sums[:, n - 1], n, nominal) for n in counts]
+        left = [deviations[:n] for n in counts]
+    return [replace(one, mean_error=one.mean_error * skewed(first)) for one, first in zip(found, left, strict=True)]
 
 
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
     ax = ax or axes()
-    series = _series(dataset, output)
-    for label, colour, counts, mean, error in series:
-        half = half_width(dataset) * error
-        ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
-        ax.plot(counts, mean, color=colour, label=label)
-    count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
+    if "running_mean" in dataset:
+        counts = dataset["round"].to_numpy()
+        mean, error = (dataset[f"running_{name}"].sel(output=output).to_numpy() for name in ("mean", "mean_error"))
+        series = [("scrambled Sobol' points", CONTROLLED, mean, error)]
+    else:
+        n = int(dataset["ok"].sum())
+        counts = np.unique(np.geomspace(max(2, min(FIRST_SHOWN, n // 2)), n, 160).round().astype(np.int64))
+        kinds = {"plain": PLAIN} | ({"with sensitivity derivatives": CONTROLLED} if "variance_ratio" in dataset else {})
+        series = []
+        for label, colour in kinds.items():
+            running = running_estimates(dataset, output, counts.tolist(), controlled=label != "plain")
+            series.append((label, colour, *np.array([(one.mean, one.mean_error) for one in running]).T))
+    for label, colour, mean, error in series:
+        banded(ax, counts, mean, half_width(dataset) * error, colour, label)
+    count_axis(ax, int(counts[0]), int(counts[-1]))
     return finished(ax, y=f"running mean of {quantity(dataset, output)}", title="mean, 95 % band")
 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the density of an output, from its expansion or its samples, with its mean and quantiles."""
-    ax = ax or axes()
+    ax, one = ax or axes(), dataset.sel(output=output)
     if "density" in dataset:
-        density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
-        ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
-        _corrected_density(dataset, output, ax)
+        density, edges = one["density"].to_numpy(), estimate_of(one, "density_edge")
+        ax.stairs(density, edges.value, fill=True, color=CONTROLLED, alpha=0.4)
+        # Without the error of the mesh: as much of it between ends that have moved.
+        widths = np.diff(edges.corrected)
+        if np.isfinite(edges.corrected).all() and (widths > 0).all():
+            moved = density * np.diff(edges.value) / widths
+            ax.stairs(moved, edges.corrected, color=DARK, linewidth=1, label="corrected for the mesh")
     else:
-        values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
-        spread = np.ptp(values) > 1e-12 * np.abs(values).max()
-        ax.hist(
-            values, bins=_bins(values) if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white"
-        )
-    ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
-    corrected = single(dataset.sel(output=output), "mean").corrected
-    if np.isfinite(corrected):
-        ax.axvline(corrected, color=DARK, linestyle=":", label="corrected mean")
-    for i, probability in enumerate(dataset["quantile"].to_numpy()):
-        place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
+        values = one["values"].to_numpy()[dataset["ok"].to_numpy()]
+        bins = _bins(values) if np.ptp(values) > 1e-12 * np.abs(values).max() else 1
+        ax.hist(values, bins=bins, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
+    mean = single(one, "mean")
+    ax.axvline(mean.value, color=DARK, label="mean")
+    if np.isfinite(mean.corrected):
+        ax.axvline(mean.corrected, color=DARK, linestyle=":", label="corrected mean")
+    above: dict[str, Any] = {"xytext": (0, 3), "textcoords": "offset points", "ha": "center", "fontsize": "small"}
+    for i, (probability, place) in enumerate(zip(one["quantile"].values, one["quantiles"].values, strict=True)):
         ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
-        above: dict[str, Any] = {
-            "xycoords": ax.get_xaxis_transform(),
-            "xytext": (0, 3),
-            "textcoords": "offset points",
-            "ha": "center",
-        }
-        ax.annotate(f"{100 * probability:g} %", (place, 1), fontsize="small", color=HIGH, **above)
-    unit = str(dataset["unit"].sel(output=output).item())
+        ax.annotate(f"{100 * probability:g} %", (place, 1), xycoords=ax.get_xaxis_transform(), color=HIGH, **above)
+    unit = str(one["unit"].item())
     density_of = "density" if unit == "1" else f"density (1/{unit})"
     return finished(ax, quantity(dataset, output), density_of, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
-
-
-def _corrected_density(dataset: xr.Dataset, output: str, ax: Axes) -> None:
-    """Draw the density without the error of the mesh: as much of it between ends that have moved."""
-    of_output = dataset.sel(output=output)
-    edges = estimate_of(of_output, "density_edge")
-    before, after = edges.value, edges.corrected
-    widths = np.diff(after)
-    if np.isfinite(after).all() and (widths > 0).all():
-        density = of_output["density"].to_numpy() * np.diff(before) / widths
-        ax.stairs(density, after, color=DARK, linewidth=1, label="corrected for the mesh")
 
 
 def _bins(values: NDArray[np.float64]) -> int:
@@ -146,17 +128,7 @@ def _bins(values: NDArray[np.float64]) -> int:
 def comparison(
     datasets: Mapping[str, xr.Dataset], output: str, estimated: Estimated = "mean", ax: Axes | None = None
 ) -> Axes:
-    """Draw an estimate of several studies, each with its 95 % confidence interval.
-
-    Parameters
-    ----------
-    datasets
-        Results by the name shown beside them.
-    output
-        Name of the output; studies without an estimate of it are omitted.
-    estimated
-        The mean or the standard deviation.
-    """
+    """Draw an estimate of an output by those studies that have it, with 95 % confidence intervals."""
     shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
     ax = ax or axes(height=1.2 + 0.42 * len(shown))
     short = [name if len(name) <= WIDEST else f"…{name[1 - WIDEST :]}" for name in shown]  # a long path leaves no room
@@ -167,27 +139,6 @@ def comparison(
     ax.locator_params(axis="x", nbins=6)
     quantities = {quantity(datasets[name], output) for name in shown}
     return finished(ax, f"{WORDS[estimated]} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
-
-
-def _series(
-    dataset: xr.Dataset, output: str
-) -> list[tuple[str, str, NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """Label, colour, numbers of samples, running mean and its standard error of each estimator that the study has."""
-    if "running_mean" in dataset:
-        mean, error = (dataset[f"running_{name}"].sel(output=output).to_numpy() for name in ("mean", "mean_error"))
-        return [("scrambled Sobol' points", CONTROLLED, dataset["round"].to_numpy(), mean, error)]
-    n = int(dataset["ok"].sum())
-    first = max(2, min(FIRST_SHOWN, n // 2))
-    counts = np.unique(np.geomspace(first, n, 160).round().astype(np.int64))
-    kinds = [("plain", PLAIN, False)]
-    if "variance_ratio" in dataset:
-        kinds.append(("with sensitivity derivatives", CONTROLLED, True))
-    series = []
-    for label, colour, controlled in kinds:
-        running = running_estimates(dataset, output, counts.tolist(), controlled=controlled)
-        mean, error = np.array([m.mean for m in running]), np.array([m.mean_error for m in running])
-        series.append((label, colour, counts, mean, error))
-    return series
 
 
 NAMED = 8  # parameters that have a colour of their own
@@ -257,8 +208,7 @@ def measured_over_path(one: xr.Dataset, output: str, steps: Steps, ax: Axes | No
     x = np.array([names[part] for part in parts if part in names])
     order = np.argsort(x, kind="stable")
     mean, reach = (here[name].to_numpy()[order] for name in ("predicted", "predicted_std"))
-    ax.fill_between(x[order], mean - 1.96 * reach, mean + 1.96 * reach, color=CONTROLLED, alpha=0.22, linewidth=0)
-    ax.plot(x[order], mean, color=CONTROLLED, label="predicted, 95 % band of the parameters")
+    banded(ax, x[order], mean, 1.96 * reach, CONTROLLED, "predicted, 95 % band of the parameters")
     error = 1.96 * here["sigma"].to_numpy()
     label = "measured, 95 % of its errors"
     ax.errorbar(x, here["measured"].to_numpy(), error, color=DARK, fmt="o", ms=4, capsize=3, label=label)
@@ -333,14 +283,12 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
     counts = dataset["index_round"].to_numpy()
     totals = dataset["sobol_total"].sel(output=output).to_numpy()
     for rank, i in enumerate(np.argsort(-totals)[:SHARES]):
-        of_parameter = dataset.isel(parameter=int(i)).sel(output=output)
-        colour = f"C{rank}"
+        of_parameter, colour = dataset.isel(parameter=int(i)).sel(output=output), f"C{rank}"
         name = text_of(str(of_parameter["parameter"].item()))
         for which, style in (("first", "--"), ("total", "-")):
             mean, error = (of_parameter[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
-            half = half_width(dataset) * error
-            ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.12, linewidth=0)
-            ax.plot(counts, mean, style, color=colour, label=name if which == "total" else None)
+            label = name if which == "total" else None
+            banded(ax, counts, mean, half_width(dataset) * error, colour, label, faint=0.12, linestyle=style)
     ax.set_ylim(-0.1, 1.1)
     count_axis(ax, int(counts[0]), int(counts[-1]))
     return finished(ax, y=f"indices of {text_of(output)}", title="total; dashed: first order")

@@ -143,18 +143,9 @@ Extent = Sequence[tuple[float, float]]
 
 
 def told(one: xr.Dataset, places: Mapping[str, FloatArray], bounds: Extent, lump: str, ax: Axes | None = None) -> Axes:
-    """Draw what each place tells alone, with draws of where an inclusion is.
+    """Draw what each place (3,) of a tool (m) tells alone, by load case, within the bounds of a body (m).
 
-    Parameters
-    ----------
-    one
-        Results of a data set.
-    places
-        Where (3,) the tool is in each load case (m).
-    bounds
-        Of the body (m).
-    lump
-        Name of the inclusion; empty where its place is known.
+    With draws of where an inclusion of this name is, unless its place is known.
     """
     ax = ax or axes(height=4.2)
     points = np.array(list(places.values()))
@@ -211,8 +202,7 @@ def pressure_map(dataset: xr.Dataset, tool: str, direction: Vector, ax: Axes | N
     ax.plot(x, y, ".", color="white", ms=2, alpha=0.6)
     corners = seen.triangles[(pressure[seen.triangles] > 0).any(axis=1)].ravel()
     if len(corners):  # the area in contact and the cells around it
-        for values, limit in ((x[corners], ax.set_xlim), (y[corners], ax.set_ylim)):
-            limit(float(values.min()), float(values.max()))
+        ax.set(xlim=(x[corners].min(), x[corners].max()), ylim=(y[corners].min(), y[corners].max()))
     figure_of(ax).colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
     ax.set_aspect("equal")
     return finished(ax, f"{AXES[int(across[0])]} (mm)", f"{AXES[int(across[1])]} (mm)")

@@ -32,6 +32,7 @@ HELD = (0.9, 0.5)  # of the probability: within the contours
 LATTICE = 40  # points along an axis at which densities are computed
 DOTS = 160  # draws shown in each pair
 CURVE = 120  # points of a density on the diagonal
+Ends = Sequence[tuple[float, float]]  # of axes
 
 
 def pairs(
@@ -43,20 +44,10 @@ def pairs(
     modes: Sequence[float] = (),
     truths: Sequence[float] = (),
 ) -> Axes:
-    """Draw the densities of parameters by draws with weights (n,).
+    """Draw the densities of parameters by draws (n,), by what is written at the axes, with weights (n,).
 
-    Parameters
-    ----------
-    columns
-        Draws (n,) by what is written at the axes.
-    weights
-        How much each counts.
-    colour
-        Of densities.
-    worth
-        Number of independent draws that they are worth, if it is not told by the weights.
-    modes, truths
-        The most probable values, and the true ones if known (NaN otherwise), in the order of the columns.
+    They are `worth` so many independent draws, if the weights do not tell it. Modes and truths, if known (NaN
+    otherwise), are in the order of the columns.
     """
     names, n = list(columns), len(columns)
     first = axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
@@ -71,15 +62,16 @@ def pairs(
     used = weights > 1e-6 * weights.max()
     shares = weights[used] / weights[used].sum()
     draws = [np.asarray(columns[name])[used] for name in names]
-    ends = [_wide(span(x, shares), truth) for x, truth in zip(draws, [*truths, *[np.nan] * n], strict=False)]
+    ends = [
+        holding(*span(x, shares), truth, 1, 0.05) for x, truth in zip(draws, [*truths, *[np.nan] * n], strict=False)
+    ]
     for i, j in [(row, column) for row in range(n) for column in range(row + 1)]:
         ax = figure.add_subplot(places[i, j], sharex=tops[j] if j < i else None)
         tops += [ax] * (i == j)
         if i == j:
             at = np.linspace(*ends[i], CURVE)
-            ax.fill_between(
-                at, density(draws[i][:, None], shares, at[:, None], worth), color=colour, alpha=0.5, linewidth=0
-            )
+            heights = density(draws[i][:, None], shares, at[:, None], worth)
+            ax.fill_between(at, heights, color=colour, alpha=0.5, linewidth=0)
             ax.set_yticks([])
             ax.set_ylim(bottom=0)
         else:
@@ -130,14 +122,7 @@ def levels(values: FloatArray, shares: Sequence[float] = HELD) -> list[float]:
     return [float(ordered[min(int(np.searchsorted(reached, share)), len(ordered) - 1)]) for share in shares]
 
 
-def _contours(
-    ax: Axes,
-    draws: FloatArray,
-    shares: FloatArray,
-    worth: float | None,
-    ends: Sequence[tuple[float, float]],
-    colour: str,
-) -> None:
+def _contours(ax: Axes, draws: FloatArray, shares: FloatArray, worth: float | None, ends: Ends, colour: str) -> None:
     first, second = (np.linspace(*end, LATTICE) for end in ends)
     lattice = np.stack([one.ravel() for one in np.meshgrid(first, second)], axis=1)
     found = density(draws, shares, lattice, worth).reshape(LATTICE, LATTICE)
@@ -148,17 +133,15 @@ def _contours(
         ax.contour(first, second, found, levels=heights, colors=[colour], linewidths=1)
     # As many dots as can be told apart, by their weights: the first of a fixed, evenly spread order.
     at = np.searchsorted(np.cumsum(shares), (np.arange(DOTS) + 0.5) / DOTS).clip(max=len(draws) - 1)
-    chosen = np.unique(at)
-    ax.plot(*draws[chosen].T, ".", color=colour, markersize=2, alpha=0.5)
+    ax.plot(*draws[np.unique(at)].T, ".", color=colour, markersize=2, alpha=0.5)
 
 
-def _wide(ends: tuple[float, float], truth: float) -> tuple[float, float]:
-    """Move the ends of an axis so that they hold the truth, unless it is far away."""
-    low, high = ends
+def holding(low: float, high: float, truth: float, far: float, margin: float) -> tuple[float, float]:
+    """Move the ends of an axis so that they hold the truth with a margin, unless it is far away, in its lengths."""
     wide = high - low
-    if low - wide < truth < high + wide:
-        return min(low, truth - 0.05 * wide), max(high, truth + 0.05 * wide)
-    return ends
+    if low - far * wide < truth < high + far * wide:
+        return min(low, truth - margin * wide), max(high, truth + margin * wide)
+    return low, high
 
 
 PALE = 0.55  # shades above it are written on in white
@@ -207,10 +190,8 @@ def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     size = frame[2] - frame[0]
     known = size > 0
     places = rows(ax, outputs)
-    for values, colour, height, label in (
-        (before, COLOURS[1], 0.7, "before the data"),
-        (after, COLOURS[0], 0.35, "after"),
-    ):
+    drawn = ((before, COLOURS[1], 0.7, "before the data"), (after, COLOURS[0], 0.35, "after"))
+    for values, colour, height, label in drawn:
         lower, middle, upper = (values[:, known] - frame[0, known]) / size[known]
         ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
         ax.plot(middle, places[known], "|", color=colour, markersize=14, markeredgewidth=2)

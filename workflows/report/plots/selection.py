@@ -73,10 +73,7 @@ def colours(dataset: xr.Dataset) -> dict[str, str]:
 
 
 def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = "displacement (m)") -> Axes:
-    """Draw the residuals of each model for a test, over the stated errors, against the measurements.
-
-    `of` says what was measured, with its unit.
-    """
+    """Draw the residuals of each model for a test, over the stated errors, against measurements `of` something."""
     ax = ax or axes(height=3.4)
     one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
     measured = one["measured"].values
@@ -96,16 +93,9 @@ def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -
 
 
 def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, ax: Axes | None = None) -> Axes:
-    """Draw the posterior curves of all models over measured outputs of the steps of a path.
+    """Draw the posterior curves of all models over measured outputs, by their places on a path.
 
-    Parameters
-    ----------
-    dataset
-        Results of a comparison.
-    places
-        Where on the path each output is, by its name.
-    over, of
-        What is drawn at the two axes, with its unit.
+    `over` and `of` say what is drawn at the two axes.
     """
     one = dataset.isel(output=[k for k, test in enumerate(dataset["output_test"].values) if str(test) in places])
     return _over(dataset, one, np.array([places[str(test)] for test in one["output_test"].values]), over, of, ax)
@@ -144,13 +134,10 @@ SHOWN = 12  # outputs that have bars
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw a bar for each output: the share of its variance within each candidate, and that between them."""
-    outputs = [str(name) for name in dataset["output"].values][:SHOWN]
-    some, parts = dataset.sel(output=outputs), {}
-    for name in dataset["candidate"].values:
-        one = some.sel(candidate=name)
-        parts[f"within {text_of(str(name))}"] = (
-            float(one["candidate_probability"]) * one["candidate_std"] ** 2
-        ).to_numpy()
+    some = dataset.isel(output=slice(SHOWN))
+    outputs = [str(name) for name in some["output"].values]
+    within = (some["candidate_probability"] * some["candidate_std"] ** 2).transpose("candidate", "output").to_numpy()
+    parts = {f"within {text_of(str(name))}": part for name, part in zip(some["candidate"].values, within, strict=True)}
     colours_ = [*(COLOURS[i % len(COLOURS)] for i in range(len(parts))), DARK]
     parts["between"] = some["between"].to_numpy()
     whole = sum(parts.values(), np.zeros(len(outputs)))

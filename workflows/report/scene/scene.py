@@ -132,15 +132,17 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
     box = points.min(axis=0), points.max(axis=0)
     for inclusion in inclusions:
         ball = partial(_ball, inclusion, names, box)
-        insides.append(ball(f"{inclusion.label}, posterior mean", one["mean"].to_numpy(), "inside"))
+        insides.append(Inside(f"{inclusion.label}, posterior mean", *ball(one["mean"].to_numpy()), "inside"))
         if np.isfinite(one["true"]).any():
             truth = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
-            insides.append(ball(f"{inclusion.label}, truth", truth, "truth", 0.45, shown=False))
+            insides.append(Inside(f"{inclusion.label}, truth", *ball(truth), "truth", 0.45, shown=False))
         if "draw" in one:
             draws = one["draw"].to_numpy()
-            some = draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]
-            parts = [ball("", draw, "draw") for draw in some]
-            insides.append(_joined(f"{inclusion.label}, {len(parts)} posterior draws", parts, "draw", 0.2))
+            parts = [ball(draw) for draw in draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]]
+            first = np.cumsum([0, *(len(at) for _, at in parts[:-1])])
+            triangles = np.concatenate([of + k for (of, _), k in zip(parts, first, strict=True)])
+            label, at = f"{inclusion.label}, {len(parts)} posterior draws", np.concatenate([at for _, at in parts])
+            insides.append(Inside(label, triangles, at, "draw", 0.2, shown=False))
     return Scene(
         points,
         cells,
@@ -193,9 +195,8 @@ def _quantities(of: xr.Dataset, mean: str, *, every: bool) -> Iterator[Quantity]
     if "field_derivative_rms" in of:
         effects = of["field_derivative_rms"] * of["parameter_std"]
         for parameter in names[np.argsort(-effects.to_numpy())][: None if every else DERIVATIVES_SHOWN]:
-            values = of["field_derivative"].sel(parameter=parameter) * float(
-                of["parameter_std"].sel(parameter=parameter)
-            )
+            std = float(of["parameter_std"].sel(parameter=parameter))
+            values = of["field_derivative"].sel(parameter=parameter) * std
             yield Quantity(f"Displacement by one standard deviation of {parameter}, to first order", _size(values), "m")
     if "dominating" in of:
         strongest = names[np.argsort(-of["field_sobol_total"].to_numpy())][: None if every else MAPS_SHOWN]
@@ -232,9 +233,8 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
     if known:
         yield Quantity("Stiffness factor, truth", truth, low=low, high=high)
         off = np.where(std > 0, (mean - one["stiffness_true"].to_numpy()) / np.maximum(std, 1e-300), 0.0)
-        yield Quantity(
-            "Mean minus truth over the posterior standard deviation", off, colours="coolwarm", low=-3.0, high=3.0
-        )
+        label = "Mean minus truth over the posterior standard deviation"
+        yield Quantity(label, off, colours="coolwarm", low=-3.0, high=3.0)
 
 
 def _by_case(one: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> Iterator[Quantity]:
@@ -308,21 +308,13 @@ def _inclusions_of(of: xr.Dataset, study: Any, points: FloatArray) -> Iterator[I
     names, means = [str(name) for name in of["parameter"].values], of["parameter_mean"].to_numpy()
     box = points.min(axis=0), points.max(axis=0)
     for inclusion in (one for body in study.model.bodies for one in body.inclusions):
-        yield _ball(inclusion, names, box, inclusion.label, means, "inside")
+        yield Inside(inclusion.label, *_ball(inclusion, names, box, means), "inside")
 
 
 def _ball(
-    inclusion: Any,
-    names: Sequence[str],
-    box: tuple[FloatArray, FloatArray],
-    label: str,
-    values: FloatArray,
-    kind: str,
-    opacity: float = 1.0,
-    *,
-    shown: bool = True,
-) -> Inside:
-    """The surface where the indicator of an inclusion is ½, within the body, with values of what is not known of it."""
+    inclusion: Any, names: Sequence[str], box: tuple[FloatArray, FloatArray], values: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Triangles and points of where the indicator of an inclusion is ½, in the body, by values of what is not known."""
     of = dict(zip(names, values.tolist(), strict=True))
     own = inclusion.model_dump(exclude={"kind", "name", "contrast"})
     numbers = {key: of.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in own.items()}
@@ -330,20 +322,10 @@ def _ball(
     centre, reach = np.array([numbers[axis] for axis in "xyz"]), 1.15 * max(radii)
     low, high = np.maximum(centre - reach, box[0] - 0.1 * reach), np.minimum(centre + reach, box[1] + 0.1 * reach)
     if (low >= high).any():
-        return Inside(label, np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), kind, opacity, shown)
+        return np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3))
     indicator = INDICATORS[inclusion.kind]
     at, triangles = level(lambda x: 0.5 - indicator(OPS, x.T, **numbers), low, high, 20)
-    return Inside(label, triangles, at, kind, opacity, shown)
-
-
-def _joined(name: str, parts: Sequence[Inside], kind: str, opacity: float) -> Inside:
-    triangles, points, first = [], [], 0
-    for part in parts:
-        assert part.points is not None
-        triangles.append(part.triangles + first)
-        points.append(part.points)
-        first += len(part.points)
-    return Inside(name, np.concatenate(triangles), np.concatenate(points), kind, opacity, shown=False)
+    return triangles, at
 
 
 def ends(quantity: Quantity) -> tuple[float, float]:
@@ -364,9 +346,8 @@ def packed(scene: Scene) -> tuple[str, str]:
     pack, whole = Packer(), len(scene.points) <= SMALL
     surface = scene.skin
     meshed = [inside for inside in scene.insides if inside.points is None]
-    if whole:
-        kept = np.arange(len(scene.points))
-    else:
+    kept = np.arange(len(scene.points))
+    if not whole:
         kept = np.unique(np.concatenate([surface.nodes, *(inside.triangles.ravel() for inside in meshed)]))
     number = np.full(len(scene.points), -1)
     number[kept] = np.arange(len(kept))

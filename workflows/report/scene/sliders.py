@@ -46,49 +46,33 @@ class Sliders:
     ----------
     expansion
         Of outputs and perhaps displacements.
+    of
+        The results that it was fitted to.
     given
-        Distributions of the parameters by their names; None for coefficients of random fields.
-    parameter_units, units
-        Of parameters by their paths, and of outputs by their names.
-    errors
-        Of the outputs (m,), one standard error.
-    drawn
-        The outputs that are shown.
-    field_loo
-        Leave-one-out error of the displacements, relative to their standard deviation; NaN without.
-    source
-        What the expansion is of, in a sentence, if not of the model itself.
+        Distributions of the parameters by their names; none of coefficients of random fields.
     samples
         (n, d) of parameters that depend on each other.
     """
 
     expansion: Expansion
-    given: Mapping[str, Distribution | None]
-    parameter_units: dict[str, str]
-    units: dict[str, str]
-    errors: FloatArray
-    drawn: list[str]
-    field_loo: float
-    source: str = ""
+    of: Results
+    given: Mapping[str, Distribution]
     samples: FloatArray | None = None
 
     def packed(self, pack: Packer, nodes: IntArray) -> dict[str, Any]:
         """Put the modes of the field at some nodes among other arrays, and return the rest."""
-        basis, of = self.expansion.basis, self.expansion
+        basis, of, dataset = self.expansion.basis, self.expansion, self.of.dataset
+        own = np.nan_to_num(dataset.get("own_error", 0.0))
+        errors = np.nan_to_num(np.hypot(dataset["loo_error"] * dataset["std"], own), posinf=0.0)
         told: dict[str, Any] = {
             "parameters": [self._parameter(i, name) for i, name in enumerate(of.parameters)],
             "indices": basis.indices.tolist(),
             "outputs": [
-                {
-                    "name": name,
-                    "unit": self.units[name],
-                    "coefficients": of.coefficients[:, k].tolist(),
-                    "error": float(self.errors[k]) if np.isfinite(self.errors[k]) else 0.0,
-                }
-                for k, name in enumerate(of.output_names)
-                if name in self.drawn
+                {"name": name, "unit": self.of.unit(name), "coefficients": column.tolist(), "error": float(error)}
+                for name, column, error in zip(of.output_names, of.coefficients.T, errors, strict=True)
+                if name in self.of.drawn
             ],
-            "source": self.source,
+            "source": dataset.attrs.get("source", ""),  # what the expansion is of, if not of the model itself
         }
         if self.samples is not None:
             told["joint"] = self._joint(pack, self.samples)
@@ -126,7 +110,7 @@ class Sliders:
         }
 
     def _parameter(self, i: int, name: str) -> dict[str, Any]:
-        distribution, basis = self.given[name], self.expansion.basis
+        distribution, basis = self.given.get(name), self.expansion.basis
         z = np.linspace(-FARTHEST, FARTHEST, 401)
         few = len(self.expansion.parameters) > MANY
         count, points = (FEWER, SHORTER) if few else (QUANTILES, CURVE)
@@ -155,7 +139,7 @@ class Sliders:
             degree = int(basis.joint.indices.max(initial=0))
         return {
             "path": name,
-            "name": with_its_unit(spoken(name), self.parameter_units.get(name, "1")),
+            "name": with_its_unit(spoken(name), self.of.parameter_unit(name)),
             "low": low,
             "high": high,
             "fitted": [float(self.expansion.lower[i]), float(self.expansion.upper[i])],
@@ -191,11 +175,12 @@ class Sliders:
         points = np.column_stack(some)
         psi = self.expansion.basis.values(points)
         error = np.abs(psi @ (coefficients - factors @ rounded)).max()
+        loo = float(self.of.dataset.get("field_loo_error", np.nan))
         return {
             "modes": pack.add(scaled.reshape(count, -1, 3).transpose(1, 2, 0).reshape(-1, 3 * count), step),
             "factors": factors.tolist(),
             "rounding": float(1.5 * error + SINGLE * np.abs(psi @ coefficients).max()),
-            "loo": self.field_loo if np.isfinite(self.field_loo) else None,
+            "loo": loo if np.isfinite(loo) else None,
         }
 
 
@@ -205,7 +190,7 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
     A reduced model is cheap enough to make an expansion of, where the study has none. Of parameters that depend on each
     other by a copula there are no sliders: expansions are not of these.
     """
-    given: Mapping[str, Distribution | None] = study.given
+    given = study.given
     if dataset.sizes["parameter"] > MOST or study.correlations:
         return None
     if "multi_index" not in dataset:
@@ -221,18 +206,7 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
         inputs = study.inputs
         given = inputs.marginals
         samples = inputs.points(sobol_points(0, 0, 0, SAMPLES, len(inputs.names)))
-    of = Results(dataset, {}, study)
-    return Sliders(
-        expansion,
-        {name: given.get(name) for name in expansion.parameters},
-        dict(study.units_of("/")),
-        {name: of.unit(name) for name in of.outputs},
-        np.hypot(dataset["loo_error"] * dataset["std"], np.nan_to_num(dataset.get("own_error", 0.0))),
-        of.drawn,
-        float(dataset["field_loo_error"]) if "field_loo_error" in dataset else float("nan"),
-        dataset.attrs.get("source", ""),
-        samples,
-    )
+    return Sliders(expansion, Results(dataset, {}, study), given, samples)
 
 
 def expanded(file: Path, study: Study, *, alone: bool = False) -> xr.Dataset:

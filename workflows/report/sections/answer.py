@@ -23,7 +23,7 @@ from forward.readable import (
 )
 from uq.estimators.estimate import single
 from uq.findings import NOT_KNOWN
-from workflows.report.blocks import CURVE, Answer, Block, Card, Text, curve_of, smooth
+from workflows.report.blocks import CURVE, Answer, Block, Card, Curve, Text, curve_of, smooth
 from workflows.report.section import Results, section
 from workflows.report.sections.cost import reduced_card
 from workflows.report.sections.errors import counting, parts_of
@@ -71,14 +71,10 @@ def forward(results: Results) -> Card:
     asked = listed([called(results, output) for output in results.drawn])
     be = "is" if len(results.drawn) == 1 else "are"
     uncertain = f"{listed(names)} {'is' if len(names) == 1 and ' modes of ' not in names[0] else 'are'} uncertain"
-    if not names and sampled:
-        question = f"How large {be} {asked}{path}, by all candidates?"
-    elif not names:
-        question = f"What {be} {asked}{path}?"
-    elif sampled:
-        question = f"How large {be} {asked}{path}, if {uncertain}?"
+    if sampled:
+        question = f"How large {be} {asked}{path}, {f'if {uncertain}' if names else 'by all candidates'}?"
     else:
-        question = f"How do {listed(names)} change {asked}{path}?"
+        question = f"How do {listed(names)} change {asked}{path}?" if names else f"What {be} {asked}{path}?"
     spec = results.study.spec
     counts = counting(results) if spec.meshed else np.ones(len(results.outputs))
     own = getattr(spec, "errors", {})  # of a reduced model itself: what a mean may be off by at most
@@ -174,26 +170,22 @@ def distribution(one: xr.Dataset) -> Distribution:
 
 def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
     """Say which parameters an output is driven by."""
-    for name, words in (
-        ("sobol_total", "driven by"),
-        ("shapley", "driven by"),
-        ("derivative_per_std", "driven, to first order, by"),
-    ):
-        if name not in one or one[name].dims != ("parameter",):
-            continue
-        effects = one[name].to_numpy()
-        names = [spoken(str(p)) for p in one["parameter"].to_numpy()]
-        if name == "derivative_per_std" and not sampled:
+    known = ("sobol_total", "shapley", "derivative_per_std")
+    name = next((name for name in known if name in one and one[name].dims == ("parameter",)), None)
+    if name is None:
+        return
+    effects, words = one[name].to_numpy(), "driven by"
+    names = [spoken(str(p)) for p in one["parameter"].to_numpy()]
+    if name == "derivative_per_std":
+        if not sampled:
             moved = {names[i]: float(effects[i]) for i in np.argsort(-np.abs(effects))[:DRIVERS]}
             by = (f"{parameter} by {'+' if x > 0 else ''}{size(x, unit)}" for parameter, x in moved.items())
             yield f"moved, by one standard deviation of: {', '.join(by)}"
             return
-        if name == "derivative_per_std":
-            effects = effects**2 / max(float((effects**2).sum()), 1e-300)
-        order = [i for i in np.argsort(-effects)[:DRIVERS] if effects[i] >= SAID]
-        if order and np.isfinite(effects).all():
-            yield f"{words} {', '.join(f'{names[i]} ({percent(float(effects[i]))})' for i in order)}"
-        return
+        effects, words = effects**2 / max(float((effects**2).sum()), 1e-300), "driven, to first order, by"
+    order = [i for i in np.argsort(-effects)[:DRIVERS] if effects[i] >= SAID]
+    if order and np.isfinite(effects).all():
+        yield f"{words} {', '.join(f'{names[i]} ({percent(float(effects[i]))})' for i in order)}"
 
 
 def inversion(results: Results) -> Card:
@@ -206,7 +198,7 @@ def inversion(results: Results) -> Card:
     if of.attrs.get("quantity") != "output":
         question = f"What is inside {whose}, given {data:,} measured {measured_kind(of, results.study)}?"
     if len(sets) > 1:
-        return Card(question, [*_sets(of), *_over_sets(of, units)])
+        return Card(question, list(_sets(of, units)))
     if not bool(of["ok"].all()):
         return Card(question, [Answer(sets[0], "no answer", ("the data could not be inverted; the reason is below",))])
     one = of.isel(data_set=0)
@@ -238,33 +230,35 @@ def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
     std, lower, upper, before, wide = (
         float(at[f"prediction_{which}"]) for which in ("std", "lower", "upper", "prior_mean", "prior_std")
     )
-    unit = str(at["goal_unit"].item())
+    unit, lines = str(at["goal_unit"].item()), []
     if not np.isfinite(mean):
         return Answer(f"{name}, predicted", "no answer", ("it could not be predicted; the reason is below",))
-    lines = [f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}"]
     if np.isfinite(before):
         lines.append(f"before the data {and_error(before, wide, unit)}")
     if np.isfinite(mesh):
         lines.append(f"to be added for the mesh: {size(mesh, unit, like=mean)}")
     elif not known_mesh:
         lines.append(NOT_KNOWN)
-    return Answer(f"{name}, predicted", quantity(mean, std, unit), lines, leads=True)
+    return replace(_of_posterior(f"{name}, predicted", (mean, std, lower, upper), unit, lines), leads=True)
 
 
-def _sets(of: xr.Dataset) -> Iterator[Answer]:
-    done = int(of["ok"].sum())
-    trusted = int(((of["trust"] <= 1) & of["ok"]).sum())
-    lines = [f"{trusted} with a posterior to be trusted"]
-    if done < of.sizes["data_set"]:
-        lines.append(f"{of.sizes['data_set'] - done} could not be inverted")
-    yield Answer("inverted", f"{done} of {of.sizes['data_set']}", lines)
+def _of_posterior(
+    name: str, found: tuple[float, float, float, float], unit: str, lines: Sequence[str], curve: Curve | None = None
+) -> Answer:
+    """A mean with its standard deviation, and the ends of the interval that holds 95 %."""
+    mean, std, lower, upper = found
+    first = f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}"
+    return Answer(name, quantity(mean, std, unit), [first, *lines], curve)
 
 
-def _over_sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
+def _sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
+    """How many data sets were inverted, and each unknown over these."""
+    done, count = int(of["ok"].sum()), of.sizes["data_set"]
+    lines = [f"{int(((of['trust'] <= 1) & of['ok']).sum())} with a posterior to be trusted"]
+    lines += [f"{count - done} could not be inverted"] if done < count else []
+    yield Answer("inverted", f"{done} of {count}", lines)
     good = of.isel(data_set=np.flatnonzero(of["ok"].to_numpy()))
-    if not good.sizes["data_set"]:
-        return
-    for name in good.parameter.values:
+    for name in good.parameter.values if done else ():
         mean, std = (good[which].sel(parameter=name).to_numpy() for which in ("mean", "std"))
         unit, middle_ = units.get(str(name), "1"), float(np.median(mean))
         lines = [
@@ -276,16 +270,12 @@ def _over_sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
 
 def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     by_laplace = "source" in one and int(one["source"]) == LAPLACE and int(one["trust"]) == NEITHER
-    which_first = "mode" if by_laplace else "mean"
-    mean, std, lower, upper = (float(one[which]) for which in (which_first, "std", "lower", "upper"))
-    label = f"{spoken(name)}, by Laplace" if by_laplace else spoken(name)
+    middle, label = ("mode", f"{spoken(name)}, by Laplace") if by_laplace else ("mean", spoken(name))
+    mean, std, lower, upper = (float(one[which]) for which in (middle, "std", "lower", "upper"))
     before, wide = float(one["prior_mean"]), float(one["prior_std"])
     narrower = wide / std if std > 0 else np.inf
-    lines = [
-        f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}",
-        f"before the data {and_error(before, wide, unit, like=mean)}: "
-        + (f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"),
-    ]
+    said = f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"
+    lines = [f"before the data {and_error(before, wide, unit, like=mean)}: {said}"]
     if np.isfinite(one["true"]):
         inside = "inside" if lower <= float(one["true"]) <= upper else "outside the interval"
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
@@ -293,7 +283,7 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
         drawn = curve_of(at, curve, (lower, upper), unit, mean)
-    return Answer(label, quantity(mean, std, unit), lines, drawn)
+    return _of_posterior(label, (mean, std, lower, upper), unit, lines, drawn)
 
 
 def _stiffness(one: xr.Dataset) -> Answer:

@@ -19,7 +19,6 @@ from workflows.report.section import Results, section
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.axes import Axes
 
     from forward.model import FloatArray
     from forward.specimen import Specimen
@@ -132,12 +131,11 @@ def contact(results: Results) -> Iterator[Block]:
     yield Pictures.of(*drawn)
 
 
-def _curve_applies(results: Results) -> bool:
-    """Whether outputs at steps were estimated."""
+def _estimated_over_a_path(results: Results) -> bool:
     return bool({"mean", "nominal"} & set(results.dataset)) and isinstance(results.study.model, PathOfLoads)
 
 
-@section("output_of", heading="Over the path", when=_curve_applies)
+@section("output_of", heading="Over the path", when=_estimated_over_a_path)
 def curve(results: Results) -> Iterator[Block]:
     """Curves with bands, and which parameters matter at which step."""
     dataset, spec = results.dataset, results.study.model
@@ -147,13 +145,11 @@ def curve(results: Results) -> Iterator[Block]:
     drawn = []
     for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
         drawn.append((outputs.over_path(dataset, output, along, unit), f"Over the path: {output}."))
+        caption = f"What moves {output}, step by step."
         if "sobol_total" in dataset:
             caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
+        if "sobol_total" in dataset or "derivative_per_std" in dataset:
             drawn.append((outputs.effects_over_path(dataset, output, along, unit), caption))
-        elif "derivative_per_std" in dataset:
-            drawn.append(
-                (outputs.effects_over_path(dataset, output, along, unit), f"What moves {output}, step by step.")
-            )
     yield Pictures.of(*drawn)
 
 
@@ -166,9 +162,17 @@ def places(results: Results) -> Iterator[Block]:
     """Measured and predicted forces, and a map of what each place tells."""
     model: Specimen = results.study.model
     several = results.dataset.sizes["data_set"] > 1
+    tools = places_of(model)
     for one in first(results):
-        drawn = list(_measured(one, model))
-        tools = places_of(model)
+        found, drawn = [], []
+        for k in np.flatnonzero(one["datum_axis"].to_numpy() >= len(AXES)).tolist():
+            case = model.cases[int(one["datum_case"][k])]
+            output = case.outputs[int(one["datum_axis"][k]) - len(AXES)]
+            found.append((k, case.name, output.name, output.unit))
+        for name, unit in dict.fromkeys((name, unit) for *_, name, unit in found):
+            mine = {k: of for k, of, *kind in found if kind == [name, unit]}
+            ax = maps.forces(one, list(mine), list(mine.values()), named(name, unit))
+            drawn.append((ax, f"{name} by load case, measured and predicted with the most probable parameters."))
         if len(tools) >= LEAST and "draw" in one:
             lump = next((item.label for item in model.inclusions), "")
             ax = maps.told(one, tools, model.body.bounds, lump)
@@ -176,7 +180,13 @@ def places(results: Results) -> Iterator[Block]:
         if several:
             yield Text(str(one.data_set.item()))
         yield Pictures.of(*drawn)
-        yield _table(one, model, tools)
+        alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
+        rows = []
+        for k, of, name, unit in found:
+            told = [number(float(alone[of]), 3) if of in alone else ""] if alone else []
+            rows.append((of, name, *misses(one.isel(datum=k), unit), *told))
+        more = ["information alone (nat)"] if alone else []
+        yield Table(["load case", "output", *MISSES, *more], rows, text={0, 1})
 
 
 def places_of(model: Specimen) -> dict[str, FloatArray]:
@@ -187,34 +197,6 @@ def places_of(model: Specimen) -> dict[str, FloatArray]:
         if len(tools) == 1:
             found[case.name] = np.array(tools[0].at, dtype=float)
     return found
-
-
-def _outputs(one: xr.Dataset, model: Specimen) -> Iterator[tuple[int, str, str, str]]:
-    """Go through data that are outputs: number, load case, name and unit."""
-    for k in np.flatnonzero(one["datum_axis"].to_numpy() >= len(AXES)):
-        case = model.cases[int(one["datum_case"][k])]
-        output = case.outputs[int(one["datum_axis"][k]) - len(AXES)]
-        yield int(k), case.name, output.name, output.unit
-
-
-def _measured(one: xr.Dataset, model: Specimen) -> Iterator[tuple[Axes, str]]:
-    """A picture for each name and unit."""
-    found = list(_outputs(one, model))
-    for name, unit in dict.fromkeys((name, unit) for *_, name, unit in found):
-        mine = [(k, case) for k, case, *kind in found if tuple(kind) == (name, unit)]
-        ax = maps.forces(one, [k for k, _ in mine], [case for _, case in mine], named(name, unit))
-        yield ax, f"{name} by load case, measured and predicted with the most probable parameters."
-
-
-def _table(one: xr.Dataset, model: Specimen, tools: dict[str, FloatArray]) -> Table:
-    """Measured and predicted values, and what each load case tells alone."""
-    alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
-    rows = []
-    for k, case, name, unit in _outputs(one, model):
-        told = [number(float(alone[case]), 3) if case in alone else ""] if alone else []
-        rows.append((case, name, *misses(one.isel(datum=k), unit), *told))
-    more = ["information alone (nat)"] if alone else []
-    return Table(["load case", "output", *MISSES, *more], rows, text={0, 1})
 
 
 MISSES = ("measured", "predicted", "residual over its error")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -109,24 +109,13 @@ CHOSEN = (
 @section("fidelity_cost", heading="Models")
 def fidelities(results: Results) -> Iterator[Block]:
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
-    yield models(results)
-    yield Text(
-        "A correlation is that with the outputs of the model of the study, in the pilot; in brackets, that of what "
-        "the tangents leave. It is what a cheap model can explain."
-    )
-    yield groups(results)
-    yield Text(CHOSEN if results.dataset["group_chosen"].values.any() else EVENLY)
-    yield worth(results)
-
-
-def models(results: Results) -> Table:
-    """The models with their costs, samples and correlations."""
     dataset = results.dataset
     measured = {one["name"]: one for one in results.summary.get("fidelities", [])}
-    rows = []
-    for label in dataset["fidelity"].values:
+    rows: list[tuple[str, ...]] = []
+    labels = [str(label) for label in dataset["fidelity"].values]
+    for label in labels:
         here = dataset.sel(fidelity=label)
-        found = measured.get(str(label))
+        found = measured.get(label)
         taken = "" if found is None or not found["solves"] else duration(found["cpu_seconds"] / found["solves"])
         related = [
             f"{number(float(here['fidelity_correlation'].sel(output=o)), 5)} "
@@ -134,15 +123,14 @@ def models(results: Results) -> Table:
             for o in results.outputs
         ]
         cost, samples = number(float(here["fidelity_cost"]), 3), f"{int(here['fidelity_samples']):,}"
-        rows.append((str(label), cost, taken, samples, *related))
+        rows.append((label, cost, taken, samples, *related))
     head = ("model", "a solve, predicted (1: the study's model)", "measured", "samples")
-    return Table((*head, *(f"correlation, {output}" for output in results.outputs)), rows)
-
-
-def groups(results: Results) -> Table:
-    """The groups of models that shared samples."""
-    dataset, rows = results.dataset, []
-    labels = [str(label) for label in dataset["fidelity"].values]
+    yield Table((*head, *(f"correlation, {output}" for output in results.outputs)), rows)
+    yield Text(
+        "A correlation is that with the outputs of the model of the study, in the pilot; in brackets, that of what "
+        "the tangents leave. It is what a cheap model can explain."
+    )
+    rows = []
     for g in dataset["group"].values:
         here = dataset.sel(group=g)
         members = [label for label, inside in zip(labels, here["group_models"].values, strict=True) if inside]
@@ -152,20 +140,16 @@ def groups(results: Results) -> Table:
         count, failed = int(here["group_samples"]), f"{int(here['group_failed']):,}"
         cost = number(count * float(here["group_cost"]), 3)
         rows.append((", ".join(members) + pilot, f"{count:,}", failed, cost))
-    return Table(("groups of models", "samples", "failed", "cost in solves of the study's model"), rows)
-
-
-def worth(results: Results) -> Table:
-    """What each unit of cost was worth in plain samples, and what other methods are predicted to need."""
-    dataset, rows = results.dataset, []
-    others = [str(name) for name in dataset["alternative"].values]
+    yield Table(("groups of models", "samples", "failed", "cost in solves of the study's model"), rows)
+    yield Text(CHOSEN if dataset["group_chosen"].values.any() else EVENLY)
+    others, rows = [str(name) for name in dataset["alternative"].values], []
     for output in results.outputs:
         here = dataset.sel(output=output)
         needed = [f"{float(here['alternative_solves'].sel(alternative=name)):,.0f}" for name in others]
         rows.append((output, written(here, "gain"), number(float(dataset["spent"]), 4), *needed))
     words = {"monte-carlo": "plain Monte Carlo", "sensitivity-monte-carlo": "the tangent", "expansion": "an expansion"}
-    head = ("output", "gain over plain Monte Carlo", "spent (solves)")
-    return Table((*head, *(f"{words[name]}, predicted" for name in others)), rows)
+    first = ("output", "gain over plain Monte Carlo", "spent (solves)")
+    yield Table((*first, *(f"{words[name]}, predicted" for name in others)), rows)
 
 
 @section("level_change", heading="Levels")
@@ -175,7 +159,10 @@ def levels(results: Results) -> Iterator[Block]:
         "Every level starts its samples from the expansion of the previous level. Residuals are relative to the loads."
     )
     dataset = results.dataset
-    work = {"residuals": "residuals", "back_substitutions": "back-substitutions", "factorisations": "factorisations"}
+
+    def work(one: xr.Dataset, name: str) -> str:
+        return f"{int(one['level_work'].sel(operation=name)):,}"
+
     yield Table.of(
         [dataset.sel(level=k) for k in dataset["level"].to_numpy()],
         {
@@ -186,7 +173,9 @@ def levels(results: Results) -> Iterator[Block]:
             "largest residual": lambda one: number(float(one["level_residual"]), 2),
             "median residual": lambda one: number(float(one["level_residual_median"]), 2),
             "change of the moments": lambda one: number(float(one["level_change"]), 2),
-            **{word: partial(_work, name=name) for name, word in work.items()},
+            "residuals": partial(work, name="residuals"),
+            "back-substitutions": partial(work, name="back_substitutions"),
+            "factorisations": partial(work, name="factorisations"),
         },
     )
     yield Text(
@@ -197,17 +186,22 @@ def levels(results: Results) -> Iterator[Block]:
     yield results.estimates({f"control_{name}": word for name, word in WORDS.items()})
 
 
-def _work(one: xr.Dataset, name: str) -> str:
-    return f"{int(one['level_work'].sel(operation=name)):,}"
-
-
 @section(when=lambda results: "reduced" in results.summary)
 def reduced_model_of_body(results: Results) -> Iterator[Block]:
     """Errors on unseen samples, and how the model is made."""
     told, found = results.summary["reduced"], results.dataset
     drawn = []
     if told.get("errors"):
-        yield from _unseen(told)
+        yield Heading("How well it follows the body")
+        yield Text(
+            f"Errors on {told['unseen']} samples that the model has not seen: their root mean square over the spread "
+            "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
+            "over the true error; where it is 1, estimates can be taken for the errors."
+        )
+        left = {name: percent(error) for name, error in told.get("errors after correction", {}).items()}
+        shares = {name: f"{share:.2f}" for name, share in told.get("effectivity", {}).items()}
+        rows = [(o, percent(error), left.get(o, "–"), shares.get(o, "–")) for o, error in told["errors"].items()]
+        yield Table(("output", "error", "after the correction", "effectivity"), rows)
         if told["unseen"] > 1:
             caption = "Estimated against true errors at the unseen samples, over the root mean square of each output."
             drawn.append((accuracy.estimates(found), caption))
@@ -227,23 +221,6 @@ def reduced_model_of_body(results: Results) -> Iterator[Block]:
             ("use it", [f"tissuq live {file}: a page with sliders", use]),
         ]
     )
-
-
-def _unseen(told: Mapping[str, Any]) -> Iterator[Block]:
-    """A table of the errors on unseen samples."""
-    yield Heading("How well it follows the body")
-    yield Text(
-        f"Errors on {told['unseen']} samples that the model has not seen: their root mean square over the spread "
-        "of each output, and what the correction by the residual leaves of them. The effectivity is the estimated "
-        "over the true error; where it is 1, estimates can be taken for the errors."
-    )
-    left = {name: percent(error) for name, error in told.get("errors after correction", {}).items()}
-    shares = {name: f"{share:.2f}" for name, share in told.get("effectivity", {}).items()}
-    rows = [
-        (name, percent(error), left.get(name, "–"), shares.get(name, "–"))
-        for name, error in told.get("errors", {}).items()
-    ]
-    yield Table(("output", "error", "after the correction", "effectivity"), rows)
 
 
 def reduced_card(results: Results) -> Card:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,21 +30,32 @@ def error_budget(results: Results) -> Iterator[Block]:
     yield Text(sentence(results, shown[0]))
     counts = counting(results) & np.isin(results.outputs, results.drawn)
     outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
-    budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
-    if budgets and outputs:
-        drawn = {
-            word: plots.error_budget(outputs, {by: e[counts] for by, e in budgets[name].items()}, word)
-            for name, word in ESTIMATES.items()
-            if name in budgets
-        }
-        yield Pictures.of(*((ax, f"Errors of the {word} by source.") for word, ax in drawn.items()))
+    drawn = []
+    for name in shown:
+        found = relative(results, name)
+        if len(found) > 1 and outputs:
+            ax = plots.error_budget(outputs, {by: e[counts] for by, e in found.items()}, ESTIMATES[name])
+            drawn.append((ax, f"Errors of the {ESTIMATES[name]} by source."))
+    if drawn:
+        yield Pictures.of(*drawn)
     if any(holds(results.dataset, name, "corrected") for name in shown):
         yield Text(
             "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
             "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
             "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
         )
-        yield table(results, shown)
+        rows = []
+        for output, name in product(np.array(results.outputs)[counting(results)].tolist(), shown):
+            one, unit = single(results.of(output), name), results.unit(output)
+            total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
+            value = results.value(output, one.value, total if np.isfinite(total) else one.error)
+            sampling, whole = (margin(error, unit, like=one.value) for error in (one.error, total))
+            of_mesh, corrected = "not known", NONE
+            if np.isfinite(one.mesh):
+                of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
+                corrected = and_error(one.corrected, one.left, unit)
+            rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
+        yield Table(("estimate", "value", "sampling", "mesh", "total error", "corrected"), rows)
 
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
@@ -103,24 +115,6 @@ def sentence(results: Results, name: str) -> str:
     if zero:
         said.append(f"Zero but for rounding: {', '.join(zero)}.")
     return " ".join(said)
-
-
-def table(results: Results, names: list[str]) -> Table:
-    """The errors of each estimate, and its corrected value."""
-    rows = []
-    for output in np.array(results.outputs)[counting(results)].tolist():
-        of_output, unit = results.of(output), results.unit(output)
-        for name in names:
-            one = single(of_output, name)
-            total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
-            value = results.value(output, one.value, total if np.isfinite(total) else one.error)
-            sampling, whole = (margin(error, unit, like=one.value) for error in (one.error, total))
-            of_mesh, corrected = "not known", NONE
-            if np.isfinite(one.mesh):
-                of_mesh = and_error(one.mesh, one.doubt, unit, like=one.value)
-                corrected = and_error(one.corrected, one.left, unit)
-            rows.append((f"{ESTIMATES[name]} of {output}", value, sampling, of_mesh, whole, corrected))
-    return Table(("estimate", "value", "sampling", "mesh", "total error", "corrected"), rows)
 
 
 @section(heading="Tolerance", when=lambda results: "accuracy" in results.summary)
@@ -188,30 +182,25 @@ def meshes(results: Results) -> Iterator[Block]:
             f"and the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 confirms that the sum "
             "over the meshes telescopes."
         )
-        yield differences(results, output)
+        rest = {
+            "variance": "mesh_variance",
+            "variance of the difference": "difference_variance",
+            "÷ by the control": "difference_variance_ratio",
+            "kurtosis": "difference_kurtosis",
+            "consistency": "consistency",
+        }
+        rows = []
+        for level in dataset["level"].to_numpy():
+            here = of.sel(level=level)
+            text = written(here, "difference_mean", results.unit(output))
+            rows.append((f"{level}", text, *(number(float(here[name]), 3) for name in rest.values())))
+        yield Table(("level", "mean of the difference", *rest), rows)
         yield Pictures.of(
             (plots.mesh_variance(dataset, output), f"Variance of {output} and of its difference between meshes."),
             (plots.mesh_mean(dataset, output), f"Mean of {output} and of its difference between meshes."),
             (plots.mesh_samples(dataset, output), "Samples on every mesh: taken, and optimal for other errors."),
             (plots.mesh_cost(dataset, output), "Predicted time of sampling, without linearisations."),
         )
-
-
-def differences(results: Results, output: str) -> Table:
-    """The contribution of every mesh to the mean of an output, and whether it can be trusted."""
-    rest = {
-        "variance": "mesh_variance",
-        "variance of the difference": "difference_variance",
-        "÷ by the control": "difference_variance_ratio",
-        "kurtosis": "difference_kurtosis",
-        "consistency": "consistency",
-    }
-    rows = []
-    for level in results.dataset["level"].to_numpy():
-        here = results.dataset.sel(output=output, level=level)
-        text = written(here, "difference_mean", results.unit(output))
-        rows.append((f"{level}", text, *(number(float(here[name]), 3) for name in rest.values())))
-    return Table(("level", "mean of the difference", *rest), rows)
 
 
 @section("probability", "mesh_checked")
@@ -270,8 +259,7 @@ def adapted_mesh(results: Results) -> Iterator[Block]:
     yield Table((*head, *(word for output in results.outputs for word in (output, "error"))), rows, text=())
     named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
     yield Pictures.of((plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh."))
-    captions = {
-        False: "The mesh; cells in bright colours contribute most to the error, for their volume.",
-        True: "What is behind the cell that contributes most.",
-    }
-    yield Pictures([Picture.painted(refined(dataset, cut=cut), caption) for cut, caption in captions.items()])
+    whole = "The mesh; cells in bright colours contribute most to the error, for their volume."
+    behind = "What is behind the cell that contributes most."
+    pictures = ((refined(dataset), whole), (refined(dataset, cut=True), behind))
+    yield Pictures([Picture.painted(figure, caption) for figure, caption in pictures])

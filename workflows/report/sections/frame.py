@@ -93,16 +93,15 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
 @section("alone_eigenvalue", heading="Priors")
 def priors(results: Results) -> Iterator[Block]:
     """The priors of the unknowns."""
-    config = tomllib.loads(results.dataset.attrs["config"])
-    rows = [(path, law(block), results.parameter_unit(path)) for path, block in config.get("parameters", {}).items()]
-    rows += [
-        (f"fields.{block.get('name') or block['of']}", f"log-normal field: {settings(block, 'of', 'name')}", "1")
-        for block in config["model"].get("fields", ())
-    ]
-    noise = config["method"].get("noise")
-    if noise is not None:
-        rows.append(("factor on all sigma", law(noise), "1"))
-    rows = [(unknown, prior, NONE if unit == "1" else unit) for unknown, prior, unit in rows]
+    config, rows = tomllib.loads(results.dataset.attrs["config"]), []
+    for path, block in config.get("parameters", {}).items():
+        unit = results.parameter_unit(path)
+        rows.append((path, law(block), NONE if unit == "1" else unit))
+    for block in config["model"].get("fields", ()):
+        prior = f"log-normal field: {settings(block, 'of', 'name')}"
+        rows.append((f"fields.{block.get('name') or block['of']}", prior, NONE))
+    if "noise" in config["method"]:
+        rows.append(("factor on all sigma", law(config["method"]["noise"]), NONE))
     yield Table(("unknown", "prior", "unit"), rows, text=range(3))
 
 

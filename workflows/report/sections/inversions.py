@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,6 +74,7 @@ def _sizes(results: Results, usual: xr.DataArray) -> dict[str, tuple[float, str]
 
 SHOWN = 24  # rows of the table of a data set
 SETS = 12  # data sets that have a table
+PREDICTED = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
 
 
 @section("prediction_share", heading="Predictions")
@@ -86,30 +88,23 @@ def predictions(results: Results) -> Iterator[Block]:
     )
     done = [str(name) for name, ok in zip(of["data_set"].values, of["ok"].values, strict=True) if bool(ok)]
     for name in done[:SETS]:
-        one = of.sel(data_set=name)
+        one, rows = of.sel(data_set=name), []
         if len(done) > 1:
             yield Heading(name, level=3)
-        yield _predicted(one)
+        for goal in one["goal"].values[:SHOWN]:
+            at = one.sel(goal=goal)
+            unit, mesh = str(at["goal_unit"].item()), single(at, "prediction_mean").mesh
+            names = ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "share")
+            mean, std, lower, upper, before, wide, share = (float(at[f"prediction_{name}"]) for name in names)
+            told = and_error(mean, std, unit), interval(lower, upper, unit, mean), and_error(before, wide, unit)
+            removed = percent(share) if np.isnan(share) or share >= 0 else "none"
+            rows.append((str(goal), *told, removed, size(mesh, unit) if np.isfinite(mesh) else "not estimated"))
+        yield Table(PREDICTED, rows)
         if np.isfinite(one["prediction_std"]).any():
             caption = "95 % intervals before and after the data, each relative to the one before."
             yield Pictures.of((plots.bands(one), caption))
     if len(done) > SETS:
         yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
-
-
-def _predicted(one: xr.Dataset) -> Table:
-    """What is predicted from a data set."""
-    rows = []
-    for goal in one["goal"].values[:SHOWN]:
-        at = one.sel(goal=goal)
-        unit, mesh = str(at["goal_unit"].item()), single(at, "prediction_mean").mesh
-        names = ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "share")
-        mean, std, lower, upper, before, wide, share = (float(at[f"prediction_{name}"]) for name in names)
-        told = and_error(mean, std, unit), interval(lower, upper, unit, mean), and_error(before, wide, unit)
-        removed = NONE if np.isnan(share) else percent(share) if share >= 0 else "none"
-        rows.append((str(goal), *told, removed, size(mesh, unit) if np.isfinite(mesh) else "not estimated"))
-    head = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
-    return Table(head, rows)
 
 
 @section("population_draw", heading="The population")
@@ -128,19 +123,16 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         kinds = {"typical": unit, "scale": "1" if logarithmic else unit, "new": unit}
         rows.append((name, *(_interval(of[f"{k}_quantiles"].sel(parameter=name), u) for k, u in kinds.items())))
     yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
-    pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
-    if pairs:
-        pairwise = [(a, b, _interval(of["correlation_quantiles"].sel(parameter=a, partner=b))) for a, b in pairs]
-        yield Table(("parameter", "with", "correlation"), pairwise, text={0, 1})
+    if len(results.parameters) > 1:
+        of_pair = of["correlation_quantiles"]
+        pairs = combinations(results.parameters, 2)
+        rows = [(a, b, _interval(of_pair.sel(parameter=a, partner=b))) for a, b in pairs]
+        yield Table(("parameter", "with", "correlation"), rows, text={0, 1})
     if "slope_quantiles" in of:
         yield Text("How means change with what specimens differ in, by one unit of it:")
-        slopes = of["slope_quantiles"]
-        changes = [
-            (str(by), name, _interval(slopes.sel(covariate=by, parameter=name)))
-            for by in of["covariate"].values
-            for name in results.parameters
-        ]
-        yield Table(("covariate", "parameter", "change"), changes, text={0, 1})
+        slopes, each = of["slope_quantiles"], product(of["covariate"].values, results.parameters)
+        rows = [(str(by), name, _interval(slopes.sel(covariate=by, parameter=name))) for by, name in each]
+        yield Table(("covariate", "parameter", "change"), rows, text={0, 1})
     yield Heading("Its specimens")
     caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
     drawn = [plots.specimens(of, name, results.parameter_unit(name)) for name in results.parameters]
@@ -150,7 +142,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         "many of its draws lie where the population is."
     )
     sizes = _sizes(results, of["typical_quantiles"].transpose(..., "parameter")[1])
-    lines = []
+    rows = []
     for specimen in map(str, of["specimen"].values):
         one = of.sel(specimen=specimen)
         cells = [
@@ -158,9 +150,9 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
             for name, (size, _) in sizes.items()
             for who in ("own", "specimen")
         ]
-        lines.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
+        rows.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
     heads = [f"{head}, {who}" for _, head in sizes.values() for who in ("by itself", "of the population")]
-    yield Table(("specimen", *heads, "effective"), lines)
+    yield Table(("specimen", *heads, "effective"), rows)
 
 
 def _interval(quantiles: xr.DataArray, unit: str = "1") -> str:
@@ -181,9 +173,10 @@ def population_card(results: Results) -> Card:
         )
         factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
         spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
-        at, curve = _new_specimens(
-            _trimmed(of["population_draw"].sel(parameter=name).to_numpy()), logarithmic=bool(of["logarithmic"])
-        )
+        values = of["population_draw"].sel(parameter=name).to_numpy()
+        least, most = np.quantile(values, (0.01, 0.99))  # the outer per cent at each end may be far away
+        inner = values[(values >= least) & (values <= most)]
+        at, curve = _new_specimens(inner, logarithmic=bool(of["logarithmic"]))
         lines = [
             f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
             f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
@@ -205,12 +198,6 @@ def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray
     found = np.interp(np.log(sizes), at, curve) / sizes
     order = np.argsort(sign * sizes)
     return (sign * sizes)[order], found[order]
-
-
-def _trimmed(values: FloatArray) -> FloatArray:
-    """Return values without the outer per cent at each end, which may be far away."""
-    low, high = np.quantile(values, (0.01, 0.99))
-    return np.asarray(values[(values >= low) & (values <= high)])
 
 
 WORTH = {

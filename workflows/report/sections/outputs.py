@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,12 +24,10 @@ if TYPE_CHECKING:
 def moments(results: Results) -> Iterator[Block]:
     """Mean and standard deviation of the outputs, with their errors."""
     yield Text("± is one standard error; a 95\u00a0% interval is about twice as wide on either side.")
-    kinds = [
-        *WORDS.items(),
-        *((part(name, "corrected"), f"{word}, error of the mesh added") for name, word in WORDS.items()),
-    ]
-    kinds += [(f"plain_{name}", f"{word}, plain Monte Carlo") for name, word in WORDS.items()]
-    yield results.estimates({name: word for name, word in kinds if name in results.dataset})
+    kinds = {str(name): word for name, word in WORDS.items()}
+    kinds |= {part(name, "corrected"): f"{word}, error of the mesh added" for name, word in WORDS.items()}
+    kinds |= {f"plain_{name}": f"{word}, plain Monte Carlo" for name, word in WORDS.items()}
+    yield results.estimates({name: word for name, word in kinds.items() if name in results.dataset})
 
 
 @section("bias_error", heading="Total errors", level=3)
@@ -50,22 +49,19 @@ def quantiles(results: Results) -> Iterator[Block]:
     """Quantiles of the outputs."""
     rows = []
     for output in results.outputs:
-        found = estimate_of(results.of(output), "quantiles")
-        for words, values, errors in (
-            (output, found.value, found.error),
-            (f"{output}, corrected for the mesh", found.corrected, found.left),
-        ):
-            if words == output or np.isfinite(values).all():
-                pairs = zip(values.tolist(), errors.tolist(), strict=True)
-                rows.append((words, *(and_error(value, error, results.unit(output)) for value, error in pairs)))
+        found, unit = estimate_of(results.of(output), "quantiles"), results.unit(output)
+        told = {output: (found.value, found.error)}
+        if np.isfinite(found.corrected).all():
+            told[f"{output}, corrected for the mesh"] = found.corrected, found.left
+        for words, both in told.items():
+            rows.append((words, *(and_error(value, error, unit) for value, error in zip(*both, strict=True))))
     yield Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 
 @section("nominal", heading="Outputs at the mean parameters")
 def nominal(results: Results) -> Iterator[Block]:
     """The outputs at the mean parameters."""
-    values = results.dataset["nominal"].to_numpy()
-    rows = [(o, size(float(v), results.unit(o), 6)) for o, v in zip(results.outputs, values, strict=True)]
+    rows = [(output, size(float(results.of(output)["nominal"]), results.unit(output), 6)) for output in results.outputs]
     yield Table(("output", "value"), rows)
 
 
@@ -170,9 +166,8 @@ def local_field(results: Results) -> Iterator[Block]:
     rows = []
     for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
         of_parameter = dataset.sel(parameter=name)
-        rms, std, wide = (
-            float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
-        )
+        kinds = ("field_derivative_rms", "parameter_std", "parameter_range")
+        rms, std, wide = (float(of_parameter[key]) for key in kinds)
         slope = with_unit(number(rms, 5), per("m", results.parameter_unit(name)))
         rows.append((name, slope, size(rms * std, "m", 4), size(rms * wide, "m", 4)))
     yield Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
@@ -181,17 +176,23 @@ def local_field(results: Results) -> Iterator[Block]:
 @section("sobol_first", heading="Sobol' indices")
 def sobol_indices(results: Results) -> Iterator[Block]:
     """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
-    dataset = results.dataset
+    dataset, words = results.dataset, {"sobol_first": "first order", "sobol_total": "total"}
     yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
     for output in results.drawn:
         yield Heading(output, level=3)
-        yield sobol(results, output)
+        leading = results.leading(results.of(output)["sobol_total"])
+        groups = map(str, dataset["group"].values if "group" in dataset.coords else ())
+        grouped = ("sobol_group_first", "sobol_group_total")
+        rows = [(name, *results.cells(words, {"output": output, "parameter": name})) for name in leading]
+        rows += [(f"group {name}", *results.cells(grouped, {"output": output, "group": name})) for name in groups]
+        yield Table(("parameter", *results.heads(words)), rows)
         if "sobol_second" in dataset:
-            pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
-            at = {pair: {"output": output, "parameter": pair[0], "partner": pair[1]} for pair in pairs}
-            rows = [(*pair, *results.cells(("sobol_second",), at[pair])) for pair in pairs]
-            heads = results.heads({"sobol_second": "second order"})
-            yield Table(("parameter", "with", *heads), rows, text={0, 1})
+            second = {"sobol_second": "second order"}
+            rows = [
+                (a, b, *results.cells(second, {"output": output, "parameter": a, "partner": b}))
+                for a, b in combinations(results.parameters, 2)
+            ]
+            yield Table(("parameter", "with", *results.heads(second)), rows, text={0, 1})
         caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
         pictures = [(plots.index_bars(dataset, output), caption)]
         if dataset.sizes.get("index_round", 0) > 1:
@@ -200,17 +201,6 @@ def sobol_indices(results: Results) -> Iterator[Block]:
         yield Pictures.of(*pictures)
     caption = "Shares of the variance: parameters alone, and the rest."
     yield Pictures.of((plots.index_shares(dataset, results.drawn), caption))
-
-
-def sobol(results: Results, output: str) -> Table:
-    """Sobol' indices of an output, and what they are without the error of the mesh."""
-    leading = results.leading(results.of(output)["sobol_total"])
-    groups = map(str, results.dataset["group"].values if "group" in results.dataset.coords else ())
-    words = {"sobol_first": "first order", "sobol_total": "total"}
-    grouped = ("sobol_group_first", "sobol_group_total")
-    rows = [(name, *results.cells(list(words), {"output": output, "parameter": name})) for name in leading]
-    rows += [(f"group {name}", *results.cells(grouped, {"output": output, "group": name})) for name in groups]
-    return Table(("parameter", *results.heads(words)), rows)
 
 
 @section("field_sobol_first", heading="Displacement field", level=3)
@@ -250,8 +240,18 @@ def derivative_based(results: Results) -> Iterator[Block]:
     )
     for output in results.drawn:
         yield Heading(output, level=3)
-        yield bounds(results, output)
-        of = results.of(output)
+        of, rows = results.of(output), []
+        for name in results.parameters:
+            one = of.sel(parameter=name)
+            slope = per(results.unit(output), results.parameter_unit(name))
+            squared = with_unit(written(one, "dgsm"), slope if slope == "1" else f"({slope})²")
+            total = written(one, "sobol_total") if "sobol_total" in one else NONE
+            bound = results.cells(("total_bound",), {"output": output, "parameter": name})
+            share, constant = number(float(one["local_share"])), number(float(one["poincare"]))
+            rows.append((name, share, squared, constant, total, *bound))
+        head = ("parameter", "share of the local variance", "mean squared derivative", "Poincaré constant")
+        heads = results.heads({"total_bound": "is at most"})
+        yield Table((*head, "total index (expansion)", *heads), rows)
         rows = [(name, written(of.sel(parameter=name), "active_direction")) for name in results.parameters]
         yield Table(("parameter", "leading direction"), rows)
         values = zip(*(of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")), strict=True)
@@ -263,20 +263,3 @@ def derivative_based(results: Results) -> Iterator[Block]:
         yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), spectrum)
         caption = f"{output} against its leading direction: a curve if only that direction matters."
         yield Pictures.of((plots.active_summary(dataset, output), caption))
-
-
-def bounds(results: Results, output: str) -> Table:
-    """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
-    of_output = results.of(output)
-    rows = []
-    for name in results.parameters:
-        of = of_output.sel(parameter=name)
-        slope = per(results.unit(output), results.parameter_unit(name))
-        squared = with_unit(written(of, "dgsm"), slope if slope == "1" else f"({slope})²")
-        total = written(of, "sobol_total") if "sobol_total" in of else NONE
-        bound = results.cells(("total_bound",), {"output": output, "parameter": name})
-        share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
-        rows.append((name, share, squared, constant, total, *bound))
-    head = ("parameter", "share of the local variance", "mean squared derivative", "Poincaré constant")
-    bound = results.heads({"total_bound": "is at most"})
-    return Table((*head, "total index (expansion)", *bound), rows)

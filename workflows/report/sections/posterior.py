@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from forward.spec import ModelSpec
-    from workflows.studies.inversion import Inversion
+    from uq.inputs.distributions import Distribution
 
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
@@ -53,17 +52,34 @@ def measured_kind(of: xr.Dataset, study: Any) -> str:
 @section("alone_eigenvalue", "draw")
 def posterior(results: Results) -> Iterator[Block]:
     """The posterior of a few parameters for each data set."""
-    before, units = prior_densities(results.study), results.study.units_of("/")
+    from inverse.data.curves import steps_of
+
+    units = results.study.units_of("/")
+    known = dict(results.study.inputs.marginals)
+    if results.study.method.noise is not None:
+        known["noise"] = results.study.method.noise
+    before = {name: density_of(distribution) for name, distribution in known.items()}
     for one in first(results):
-        yield from begun(results, one)
-        yield Pairs.of(*amounts(one, one.sizes["direction"], results.study))
-        yield parameters(one, units)
+        yield from begun(results, one, one.sizes["direction"])
         if _part(one) == OUTPUT:
             yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
-            yield from _curves(one, results.study.model)
+            steps = steps_of(results.study.model)
+            seen = {str(case).rpartition(".")[0] for case in one.case.values}
+            names = [name for name in steps.units if name in seen] if steps is not None else []
+            if steps is not None and names:
+                drawn = [(measured_over_path(one, name, steps), f"{name}, measured and predicted.") for name in names]
+                yield Pictures.of(*drawn)
         yield Pictures.of(*pictures(one, before, units))
         names = [str(name) for name in one.parameter.values if name != "noise"]
-        yield from cases(one, *_widths(one, names, units))
+        sizes = {
+            name: scale(float(one["alone_std"].sel(parameter=name).median()), units.get(name, "1")) for name in names
+        }
+        widths = [
+            *one["alone_std"].sel(parameter=names).to_numpy(),
+            one["together_std"].sel(parameter=names).to_numpy(),
+        ]
+        shown = [[number(x / size, 2) for x, (size, _) in zip(row, sizes.values(), strict=True)] for row in widths]
+        yield from cases(one, [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()], shown)
         if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
             caption = (
                 f"How many times narrower each {_part(one)} alone makes what was known of each parameter "
@@ -79,23 +95,19 @@ def posterior(results: Results) -> Iterator[Block]:
         yield iterations(one)
 
 
-def _widths(one: xr.Dataset, names: list[str], units: Mapping[str, str]) -> tuple[list[str], list[list[str]]]:
-    """Return heads and rows of posterior widths: by each load case alone, then by all; a column in one unit."""
-    sizes = {name: scale(float(one["alone_std"].sel(parameter=name).median()), units.get(name, "1")) for name in names}
-    rows = [[of["alone_std"].sel(parameter=name) for name in names] for of in each_case(one)]
-    rows.append([one["together_std"].sel(parameter=name) for name in names])
-    heads = [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()]
-    return heads, [[_shown(x / sizes[n][0], 2) for n, x in zip(names, row, strict=True)] for row in rows]
+def begun(results: Results, one: xr.Dataset, directions: int, *more: tuple[str, str]) -> Iterator[Block]:
+    """Name a data set, with amounts, given the number of directions, and its parameters.
 
-
-def begun(results: Results, one: xr.Dataset) -> Iterator[Block]:
-    """Name a data set; of several, say whether it can be trusted, and show those that are not on the first screen."""
+    Of several, say whether it can be trusted, and show those that are not on the first screen.
+    """
     yield Heading(str(one.data_set.item()))
     if results.dataset.sizes["data_set"] > 1:
         yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
     shown = results.dataset.data_set.values[results.dataset["ok"]][0]
     if "stiffness_mean" in one and "cell_nodes" in one and one.data_set.item() != shown:
         yield specimen(one, results)
+    yield Pairs.of(*amounts(one, directions, results.study), *more)
+    yield parameters(one, results.study.units_of("/"))
 
 
 def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
@@ -168,25 +180,18 @@ def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[s
     return row
 
 
-def each_case(one: xr.Dataset) -> list[xr.Dataset]:
-    """Return the results of each load case."""
-    return [one.sel(case=case) for case in one.case.values]
-
-
 def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator[Block]:
     """Misfit of each load case, and widths from it alone, with their heads; all together in the last row."""
+    parts = [(str(case), one.sel(case=case), "alone_") for case in one.case.values]
     rows = []
-    for of, width in zip(each_case(one), widths, strict=False):
-        misfit = f"{_shown(of['misfit'])} of {_shown(of['misfit_degrees'])}"
-        seen = int((of["alone_eigenvalue"] > plots.SEEN).sum())
-        determined = _shown(of["alone_determined"], 3)
-        rows.append([str(of.case.item()), f"{int(of['misfit_count']):,}", misfit, str(seen), determined, *width])
-    together = ["all together", f"{int(one['misfit_count'].sum()):,}"]
-    together += [f"{_shown(one['misfit'].sum())} of {_shown(one['misfit_degrees'].sum())}"]
-    together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3), *widths[-1]]
+    for (name, of, alone), width in zip([*parts, ("all together", one, "")], widths, strict=True):
+        count, misfit, degrees = (float(of[f"misfit{end}"].sum()) for end in ("_count", "", "_degrees"))
+        seen = int((of[f"{alone}eigenvalue"] > plots.SEEN).sum())
+        determined = number(float(of[f"{alone}determined"]), 3)
+        rows.append((name, f"{int(count):,}", f"{number(misfit)} of {number(degrees)}", str(seen), determined, *width))
     yield Heading(f"{_part(one)}s".capitalize(), level=3)
     yield Text("The widths from each of them alone, with the model linearised at the mode.")
-    yield Table([_part(one), "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together])
+    yield Table([_part(one), "data", "|r|², expected", "directions with λ > 1", "determined", *head], rows)
 
 
 def directions(one: xr.Dataset) -> Table:
@@ -214,23 +219,13 @@ def iterations(one: xr.Dataset) -> Block:
     return Folded("Iterations of the search for the mode", [table], printed=False)
 
 
-def _shown(value: Any, digits: int = 4) -> str:
-    return number(float(value), digits)
-
-
-def prior_densities(study: Inversion) -> dict[str, plots.Density]:
-    """Curves (values, density) of the priors by the name of the parameter."""
-    known = dict(study.inputs.marginals)
-    if study.method.noise is not None:
-        known["noise"] = study.method.noise
+def density_of(distribution: Distribution) -> plots.Density:
+    """Return values and the density there of a prior."""
     z = np.linspace(-6, 6, 1201)
-    curves = {}
-    for name, distribution in known.items():
-        values, slopes = distribution.from_normal(z)
-        density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / np.maximum(slopes, 1e-300)
-        seen = np.exp(-(z**2) / 2) > 1e-7  # beyond, slopes of bounded distributions are rounding errors
-        curves[name] = values[seen], density[seen]
-    return curves
+    values, slopes = distribution.from_normal(z)
+    density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / np.maximum(slopes, 1e-300)
+    seen = np.exp(-(z**2) / 2) > 1e-7  # beyond, slopes of bounded distributions are rounding errors
+    return values[seen], density[seen]
 
 
 def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
@@ -245,19 +240,6 @@ def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
         unit = units.get(output, "1")
         rows.append((output, *misses(one.isel(datum=k), unit, largest[unit])))
     return Table(("output", *MISSES), rows)
-
-
-def _curves(one: xr.Dataset, spec: ModelSpec) -> Iterator[Block]:
-    """Draw measured curves over a path."""
-    from inverse.data.curves import steps_of
-
-    steps = steps_of(spec)
-    seen = {str(case).rpartition(".")[0] for case in one.case.values}
-    names = [name for name in steps.units if name in seen] if steps is not None else []
-    if steps is not None and names:
-        yield Pictures.of(
-            *((measured_over_path(one, name, steps), f"{name}, measured and predicted.") for name in names)
-        )
 
 
 def of_spectrum(one: xr.Dataset) -> tuple[Axes, str]:
@@ -307,22 +289,16 @@ def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[s
 def field_posterior(results: Results) -> Iterator[Block]:
     """The posterior of a field for each data set."""
     for one in first(results):
-        yield from begun(results, one)
-        yield Pairs.of(*amounts(one, one.sizes["node"], results.study), *more_amounts(one))
-        yield parameters(one, results.study.units_of("/"))
+        more = [("Hessian products", f"{int(one['products']):,}")]
+        if np.isfinite(one["stiffness_true"]).all():
+            inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
+            more.append(("true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"))
+        yield from begun(results, one, one.sizes["node"], *more)
         yield Pictures.of(*field_pictures(one))
-        alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
-        widths = [[number(float(width), 3)] for width in (*alone, one["stiffness_std"].mean())]
+        alone = [float(one["alone_stiffness_std"].sel(case=case).mean()) for case in one.case.values]
+        widths = [[number(width, 3)] for width in (*alone, float(one["stiffness_std"].mean()))]
         yield from cases(one, ["mean ± of ln stiffness"], widths)
         yield iterations(one)
-
-
-def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
-    """The cost of the search, and how often the interval contains the truth, if known."""
-    yield "Hessian products", f"{int(one['products']):,}"
-    if np.isfinite(one["stiffness_true"]).all():
-        inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
-        yield "true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"
 
 
 def field_pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:

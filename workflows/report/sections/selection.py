@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,31 @@ def evidences(results: Results) -> Iterator[Block]:
         "factors are those of Kass and Raftery. Probabilities say which candidate is true, if one is; the weights "
         "of stacking are those with which their mixture predicts left-out data best, whether or not one is true."
     )
-    yield _evidences(dataset)
+    order = ranking(dataset["log_evidence"])
+    of = {model: dataset.sel(model=model) for model in order}
+
+    def stacking(model: str) -> str:
+        share = single(of[model], "stacking")
+        return f"{with_error(100 * share.value, 100 * share.error)} %"
+
+    def sampled(model: str) -> str:
+        found = estimate_of(of[model], "nested_log_evidence")
+        return with_error(float(np.nansum(found.value)), float(np.sqrt(np.nansum(found.error**2))))
+
+    columns: dict[str, Callable[[str], str]] = {
+        "model": str,
+        "ln Z": lambda model: written(of[model], "log_evidence"),
+        "by Laplace alone": lambda model: number(float(of[model]["laplace_log_evidence"].sum()), 6),
+        "ln of the first's Bayes factor": lambda model: (
+            "" if model == order[0] else with_error(*bayes_factor(dataset, order[0], model))
+        ),
+        "which is": lambda model: "" if model == order[0] else grade(bayes_factor(dataset, order[0], model)[0]),
+        "before": lambda model: f"{number(100 * float(of[model]['prior_probability']), 3)} %",
+        "P(model | data)": lambda model: f"{number(100 * float(of[model]['probability']), 4)} %",
+        **({"stacking": stacking} if "stacking" in dataset else {}),
+        **({"ln Z by nested sampling": sampled} if "nested_log_evidence" in dataset else {}),
+    }
+    yield replace(Table.of(order, columns, text={0, 4}), strong=0)
     yield Pictures.of(
         (plots.evidence_bars(dataset), "ln Z minus that of the most probable model, with three standard errors."),
         (plots.probability_bars(dataset), "Probability of each model, and with other errors, data and priors."),
@@ -61,42 +86,6 @@ def evidences(results: Results) -> Iterator[Block]:
     )
 
 
-def _evidences(dataset: xr.Dataset) -> Table:
-    """Evidence, Bayes factor and probability of each model, nested sampling beside it."""
-    order = ranking(dataset["log_evidence"])
-    nested, stacked = "nested_log_evidence" in dataset, "stacking" in dataset
-    of = {model: dataset.sel(model=model) for model in order}
-
-    def stacking(model: str) -> str:
-        share = single(of[model], "stacking")
-        return f"{with_error(100 * share.value, 100 * share.error)} %"
-
-    def sampled(model: str) -> str:
-        found = estimate_of(of[model], "nested_log_evidence")
-        return with_error(float(np.nansum(found.value)), float(np.sqrt(np.nansum(found.error**2))))
-
-    return replace(
-        Table.of(
-            order,
-            {
-                "model": str,
-                "ln Z": lambda model: written(of[model], "log_evidence"),
-                "by Laplace alone": lambda model: number(float(of[model]["laplace_log_evidence"].sum()), 6),
-                "ln of the first's Bayes factor": lambda model: (
-                    "" if model == order[0] else with_error(*bayes_factor(dataset, order[0], model))
-                ),
-                "which is": lambda model: "" if model == order[0] else grade(bayes_factor(dataset, order[0], model)[0]),
-                "before": lambda model: f"{number(100 * float(of[model]['prior_probability']), 3)} %",
-                "P(model | data)": lambda model: f"{number(100 * float(of[model]['probability']), 4)} %",
-                **({"stacking": stacking} if stacked else {}),
-                **({"ln Z by nested sampling": sampled} if nested else {}),
-            },
-            text={0, 4},
-        ),
-        strong=0,
-    )
-
-
 @section("probability", heading="What the evidences depend on")
 def dependence(results: Results) -> Iterator[Block]:
     """Evidences with other errors, other data and other priors."""
@@ -105,9 +94,8 @@ def dependence(results: Results) -> Iterator[Block]:
         "standard normal coordinates)."
     )
     dataset = results.dataset
-    models = [str(model) for model in dataset.model.values]
+    models, names = ([str(name) for name in dataset[over].values] for over in ("model", "variant"))
     chances = dataset["variant_probability"].transpose("variant", "model").to_numpy()
-    names = [str(variant) for variant in dataset.variant.values]
     yield Table(("", *models), [(n, *(percent(float(p)) for p in row)) for n, row in zip(names, chances, strict=True)])
     of = [[dataset.sel(model=model, variant=name) for name in names] for model in models]  # models have longer names
     rows = [(model, *(written(o, "variant_log_evidence") for o in row)) for model, row in zip(models, of, strict=True)]
@@ -176,56 +164,36 @@ def averaged_candidates(results: Results) -> Iterator[Block]:
 def constants(results: Results) -> Iterator[Block]:
     """Constants of the models: posteriors and priors."""
     dataset, study = results.dataset, results.study
-    yield posteriors(results)
+    rows = []
+    for model, group, name in product(map(str, dataset.model.values), dataset.group.values, dataset.parameter.values):
+        one = dataset.sel(model=model, group=group, parameter=name)
+        if np.isfinite(float(one["constant_mode"])):
+            unit, like = results.parameter_unit(str(name), model), float(one["constant_mean"])
+            values = (
+                *(one[f"constant_{which}"] for which in ("mode", "mean", "std")),
+                *one["constant_quantiles"].values,
+            )
+            rows.append((model, str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
+    head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
+    yield Table(head, rows, text={0, 1, 2})
     several, best = dataset.sizes["group"] > 1, by_probability(dataset, dataset["log_evidence"])[0]
     yield Heading("Posteriors of the constants" + (f" of {best}" if several else ""), level=3)
-    pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
-    yield Pictures.of(
-        *(
-            (plots.corner(dataset, model, group, study.units_of(model)), f"{model}{f' ({group})' if several else ''}")
-            for model, group in pairs
-            if not several or model == best
-        )
-    )
+    drawn = []
+    for model, group in product(map(str, dataset.model.values), map(str, dataset.group.values)):
+        if not several or model == best:
+            ax = plots.corner(dataset, model, group, study.units_of(model))
+            drawn.append((ax, f"{model}{f' ({group})' if several else ''}"))
+    yield Pictures.of(*drawn)
     yield Heading("Candidates and priors", level=3)
-    yield Table.of(
-        [
-            (name, constant, prior)
-            for name, one in study.candidates.items()
-            for constant, prior in one.parameters.items()
-        ],
-        {
-            "candidate": lambda one: one[0],
-            "model": lambda one: study.described(one[0]),
-            "constant": lambda one: one[1],
-            "prior": lambda one: law(one[2].model_dump()),
-            "unit": lambda one: results.parameter_unit(one[1], one[0]),
-        },
-        text=range(5),
-    )
+    rows = [
+        (name, study.described(name), constant, law(prior.model_dump()), results.parameter_unit(constant, name))
+        for name, one in study.candidates.items()
+        for constant, prior in one.parameters.items()
+    ]
+    yield Table(("candidate", "model", "constant", "prior", "unit"), rows, text=range(5))
     if study.data.source:
         yield Heading("Data", level=3)
         yield Text("\n".join(study.data.source))
-
-
-def posteriors(results: Results) -> Table:
-    """Posterior of every constant."""
-    dataset = results.dataset
-    rows = []
-    for model in dataset.model.values:
-        for group in dataset.group.values:
-            one = dataset.sel(model=model, group=group)
-            for name in dataset.parameter.values:
-                of_name = one.sel(parameter=name)
-                if np.isnan(float(of_name["constant_mode"])):
-                    continue
-                unit = results.parameter_unit(str(name), str(model))
-                low, high = of_name["constant_quantiles"].values
-                values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
-                like = float(of_name["constant_mean"])
-                rows.append((str(model), str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
-    head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
-    return Table(head, rows, text={0, 1, 2})
 
 
 @section("probability", heading="Is the best one good?")
@@ -258,14 +226,11 @@ def held_out(results: Results) -> Iterator[Block]:
     """Whole tests, predicted from the others."""
     yield Text("Whole tests, predicted from the others: ln of the density of all data in the test.")
     dataset = results.dataset
-    scores, errors = dataset["held_out_score"], dataset["held_out_score_error"]
     rows = []
-    for model in ranking(scores.sum("left_out")):
-        cells = [
-            with_error(float(value), float(error))
-            for value, error in zip(scores.sel(model=model).values, errors.sel(model=model).values, strict=True)
-        ]
-        total = with_error(float(scores.sel(model=model).sum()), float(np.sqrt((errors.sel(model=model) ** 2).sum())))
+    for model in ranking(dataset["held_out_score"].sum("left_out")):
+        scores = estimate_of(dataset.sel(model=model), "held_out_score")
+        cells = (with_error(*of) for of in zip(scores.value.tolist(), scores.error.tolist(), strict=True))
+        total = with_error(float(scores.value.sum()), float(np.sqrt((scores.error**2).sum())))
         rows.append((model, *cells, total))
     yield Table(("model", *map(str, dataset.left_out.values), "sum"), rows)
 
