@@ -78,13 +78,7 @@ def _kept(path: Path) -> Draws:
 
 
 class Left:
-    """What a finished study has left in a directory; a ValueError says in one line what is not there.
-
-    Parameters
-    ----------
-    file
-        The directory, or results.nc in it.
-    """
+    """What a finished study has left in a directory; a ValueError says in one line what is not there."""
 
     def __init__(self, file: str | Path) -> None:
         path = Path(file)
