@@ -17,13 +17,7 @@ LARGEST = 1 << 20  # bytes of a message, if the system has as much room
 
 
 class Mail:
-    """One end of a line between two processes of this program; what comes in is trusted.
-
-    Parameters
-    ----------
-    end
-        Of a pair of sockets.
-    """
+    """One end of a line between two processes of this program, of a pair of sockets; what comes in is trusted."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end

@@ -62,15 +62,19 @@ def still(scene: Scene, quantity: Quantity) -> Figure:
         of_faces = values[:, 0] if quantity.names else values.mean(axis=1)
     rgb = np.where(np.isfinite(of_faces)[:, None], colours(norm(np.nan_to_num(of_faces)))[:, :3], _rgb(STILL))
     inner = [inside for inside in scene.insides if inside.shown and len(inside.triangles)]
-    equal = _equal(scene, quantity)
-    hidden = bool(len(equal[1])) or any(inside.kind == "inside" for inside in inner)
+    at, between = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    if scene.cut == "v" and quantity is scene.quantities[0]:  # the viewer begins with where it is half-way
+        low, high = ends(quantity)
+        above = quantity.values - (low + HALF * (high - low))
+        four = tetrahedra(scene.cells, scene.kind)
+        at, between = crossing(scene.points, np.where(above == 0, 1e-300, above), four)
+    hidden = bool(len(between)) or any(inside.kind == "inside" for inside in inner)
     faces = []
     for inside in inner:
-        at = (moved if inside.points is None else inside.points) @ view.T
+        nodes = (moved if inside.points is None else inside.points) @ view.T
         paints = np.tile(_rgb(COLOURS[inside.kind]), (len(inside.triangles), 1))
-        faces.append(_faces(at, inside.triangles, paints, inside.opacity, culled=False))
-    if len(equal[1]):
-        at, between = equal
+        faces.append(_faces(nodes, inside.triangles, paints, inside.opacity, culled=False))
+    if len(between):
         faces.append(_faces(at @ view.T, between, np.tile(colours(HALF)[:3], (len(between), 1)), 1.0, culled=False))
     faces.append(_faces(moved @ view.T, triangles, rgb, TRANSPARENT if hidden else 1.0, culled=True))
     # From far to near; a transparent skin is in front of what is inside.
@@ -146,15 +150,6 @@ def _painted(
     drawn.set_label(label, fontsize=8)
     drawn.ax.tick_params(labelsize=8)
     return figure, drawn
-
-
-def _equal(scene: Scene, quantity: Quantity) -> tuple[FloatArray, IntArray]:
-    """Return the surface inside the body that the viewer begins with, if it does: where its quantity is half-way."""
-    if scene.cut != "v" or quantity is not scene.quantities[0]:
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    low, high = ends(quantity)
-    above = quantity.values - (low + HALF * (high - low))
-    return crossing(scene.points, np.where(above == 0, 1e-300, above), tetrahedra(scene.cells, scene.kind))
 
 
 def _rgb(colour: str) -> FloatArray:

@@ -21,7 +21,7 @@ from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
-from workflows.report.section import SECTIONS, Results, Section, sections
+from workflows.report.section import SECTIONS, Results, sections
 from workflows.results.directory import read_dataset, read_summary
 from workflows.run import own_code
 
@@ -50,11 +50,16 @@ def write_report(directory: Path, *, code: bool = False) -> Path:
         parts: Parts = []
         for name, section in sections(asked):
             try:
-                found = _made(name, section, results)
+                found = list(section.content(results)) if section.applies(results) else None
             except OwnCodeError:
                 left_out.append(name)
-            else:
-                parts += [] if found is None else [(name, found)]
+                continue
+            except Exception as error:  # the rest of the report survives a failing one from outside
+                if name in SECTIONS.own:
+                    raise
+                said = f"This section could not be made: {type(error).__name__}: {error}"
+                found = [Heading(name), Text(said, "error")]
+            parts += [] if found is None else [(name, found)]
     if left_out:
         asked_for = f" ({', '.join(dict.fromkeys(refusals))})" if refusals else ""
         said = f"left out, since they need code that is not installed{asked_for}: {', '.join(left_out)}; --code runs it"
@@ -113,18 +118,6 @@ def _asked(directory: Path) -> Report | None:
         raise StudyError(f"{directory / 'study.toml'}: not valid TOML: {error}") from None
     except ValidationError as error:
         raise StudyError(*lines(error, "report")) from None
-
-
-def _made(name: str, section: Section, results: Results) -> list[Block] | None:
-    """Return the blocks of a section, if it applies; the rest of the report survives a failing one from outside."""
-    try:
-        return list(section.content(results)) if section.applies(results) else None
-    except OwnCodeError:
-        raise
-    except Exception as error:
-        if name in SECTIONS.own:
-            raise
-        return [Heading(name), Text(f"This section could not be made: {type(error).__name__}: {error}", "error")]
 
 
 def _read(directory: Path, refusals: list[str]) -> Results:

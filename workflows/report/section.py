@@ -24,7 +24,6 @@ from uq.estimators.estimate import PARTS, holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
 from workflows.report.blocks import Block, Heading, Level, Table
-from workflows.report.words import solves
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,11 +134,6 @@ class Results:
     def parameter_unit(self, path: str, label: str = "/") -> str:
         """SI unit of a number of the model of some evaluations, by its path; "1" for other names."""
         return str(self.study.units_of(label).get(path, "1"))
-
-    @property
-    def solves(self) -> int:
-        """Number of solves."""
-        return solves(self.summary)
 
 
 def written(of: Mapping[Any, Any], name: str, unit: str = "1") -> str:

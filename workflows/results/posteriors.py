@@ -6,7 +6,7 @@ import io
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -61,14 +61,7 @@ def read(file: str, group: str | None, model: str | None) -> Draws:
 def to_file(draws: Draws) -> bytes:
     """Return the content of a file of draws."""
     file = io.BytesIO()
-    np.savez(
-        file,
-        names=np.array(draws.names),
-        values=draws.values,
-        weights=draws.weights,
-        effective=draws.effective,
-        digest=draws.digest,
-    )
+    np.savez(file, **asdict(draws))
     return file.getvalue()
 
 
@@ -85,13 +78,7 @@ def _kept(path: Path) -> Draws:
 
 
 class Left:
-    """What a finished study has left in a directory; a ValueError says in one line what is not there.
-
-    Parameters
-    ----------
-    file
-        The directory, or results.nc in it.
-    """
+    """What a finished study has left in a directory; a ValueError says in one line what is not there."""
 
     def __init__(self, file: str | Path) -> None:
         path = Path(file)

@@ -174,16 +174,10 @@ def _number(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class _Told:
-    """Variables of results of which the summary holds every number, with what is known of its errors.
+    """Variables of results of which the summary holds every number under a key, with what is known of its errors.
 
-    Attributes
-    ----------
-    key
-        Where, in summary.json.
-    variables
-        Of the same dimensions, by their names there; one that is `ALONE` stands without a name, and without errors.
-    needs
-        Variables that must be there; otherwise all. Of the others those are told that are there.
+    They are of the same dimensions, by their names there; one that is `ALONE` stands without a name, and without
+    errors. Those that it `needs` must be there, otherwise all.
     """
 
     key: str

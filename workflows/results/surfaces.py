@@ -50,44 +50,26 @@ def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
 def surface(tool: Indenter, points: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return points (n, 3) and triangles (t, 3) of the surface of a tool at its depth: where the distance is zero.
 
-    Parameters
-    ----------
-    points
-        Points (n, 3) of the body (m); tools without end are drawn as far as it reaches.
+    Tools without end are drawn as far as the body reaches, which has these points (n, 3) (m).
     """
-    if tool.shape != "plane":
-        return level(tool.gaps, *around(tool, points), POINTS)
-    centre, extent = middle(tool, points)
-    d = np.array(tool.along)
-    one = np.cross(d, np.eye(3)[int(np.abs(d).argmin())])
-    one *= 0.55 * extent / np.linalg.norm(one)
-    other = np.cross(d, one) / np.linalg.norm(d)
-    corners = centre + np.array([one + other, other - one, -one - other, one - other])
-    return corners, np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def middle(tool: Indenter, points: FloatArray) -> tuple[FloatArray, float]:
-    """Return where (3,) a plane at its depth is nearest to the middle of points (n, 3), and how far these reach (m)."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    d = np.array(tool.along)
-    tip = np.array(tool.at) + tool.depth * d
-    return tip + (np.eye(3) - np.outer(d, d)) @ ((low + high) / 2 - tip), float((high - low).max())
-
-
-def around(tool: Indenter, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the corners (3,) of a box around the part of a tool, at its depth, that is drawn beside points (n, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent, d = float((high - low).max()), np.array(tool.along)
-    tip = np.array(tool.at) + tool.depth * d
+    tip, middle = np.array(tool.at) + tool.depth * d, (low + high) / 2
+    if tool.shape == "plane":
+        centre = tip + (np.eye(3) - np.outer(d, d)) @ (middle - tip)
+        one = np.cross(d, np.eye(3)[int(np.abs(d).argmin())])
+        one *= 0.55 * extent / np.linalg.norm(one)
+        other = np.cross(d, one) / np.linalg.norm(d)
+        corners = centre + np.array([one + other, other - one, -one - other, one - other])
+        return corners, np.array([[0, 1, 2], [0, 2, 3]])
     half = min(1.2 * (tool.radius or np.inf), SHOWN * extent)
-    ahead = 0.05 * half
     lengths = np.full(3, half)
     if tool.axis is not None:  # it is longer than the body
         along = np.abs(tool.axis) / np.linalg.norm(tool.axis)
         lengths = np.maximum(lengths, along * (extent / 2 + 0.2 * half))
-        tip = tip + np.outer(tool.axis, tool.axis) @ ((low + high) / 2 - tip) / np.dot(tool.axis, tool.axis)
-    centre = tip - (half - ahead) * d
-    return centre - lengths, centre + lengths
+        tip = tip + np.outer(tool.axis, tool.axis) @ (middle - tip) / np.dot(tool.axis, tool.axis)
+    centre = tip - (half - 0.05 * half) * d
+    return level(tool.gaps, centre - lengths, centre + lengths, POINTS)
 
 
 def tool_grid(tool: Indenter, points: FloatArray) -> Grid:

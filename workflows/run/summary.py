@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,8 @@ from workflows.run.version import commit, versions
 if TYPE_CHECKING:
     import xarray as xr
 
+    from uq.evaluation.request import Evaluations
+    from uq.evaluation.tasks import Outcome
     from workflows.studies.job import Job
     from workflows.studies.study import StudyKind
 
@@ -29,7 +32,8 @@ def summarised(
     """Return the contents of summary.json: the study, its results, their cost, and the versions that made them."""
     from forward.model import WORK
 
-    every, done = job.evaluations.values(), _counts(study, job)
+    evaluations = job.evaluations
+    every, done = evaluations.values(), _counts(study, evaluations, job.outcomes)
     seconds = sum(one.seconds for one in job.outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
     stability, joined = failure_domain.counts(every), failure_domain.joined_counts(every)
@@ -63,9 +67,9 @@ def summarised(
     }
 
 
-def _counts(study: StudyKind, job: Job) -> dict[str, Any]:
+def _counts(study: StudyKind, evaluations: Mapping[str, Evaluations], outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Number of solves, or of data sets that were inverted side by side, and which failed."""
-    evaluations, outcomes, explains = job.evaluations, job.outcomes, study.explains
+    explains = study.explains
     solves = [(label, failure) for label, found in evaluations.items() for failure in found.failures]
     failures: list[dict[str, Any]] = [
         {"parameters": {"data_set": float(k)}, "reason": one.reason}

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.readable import named
 from uq.estimators.estimate import estimate_of, holds, single
@@ -101,8 +100,13 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
             moved = density * np.diff(edges.value) / widths
             ax.stairs(moved, edges.corrected, color=DARK, linewidth=1, label="corrected for the mesh")
     else:
-        values = one["values"].to_numpy()[dataset["ok"].to_numpy()]
-        bins = _bins(values) if np.ptp(values) > 1e-12 * np.abs(values).max() else 1
+        values, bins = one["values"].to_numpy()[dataset["ok"].to_numpy()], 1
+        if (
+            np.ptp(values) > 1e-12 * np.abs(values).max()
+        ):  # as of NumPy's "auto", but no more: one outlier makes millions
+            width = 2 * np.subtract(*np.percentile(values, [75, 25])) / len(values) ** (1 / 3)
+            fewest = np.log2(len(values)) + 1
+            bins = int(np.ceil(min(max(fewest, np.ptp(values) / width if width > 0 else 0), MOST_BINS)))
         ax.hist(values, bins=bins, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
     mean = single(one, "mean")
     ax.axvline(mean.value, color=DARK, label="mean")
@@ -115,14 +119,6 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     unit = str(one["unit"].item())
     density_of = "density" if unit == "1" else f"density (1/{unit})"
     return finished(ax, quantity(dataset, output), density_of, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
-
-
-def _bins(values: NDArray[np.float64]) -> int:
-    """Return the number of bins of NumPy's "auto", but no more than can be drawn: one outlier makes millions."""
-    quarter, three_quarters = np.percentile(values, [25, 75])
-    width = 2 * (three_quarters - quarter) / len(values) ** (1 / 3)
-    fewest = np.log2(len(values)) + 1
-    return int(np.ceil(min(max(fewest, np.ptp(values) / width if width > 0 else 0), MOST_BINS)))
 
 
 def comparison(

@@ -159,7 +159,7 @@ def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     widths = np.vstack([one["alone_std"].sel(parameter=names), one["together_std"].sel(parameter=names).values[None]])
     factors = np.maximum(before / widths, 1.0)
     shades = np.log(factors) / max(np.log(factors.max()), np.log(LEAST))
-    parts = [*(str(case) for case in one.case.values), "all together"]
+    parts = [*map(str, one.case.values), "all together"]
     ax = ax or axes(height=1.6 + 0.32 * len(parts), width=max(5.4, 1.6 + 0.85 * len(names)))
     ax.imshow(shades, cmap="Blues", vmin=0, vmax=1.1, aspect="auto")
     for (i, j), factor in np.ndenumerate(factors):

@@ -110,6 +110,15 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
     """Return the scene of a body that was deformed by its loads; with `every` parameter, not only the strongest."""
     points, cells, kind = _mesh(dataset)
     mean = "field_mean" if "field_mean" in dataset else "field_nominal"
+    insides = list(_regions(dataset, points, cells, kind))
+    if study is not None and "parameter" in dataset.coords:  # inclusions where they were before the body moved
+        names, means = [str(name) for name in dataset["parameter"].values], dataset["parameter_mean"].to_numpy()
+        box = points.min(axis=0), points.max(axis=0)
+        inclusions = [one for body in study.model.bodies for one in body.inclusions]
+        insides += [Inside(one.label, *_ball(one, names, box, means), "inside") for one in inclusions]
+    for tool in tools_of(dataset):
+        at, triangles = surface(tool, points)
+        insides.append(Inside(f"tool {tool.label}", triangles, at, "tool", 0.5))
     return Scene(
         points,
         cells,
@@ -117,7 +126,7 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
         up_of(dataset),
         dataset[mean].to_numpy(),
         list(_quantities(dataset, mean, every=every)),
-        [*_regions(dataset, points, cells, kind), *_inclusions_of(dataset, study, points), *_tools(dataset, points)],
+        insides,
         sliders=None if study is None else sliders(dataset, study),
         motion_name="its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters",
     )
@@ -293,22 +302,6 @@ def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> 
             name = str(of["region"].values[k]) if k >= 0 else "the rest"
             own = skin(points, cells[numbers == k], kind)
             yield Inside(f"region {name}", own.nodes[own.triangles], None, "inside")
-
-
-def _tools(of: xr.Dataset, points: FloatArray) -> Iterator[Inside]:
-    for tool in tools_of(of):
-        at, triangles = surface(tool, points)
-        yield Inside(f"tool {tool.label}", triangles, at, "tool", 0.5)
-
-
-def _inclusions_of(of: xr.Dataset, study: Any, points: FloatArray) -> Iterator[Inside]:
-    """Inclusions of a deformed body, with the means of what is random; where they were before it moved."""
-    if study is None or "parameter" not in of.coords:
-        return
-    names, means = [str(name) for name in of["parameter"].values], of["parameter_mean"].to_numpy()
-    box = points.min(axis=0), points.max(axis=0)
-    for inclusion in (one for body in study.model.bodies for one in body.inclusions):
-        yield Inside(inclusion.label, *_ball(inclusion, names, box, means), "inside")
 
 
 def _ball(

@@ -41,7 +41,7 @@ def skin(points: FloatArray, cells: IntArray, kind: int) -> Skin:
     """Return the surface of cells (c, k) of a kind of VTK, with nodes (n, 3)."""
     if not len(cells):
         none = np.zeros((0, 3), dtype=np.int64)
-        return Skin(none, np.zeros(0, dtype=np.int64), none[:, :2])
+        return Skin(none, none[:, 0], none[:, :2])
     return split(points, outer(cells, faces(points, cells, kind))[0])
 
 

@@ -96,12 +96,10 @@ def turning(scene: Scene, label: str, also: str = "") -> Viewer:
     from workflows.report.bodies import still
     from workflows.report.scene.scene import packed
 
-    told, data = packed(scene)
-    stills = []
-    for k, quantity in enumerate(scene.quantities[:STILLS]):
-        caption = quantity.name + (f", {also}." if also and not k else ".")
-        stills.append(Picture.painted(still(scene, quantity), caption))
-    return Viewer(label, told, data, Pictures(stills))
+    shown = scene.quantities[:STILLS]
+    captions = [f"{of.name}, {also}." if also and of is shown[0] else f"{of.name}." for of in shown]
+    stills = [Picture.painted(still(scene, of), words) for of, words in zip(shown, captions, strict=True)]
+    return Viewer(label, *packed(scene), Pictures(stills))
 
 
 def largest(dataset: xr.Dataset) -> str:

@@ -12,7 +12,7 @@ from forward.readable import NONE, duration, number, settings, size, with_unit
 from uq import findings as of_results
 from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text
 from workflows.report.section import Results, section
-from workflows.report.words import counted, joined, law, stability
+from workflows.report.words import counted, joined, law, solves, stability
 
 if TYPE_CHECKING:
     from workflows.studies.sampling import Study
@@ -26,9 +26,9 @@ def header(results: Results) -> Iterator[Block]:
     yield Text(str(type(results.study.method).__doc__).partition("\n")[0].replace("`", ""), "lead")
     sets, failed = len(summary.get("data_sets", ())), f"{summary['failed']:,} failed"
     if sets > 1:
-        yield Text(f"{sets} data sets, {failed}; {counted(results.solves)}")
+        yield Text(f"{sets} data sets, {failed}; {counted(solves(results.summary))}")
     else:
-        yield Text(f"{summary['stopped']}; {counted(results.solves)}, {failed}")
+        yield Text(f"{summary['stopped']}; {counted(solves(results.summary))}, {failed}")
 
 
 NOTES = 2  # that are read at once
@@ -117,7 +117,7 @@ def failures(results: Results) -> Iterator[Block]:
     if not listed:
         yield Text("None failed.")
         return
-    line = f"{failed:,} of {counted(results.solves)} failed."
+    line = f"{failed:,} of {counted(solves(results.summary))} failed."
     yield Text(line if listed == failed else f"{line} These are the first {listed}; evaluations.h5 holds all.")
     found = results.summary["failures"]
     every = dict.fromkeys(name for failure in found for name in failure["parameters"])
@@ -135,7 +135,7 @@ def failures(results: Results) -> Iterator[Block]:
 @section(heading="Run time")
 def run_time(results: Results) -> Iterator[Block]:
     """What the study took."""
-    summary, count = results.summary, max(results.solves, 1)
+    summary, count = results.summary, max(solves(results.summary), 1)
     cpu, work = summary["cpu_seconds"], summary["work"].items()
     told = {
         "wall time": f"{duration(summary['wall_seconds'])} (of the run that finished the study)",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,12 +35,11 @@ def total_errors(results: Results) -> Iterator[Block]:
     """Errors of means and standard deviations by source."""
     yield Text("The error of the mesh is estimated from the differences between meshes.")
     rows = []
-    for output in results.outputs:
+    for output, (name, word) in product(results.outputs, WORDS.items()):
         of_output = results.of(output)
-        for name, word in WORDS.items():
-            one, bias = single(of_output, name), "bias_error" if name == "mean" else "std_bias_error"
-            errors = (one.error, float(of_output[bias]), one.total)
-            rows.append((f"{word} of {output}", *(margin(error, results.unit(output)) for error in errors)))
+        one, bias = single(of_output, name), "bias_error" if name == "mean" else "std_bias_error"
+        errors = (one.error, float(of_output[bias]), one.total)
+        rows.append((f"{word} of {output}", *(margin(error, results.unit(output)) for error in errors)))
     yield Table(("estimate", "sampling", "mesh", "total"), rows)
 
 
@@ -255,11 +254,9 @@ def derivative_based(results: Results) -> Iterator[Block]:
         rows = [(name, written(of.sel(parameter=name), "active_direction")) for name in results.parameters]
         yield Table(("parameter", "leading direction"), rows)
         values = zip(*(of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")), strict=True)
-        whole = max(float(of["active_eigenvalue"].sum()), 1e-300)
-        spectrum = [
-            (str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole))
-            for i, (value, lower, upper) in enumerate(values, start=1)
-        ]
-        yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), spectrum)
+        whole, rows = max(float(of["active_eigenvalue"].sum()), 1e-300), []
+        for i, (value, lower, upper) in enumerate(values, start=1):
+            rows.append((str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole)))
+        yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), rows)
         caption = f"{output} against its leading direction: a curve if only that direction matters."
         yield Pictures.of((plots.active_summary(dataset, output), caption))

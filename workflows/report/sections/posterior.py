@@ -230,15 +230,14 @@ def density_of(distribution: Distribution) -> plots.Density:
 
 def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Measurements of each output, and predictions with the most probable parameters."""
-    rows = []
-    known = np.flatnonzero(np.isfinite(one["measured"].to_numpy()))
-    outputs = [str(one.case.values[k]) for k in one["datum_case"].to_numpy()[known].astype(int)]
+    here = one.isel(datum=np.isfinite(one["measured"].to_numpy()))
+    outputs = [str(one.case.values[k]) for k in here["datum_case"].to_numpy().astype(int)]
+    of = [units.get(output, "1") for output in outputs]
     largest: dict[str, float] = {}  # by unit: a column of one quantity is read in one unit
-    for output, value in zip(outputs, np.abs(one["measured"].to_numpy()[known]).tolist(), strict=True):
-        largest[units.get(output, "1")] = max(value, largest.get(units.get(output, "1"), 0.0))
-    for k, output in zip(known, outputs, strict=True):
-        unit = units.get(output, "1")
-        rows.append((output, *misses(one.isel(datum=k), unit, largest[unit])))
+    for unit, value in zip(of, np.abs(here["measured"].to_numpy()).tolist(), strict=True):
+        largest[unit] = max(value, largest.get(unit, 0.0))
+    each = enumerate(zip(outputs, of, strict=True))
+    rows = [(output, *misses(here.isel(datum=k), unit, largest[unit])) for k, (output, unit) in each]
     return Table(("output", *MISSES), rows)
 
 

@@ -242,24 +242,24 @@ def curves(results: Results) -> Iterator[Block]:
     tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
     if dataset.attrs["quantity"] == "stress":
         yield Heading("Curves over the data")
-        several = dataset.sizes["group"] > 1
-        captions = [f"{test}{f' of {group}' if several else ''}: mean and 90 % band." for group, test in tests]
-        drawn = [plots.curves(dataset, str(group), str(test)) for group, test in tests]
-        yield Pictures.of(*zip(drawn, captions, strict=True), small=True)
+        several, drawn = dataset.sizes["group"] > 1, []
+        for group, test in tests:
+            caption = f"{test}{f' of {group}' if several else ''}: mean and 90 % band."
+            drawn.append((plots.curves(dataset, str(group), str(test)), caption))
+        yield Pictures.of(*drawn, small=True)
         return
     paths = dict(_paths(results, [str(test) for _, test in tests]))
     if paths:
         yield Heading("Curves over the data")
-        captions = [f"{name} over the path: mean and 90 % band of each model." for name in paths]
-        drawn = [plots.along(dataset, *of) for of in paths.values()]
-        yield Pictures.of(*zip(drawn, captions, strict=True))
+        words = "over the path: mean and 90 % band of each model."
+        yield Pictures.of(*((plots.along(dataset, *of), f"{name} {words}") for name, of in paths.items()))
     on_paths = {test for places, *_ in paths.values() for test in places}
     left = [str(test) for _, test in tests if str(test) not in on_paths]
     if left:
         yield Heading("Residuals")
-        captions = [f"{test}: measured minus predicted, over the errors." for test in left]
-        drawn = [plots.residuals(dataset, test, of=study.measured_in(test)) for test in left]
-        yield Pictures.of(*zip(drawn, captions, strict=True), small=True)
+        words = "measured minus predicted, over the errors."
+        drawn = [(plots.residuals(dataset, test, of=study.measured_in(test)), f"{test}: {words}") for test in left]
+        yield Pictures.of(*drawn, small=True)
 
 
 def _paths(results: Results, tests: list[str]) -> Iterator[tuple[str, tuple[dict[str, float], str, str]]]:
