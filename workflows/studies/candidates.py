@@ -20,7 +20,6 @@ from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
-from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.findings import Finding
@@ -116,7 +115,7 @@ class ModelCandidate(CandidateBlock):
                 yield from mistakes_of_materials(self.restricted(spec), materials)
 
 
-class OfCandidates(StudyKind):
+class OfCandidates(Settings):
     """A study of candidates that each change one model, or are materials without one.
 
     Parameters
@@ -155,16 +154,12 @@ class OfCandidates(StudyKind):
             yield from spec.findings_over(ranges(self.candidates[name].parameters))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns of a candidate, or of the one model."""
-        if self.candidates is None:
-            return super().parameters_of(label)
+        """Names of the unknowns of a candidate."""
         found: tuple[str, ...] = self.candidates[label.partition("/")[0]].inputs.names
         return found
 
     def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of a candidate's model, or of the one model."""
-        if self.candidates is None:
-            return super().units_of(label)
+        """SI units of the numbers of a candidate's model."""
         name, _, _ = label.partition("/")
         found: dict[str, str] = self.candidates[name].units(self.of_candidates.get(name))
         return found

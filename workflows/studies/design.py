@@ -31,6 +31,7 @@ from workflows.run.from_python import FromPython
 from workflows.studies.candidates import ModelCandidate, OfCandidates
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +51,7 @@ PRODUCTS = 600  # with the derivative, for the directions of a field that many c
 SIDES = {f"{axis}-{side}": (k, end) for k, axis in enumerate(AXES) for side, end in (("min", 0), ("max", -1))}
 
 
-class DesignStudy(Sourced, OfCandidates, FromPython):
+class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
     """What could be observed, and how much of it.
 
     Parameters
@@ -166,6 +167,14 @@ class DesignStudy(Sourced, OfCandidates, FromPython):
 
         makers = {one: partial(made, one) for one in others}
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the unknowns, of a candidate if there are some."""
+        return self.inputs.names if self.candidates is None else super().parameters_of(label)
+
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of the numbers of the model, or of that of a candidate."""
+        return StudyKind.units_of(self, label) if self.candidates is None else super().units_of(label)
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""

@@ -19,7 +19,7 @@ from workflows.config.priors import findings_of_materials, mistakes_of_factor, r
 from workflows.run.from_python import FromPython
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.predictions import has_mesh, meshes_of
-from workflows.studies.study import Sampled
+from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
     from forward.spec import ModelSpec
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
-class Inversion(InversionBlocks, FromPython):
+class Inversion(InversionBlocks, FromPython, StudyKind):
     """What to invert: displacements of a specimen, or outputs of any other model.
 
     Parameters

@@ -16,14 +16,13 @@ from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AS_DECIDED, decided
+from workflows.config.blocks import AS_DECIDED, Parallel, decided
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
 from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.predictions import never_estimable
-from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.model import FloatArray
@@ -66,7 +65,7 @@ class Predict(Settings):
         return self.samples
 
 
-class InversionBlocks(OneModel, StudyKind):
+class InversionBlocks(OneModel):
     """The blocks of an inversion, as `workflows.studies.inversion.Inversion` explains them."""
 
     restricted: ClassVar[bool] = True
@@ -76,6 +75,12 @@ class InversionBlocks(OneModel, StudyKind):
     method: Invert = Invert()
     predict: Predict | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
+
+        def units_of(self, label: str) -> dict[str, str]:
+            """SI units of numbers of the model, by their paths."""
 
     # --- the model ---------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
 from workflows.studies.sampling_blocks import SamplingBlocks
-from workflows.studies.study import Sampled
+from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 
-class Study(SamplingBlocks, FromPython):
+class Study(SamplingBlocks, FromPython, StudyKind):
     """What to compute.
 
     Parameters

@@ -23,7 +23,7 @@ from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
 from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
-from workflows.studies.study import bytes_of
+from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -40,7 +40,7 @@ DATA = {
 }
 
 
-class Selection(SelectionBlocks, FromPython):
+class Selection(SelectionBlocks, FromPython, StudyKind):
     """What to compare: candidates that change one model, and are observed in the same way; or materials.
 
     Parameters
