@@ -48,9 +48,10 @@ def test_a_wrong_noise_is_seen():
         """Believes that errors are a third of what they are."""
 
         def at(self, x, *, derivatives=False):
-            return replace(honest, data=self.data, sigma=self.sigma / 3).at(x, derivatives=derivatives)
+            noise = Noise(self.noise.sigma / 3)
+            return replace(honest, data=self.data, noise=noise).at(x, derivatives=derivatives)
 
-    found = calibrate(Optimist(honest.inputs, honest.evaluate, honest.data, honest.sigma), 15, samples=32, starts=1)
+    found = calibrate(Optimist(honest.inputs, honest.evaluate, honest.data, honest.noise), 15, samples=32, starts=1)
     assert found.probability("laplace") < 1e-2
 
 
