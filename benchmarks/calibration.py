@@ -21,6 +21,7 @@ from benchmarks import calibration_forces, calibration_palpation
 from benchmarks.beams import CONFIG
 from benchmarks.simulated import Kind, calibrate
 from forward.fem.joined import SpecimenModel
+from forward.model import ReferenceSolution
 from forward.specimen import Specimen
 from inverse.data.noise import Noise
 from inverse.low_dimensional.posterior import Posterior
@@ -85,7 +86,7 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     assert slopes is not None
     sizes = [np.sqrt((part**2).mean()) for part in model.values(solution.outputs)]
     sigma = noise * np.array(sizes)[model.cases]
-    start = Prediction(centre, state[0], slopes, inputs.coordinates, inputs.std)
+    start = Prediction(ReferenceSolution(centre, state[0], inputs.std), slopes, inputs.coordinates)
     return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), Noise(sigma), start=start)
 
 

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from benchmarks.beams import CONFIG
 from benchmarks.calibration import PRIORS, specimen
 from forward.fem.joined import SpecimenModel
-from forward.model import FloatArray
+from forward.model import FloatArray, ReferenceSolution
 from forward.specimen import LoadCase, Specimen
 from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
@@ -104,7 +104,7 @@ def started(model: SpecimenModel, inputs: Inputs) -> Prediction:
     state, slopes = map(model.space.gather, (solution.state[None], solution.state_tangent(np.eye(len(centre)))))
     assert state is not None
     assert slopes is not None
-    return Prediction(centre, state[0], slopes, inputs.coordinates, inputs.std)
+    return Prediction(ReferenceSolution(centre, state[0], inputs.std), slopes, inputs.coordinates)
 
 
 def load_cases(count: int) -> None:

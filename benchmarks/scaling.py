@@ -41,12 +41,12 @@ import numpy as np
 from mpi4py import MPI
 from forward.pointwise import FunctionModel
 from uq.evaluation.ensemble import Ensemble
-from uq.evaluation.work_queue import counter as shared_counter
+from uq.evaluation.work_queue import Counter
 from uq.evaluation.request import Request
 
 mode, world = sys.argv[1], MPI.COMM_WORLD
 if mode == "counter":
-    with shared_counter(world) as counter:
+    with Counter(world) as counter:
         world.barrier()
         times = []
         for _ in range(100 if world.rank == world.size - 1 else 0):

@@ -64,33 +64,26 @@ class Nearby:
 
     Attributes
     ----------
-    point
-        Its parameters (d,).
-    state, slopes
-        State (U_local,) there, and its derivatives (d, U_local).
-    spread
-        Standard deviations (d,) of the prior.
-    joined
-        Whether the state is joined to rest.
+    reference
+        That solution, with this rank's part of the state.
+    slopes
+        Derivatives (d, U_local) of the state there.
     """
 
-    point: FloatArray
-    state: FloatArray
+    reference: ReferenceSolution
     slopes: FloatArray
-    spread: FloatArray
-    joined: bool
 
     @classmethod
     def at(cls, model: ForwardModel, point: FloatArray, spread: FloatArray) -> Nearby:
         """Solve at parameters (d,); collective."""
         solution = model.solve(point)
         slopes = solution.state_tangent(np.eye(len(point)))
-        return cls(point, np.array(solution.state), slopes, spread, solution.work.snaps == 0)
+        return cls(ReferenceSolution(point, np.array(solution.state), spread, solution.work.snaps == 0), slopes)
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) with its reference."""
-        reference = ReferenceSolution(self.point, self.state, self.spread, self.joined)
-        return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
+        here = self.reference
+        return lambda point: Guess(here.state + (point - here.parameters) @ self.slopes, here)
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,7 @@ def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch
         if ok.sum() >= ENOUGH:
             return Sketch(dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
     points = inputs.points(even_points(POINTS, len(inputs.names)))
-    tangents = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
+    tangents = centre.middle + centre.predicted(points)
     if not expanded:
         return Sketch(points, tangents)
     known = Expansion.of(dataset)

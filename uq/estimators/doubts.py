@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.findings import Finding, entries
+from forward.findings import Finding, Severity, entries
 from forward.model import FloatArray
 from uq.estimators.tails import concentration, influences, missed, shown, spread
 
@@ -36,6 +36,11 @@ LAST_DIGITS = 1e-13  # of an output
 CENTRE = 6.0  # leave-one-out errors by which an expansion may be wrong at the mean parameters
 ROUGH = 0.02  # relative leave-one-out error from which the shape of an expansion matters
 SEEN = 1e-3  # of the standard deviation: smaller errors there are not reported
+
+
+def _of(name: str, code: str, severity: Severity, **values: Any) -> Finding:
+    """A finding of one output."""
+    return Finding(code, severity, values, about=entries([name]))
 
 
 def of_tails(
@@ -94,13 +99,13 @@ def of_tails(
         logarithmic = spread(values[:, i]) if relative[i] > SEEN else 0.0
         wider = (n / 64) ** WIDENS
         if logarithmic > HOPELESS[0] * wider and kappa > HOPELESS[1] / TAILS * largest:
-            yield Finding("tails-hopeless", "error", {"n": n, "spread": logarithmic}, about=entries([name]))
+            yield _of(name, "tails-hopeless", "error", n=n, spread=logarithmic)
         elif logarithmic > SPREAD * wider and kappa <= largest:
-            yield Finding("tails-log-normal", "warning", {"n": n, "spread": logarithmic}, about=entries([name]))
+            yield _of(name, "tails-log-normal", "warning", n=n, spread=logarithmic)
         elif kappa > largest or beyond[i] > most * variance:
             kurtosis = (deviations[:, i] ** 4).mean() / variance**2
             kappa = max(kappa, concentration(plain[:, i], variance))
-            yield Finding("tails", "warning", {"n": n, "worth": n / kappa, "kurtosis": kurtosis}, about=entries([name]))
+            yield _of(name, "tails", "warning", n=n, worth=n / kappa, kurtosis=kurtosis)
 
 
 def of_differences(
@@ -125,12 +130,8 @@ def of_differences(
         for i in np.flatnonzero(matters):
             kappa = concentration(one[:, i], std[i] ** 2)
             if kappa > largest or tails[i] > most * std[i] ** 2:
-                yield Finding(
-                    "tails-of-difference",
-                    "warning",
-                    {"n": n, "coarser": level - 1, "level": level, "worth": n / max(kappa, 1.0)},
-                    about=entries([names[i]]),
-                )
+                worth = n / max(kappa, 1.0)
+                yield _of(names[i], "tails-of-difference", "warning", n=n, coarser=level - 1, level=level, worth=worth)
 
 
 def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
@@ -138,7 +139,7 @@ def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
     n = len(values)
     for name, value, alike in zip(names, values[0].tolist(), equal(values).tolist(), strict=True):
         if alike:
-            yield Finding("constant", "warning", {"n": n, "value": value, "unmet": unmet(n)}, about=entries([name]))
+            yield _of(name, "constant", "warning", n=n, value=value, unmet=unmet(n))
 
 
 def equal(values: FloatArray) -> NDArray[np.bool_]:
@@ -191,12 +192,8 @@ def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator
             if beta[i] == 0
         ]
         if dropped and found.relative_std_error[i] > MATTERS:
-            yield Finding(
-                "control-dropped",
-                "note",
-                {"control": control, "dropped": " and ".join(dropped), "be": "are" if len(dropped) > 1 else "is"},
-                about=entries([name]),
-            )
+            be = "are" if len(dropped) > 1 else "is"
+            yield _of(name, "control-dropped", "note", control=control, dropped=" and ".join(dropped), be=be)
 
 
 def of_expansion(
@@ -205,11 +202,9 @@ def of_expansion(
     """Find the outputs that an expansion does not explain, from its relative leave-one-out errors (m,)."""
     for name, error in zip(names, relative.tolist(), strict=True):
         if error > nothing:
-            yield Finding(
-                "expansion-explains-nothing", "error", {"error": error, "samples": samples}, about=entries([name])
-            )
+            yield _of(name, "expansion-explains-nothing", "error", error=error, samples=samples)
         elif error > trusted:
-            yield Finding("expansion-rough", "warning", {"error": error, "samples": samples}, about=entries([name]))
+            yield _of(name, "expansion-rough", "warning", error=error, samples=samples)
 
 
 def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samples: int) -> Iterator[Finding]:
@@ -225,7 +220,7 @@ def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samp
     for i, (name, error) in enumerate(zip(names, relative.tolist(), strict=True)):
         kappa = concentration(moved[:, i], float(deviations[:, i].var())) if error > ROUGH else 0.0
         if kappa > largest:
-            yield Finding("expansion-shape", "warning", {"kappa": kappa, "error": error}, about=entries([name]))
+            yield _of(name, "expansion-shape", "warning", kappa=kappa, error=error)
 
 
 def of_reach(
@@ -238,12 +233,7 @@ def of_reach(
     for name, share, left, whole in zip(names, outside.tolist(), relative.tolist(), rest.tolist(), strict=True):
         error = max(left, whole) if share > MOSTLY else left
         if share > BEYOND_SAMPLES and error > SEEN:
-            yield Finding(
-                "expansion-reach",
-                "warning",
-                {"share": share, "samples": samples, "error": error},
-                about=entries([name]),
-            )
+            yield _of(name, "expansion-reach", "warning", share=share, samples=samples, error=error)
 
 
 def of_centre(
@@ -254,7 +244,7 @@ def of_centre(
     limits = np.maximum(np.maximum(CENTRE * loo, SEEN * std), rounding)
     for name, error, left, limit in zip(names, np.abs(errors).tolist(), loo.tolist(), limits.tolist(), strict=True):
         if error > limit:
-            yield Finding("expansion-at-mean", "warning", {"error": error, "left": left}, about=entries([name]))
+            yield _of(name, "expansion-at-mean", "warning", error=error, left=left)
 
 
 def of_field(rest: float, trusted: float, nothing: float) -> Iterator[Finding]:
@@ -289,19 +279,9 @@ def of_indices(dataset: xr.Dataset) -> Iterator[Finding]:
         )
         for what, value, error, sign, excess, limit in checks:
             for i in np.flatnonzero(sign * (value - limit) > BEYOND * error + ROUNDING):
-                yield Finding(
-                    "index-out-of-bounds",
-                    "error",
-                    {
-                        "what": what,
-                        "parameter": names[i],
-                        "value": value[i],
-                        "excess": excess,
-                        "limit": limit[i],
-                        "times": min(abs(value[i] - limit[i]) / max(error[i], 1e-300), 999),
-                    },
-                    about=entries([of]),
-                )
+                times = min(abs(value[i] - limit[i]) / max(error[i], 1e-300), 999)
+                values = {"what": what, "parameter": names[i], "value": value[i], "excess": excess, "limit": limit[i]}
+                yield _of(of, "index-out-of-bounds", "error", **values, times=times)
         together = float(np.sqrt((S_error**2).sum()))
         if S.sum() > 1 + BEYOND * together + ROUNDING:
-            yield Finding("indices-add-up", "error", {"total": S.sum(), "together": together}, about=entries([of]))
+            yield _of(of, "indices-add-up", "error", total=S.sum(), together=together)

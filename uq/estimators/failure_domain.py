@@ -6,7 +6,7 @@ not found from the straight ones. Estimates from the other samples describe the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,17 +170,22 @@ def joined_counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
 
 def joined_by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
     """Return the number (n,) of `JOINED` at points (n, d): the largest of several solves at a point."""
-    known: dict[bytes, int] = {}
-    for point, one in zip(evaluations.points, joined(evaluations).tolist(), strict=True):
-        known[point.tobytes()] = max(one, known.get(point.tobytes(), 0))
-    return np.array([known.get(np.ascontiguousarray(point).tobytes(), 0) for point in points], dtype=np.int8)
+    return _at(points, evaluations, joined(evaluations), max)
 
 
 def by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
     """Return what is known (n,) about the stability at points (n, d): the least of several solves at a point."""
+    refused = Stability.REFUSED
+    return _at(
+        points, evaluations, evaluations.stability, lambda all_: max(all_) if max(all_) >= refused else min(all_)
+    )
+
+
+def _at(
+    points: FloatArray, evaluations: Evaluations, values: NDArray[np.int8], of: Callable[[list[int]], int]
+) -> NDArray[np.int8]:
+    """What follows at points (n, d) from a number of each solve; of none from 0."""
     known: dict[bytes, list[int]] = {}
-    for point, one in zip(evaluations.points, evaluations.stability.tolist(), strict=True):
+    for point, one in zip(evaluations.points, values.tolist(), strict=True):
         known.setdefault(point.tobytes(), []).append(one)
-    refused = int(Stability.REFUSED)
-    found = [known.get(np.ascontiguousarray(point).tobytes(), [0]) for point in points]
-    return np.array([max(several) if max(several) >= refused else min(several) for several in found], dtype=np.int8)
+    return np.array([of(known.get(np.ascontiguousarray(point).tobytes(), [0])) for point in points], dtype=np.int8)

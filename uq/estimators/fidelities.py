@@ -15,7 +15,7 @@ freedom leave open lengthens the error by Student's factor (B. L. Welch, Biometr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from uq.estimators.blue import Group, Problem, informations, weights
 from uq.estimators.moments import Estimates, Term, Z, combine, ratio, student, term
+from uq.estimators.tails import influences
 
 FOLDS = 10  # parts into which the samples of all models are cut
 ROUNDS = 4  # in which the mean stands for answers of model 0 that are missing
@@ -207,8 +208,7 @@ def estimated(
     terms = tuple(term(a, b) for a, b in zip(first, second, strict=True))
     found = combine(offset, terms)
     mean = np.sum([one.first for one in terms], axis=0)
-    moved = tuple(b - 2 * mean * a for a, b in zip(first, second, strict=True))
-    moved = tuple(one - one.mean(axis=0) for one in moved)
+    moved = tuple(influences(a, b, mean) for a, b in zip(first, second, strict=True))
     factors, relative = zip(*(uncertainty(parts) for parts in (first, moved)), strict=True)
     estimates = replace(found, mean_error=found.mean_error * factors[0], std_error=found.std_error * factors[1])
     return Found(estimates, terms, moved, tuple(fitted), np.array(relative))
@@ -285,31 +285,3 @@ def correlations(covariance: FloatArray) -> FloatArray:
 def ok_rows(values: FloatArray, group: Group) -> NDArray[np.bool_]:
     """Which samples (n,) of values (n, K, m) have answers of all models of a group."""
     return np.asarray(np.isfinite(values[:, list(group)]).all(axis=(1, 2)))
-
-
-def gains(plain: FloatArray, cost: float, found: Found) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances.
-
-    Parameters
-    ----------
-    plain
-        Samples (n, m) of model 0.
-    cost
-        What was spent, in samples of model 0.
-    """
-    n = len(plain)
-    centred = plain - plain.mean(axis=0)
-    influences = centred**2 - (centred**2).mean(axis=0)
-    for which, (parts, one) in enumerate(((centred, "variance"), (influences, "second"))):
-        squares = np.sum([_error_square(t, one, found) for t in found.terms], axis=0)
-        variance = (parts**2).sum(axis=0) / (n - 1)
-        kurtosis = ratio((parts**4).mean(axis=0), (parts**2).mean(axis=0) ** 2, empty=3.0)
-        gain = ratio(variance, squares * cost, empty=1.0)
-        yield gain, gain * np.sqrt(np.maximum(kurtosis - 1, 0) / n + found.relative[which])
-
-
-def _error_square(one: Term, which: str, found: Found) -> FloatArray:
-    if which == "variance":
-        return np.asarray(one.variance / one.n)
-    mean = np.sum([t.first for t in found.terms], axis=0)
-    return np.asarray((one.second_variance - 4 * mean * one.covariance + 4 * mean**2 * one.variance) / one.n)

@@ -41,6 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from uq.estimators.estimate import Variables
 from uq.surrogates.basis import Basis, hermite, hyperbolic, hyperbolic_count
 
 if TYPE_CHECKING:
@@ -226,7 +227,7 @@ def jackknife_error(left_out: FloatArray) -> FloatArray:
 
 def field_indices(
     variance: FloatArray, first: FloatArray, total: FloatArray, volumes: FloatArray | None = None
-) -> dict[str, tuple[tuple[str, ...], FloatArray | NDArray[np.int64]]]:
+) -> Variables:
     """Return the generalised indices of a field, its indices by node, and the dominating parameter at each node.
 
     Parameters
@@ -322,7 +323,7 @@ class Shapley:
     def error(self, coefficients: FloatArray, indices: NDArray[np.int64]) -> FloatArray:
         """Return standard errors (…, d) of the effects because draws are few: the jackknife over parts of them."""
         left = np.array([self.effects(coefficients, indices, form) for form in range(1, len(self.forms))])
-        return np.asarray(np.sqrt((PARTS - 1) / PARTS * ((left - left.mean(axis=0)) ** 2).sum(axis=0)))
+        return jackknife_error(left)
 
 
 def _alone(basis: Basis) -> NDArray[np.int64]:

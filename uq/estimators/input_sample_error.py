@@ -19,6 +19,7 @@ import numpy as np
 from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.quantiles import quantiles
+from uq.estimators.tails import kurtosis
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 
@@ -54,7 +55,7 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
     std = dataset["std"].to_numpy()
     added = {
         "mean_error": std * np.sqrt(share * left),
-        "std_error": std * np.sqrt(share * (_kurtosis(values) - 1) * left) / 2,
+        "std_error": std * np.sqrt(share * (kurtosis(values) - 1) * left) / 2,
     }
     dominated = []
     for name, error in added.items():
@@ -105,13 +106,6 @@ def _share(inputs: Inputs, points: FloatArray, values: FloatArray) -> FloatArray
     left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
     variance = values.var(axis=0)
     return np.where(variance > 0, left.var(axis=0) / np.where(variance > 0, variance, 1.0), 0.0)
-
-
-def _kurtosis(values: FloatArray) -> FloatArray:
-    deviations = values - values.mean(axis=0)
-    variance = (deviations**2).mean(axis=0)
-    varies = variance > 0
-    return np.where(varies, (deviations**4).mean(axis=0) / np.where(varies, variance, 1.0) ** 2, 3.0)
 
 
 def _quantiles(dataset: xr.Dataset, values: FloatArray, share: FloatArray, worth: float) -> dict[str, object]:

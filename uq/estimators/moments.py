@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from uq.estimators.estimate import Variables
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,7 +36,7 @@ Coefficient = Literal["one", "optimal"]
 SecondMoment = Literal["quadratic", "linear"]
 
 ESTIMATES = ("mean", "mean_error", "std", "std_error")
-Variables = dict[str, tuple[tuple[str, ...], Any]]
+Sums = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
 MORE = 0.5  # over n − 1: relative increase of the scatter of n samples from which a control is dropped
@@ -81,13 +82,18 @@ class Estimates:
     @property
     def named(self) -> dict[str, FloatArray]:
         """The four estimates by their names."""
-        return {"mean": self.mean, "mean_error": self.mean_error, "std": self.std, "std_error": self.std_error}
+        return {name: getattr(self, name) for name in ESTIMATES}
+
+    @property
+    def size(self) -> FloatArray:
+        """What errors of means are relative to: the mean, or the standard deviation if that is larger; 1 for zeros."""
+        found = np.maximum(np.abs(self.mean), self.std)
+        return np.where(found > 0, found, 1.0)
 
     @property
     def relative_error(self) -> FloatArray:
-        """Standard error of the mean relative to the mean, or to the standard deviation if that is larger."""
-        scale = np.maximum(np.abs(self.mean), self.std)
-        return np.where(scale > 0, self.mean_error / np.where(scale > 0, scale, 1), 0)
+        """Standard error of the mean relative to the size."""
+        return np.asarray(self.mean_error / self.size)
 
     @property
     def relative_std_error(self) -> FloatArray:
@@ -172,37 +178,39 @@ def combine(
 ) -> Estimates:
     """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each with its own samples.
 
-    Parameters
-    ----------
-    offset
-        ψ̄ (…).
-    terms
-        The terms.
-    coefficient, second_coefficient
-        β₁ and β₂ of the terms, for the record.
+    The coefficients β₁ and β₂ of the terms are for the record.
     """
-    m1, mean_variance, variance, variance_error = _sums(terms)
-    std: FloatArray = np.sqrt(variance)
+    return _estimated(offset, _sums(terms), coefficient, second_coefficient)
+
+
+def _sums(terms: Sequence[Term]) -> Sums:
+    """Mean of ψ − ψ̄ and its variance; second moment, and the variance of its part in that of ψ, by linearisation."""
+    m1 = _sum(t.first for t in terms)
+    scatter = _sum(_scatter_of_variance(t, m1) / t.n for t in terms)
+    return m1, _sum(t.variance / t.n for t in terms), _sum(t.second for t in terms), scatter
+
+
+def _estimated(
+    offset: FloatArray, sums: Sums, coefficient: float | FloatArray, second: float | FloatArray
+) -> Estimates:
+    """Return estimates from what `_sums` tells, with β₁ and β₂."""
+    m1, mean_variance, square, scatter = sums
+    # The squared mean exceeds the square of the expectation by its variance, which is added back: for plain Monte Carlo
+    # this gives the usual n − 1.
+    std: FloatArray = np.sqrt(np.maximum(square - m1**2 + mean_variance, 0))
     return Estimates(
         mean=offset + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
-        std_error=error_of_root(std, variance_error),
+        std_error=error_of_root(std, _error_of_variance(scatter, mean_variance)),
         coefficient=np.broadcast_to(coefficient, std.shape),
-        second_coefficient=np.broadcast_to(second_coefficient, std.shape),
+        second_coefficient=np.broadcast_to(second, std.shape),
     )
 
 
-def _sums(terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Mean of ψ − ψ̄ and its variance; variance of ψ and its standard error, by linearisation."""
-    m1 = _sum(t.first for t in terms)
-    mean_variance = _sum(t.variance / t.n for t in terms)
-    # The squared mean exceeds the square of the expectation by its variance, which is added back: for plain Monte Carlo
-    # this gives the usual n − 1.
-    variance = np.maximum(_sum(t.second for t in terms) - m1**2 + mean_variance, 0)
-    scatter = _sum(_scatter_of_variance(t, m1) / t.n for t in terms)
-    # The error of the square of an inaccurate mean is larger than its slope says.
-    return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0) + 2 * mean_variance**2)
+def _error_of_variance(scatter: FloatArray, mean_variance: FloatArray) -> FloatArray:
+    """Error of σ²: that of the square of an inaccurate mean is larger than its slope says."""
+    return np.asarray(np.sqrt(np.maximum(scatter, 0) + 2 * mean_variance**2))
 
 
 def _scatter_of_variance(one: Term, m1: FloatArray | None = None) -> FloatArray:
@@ -280,13 +288,15 @@ def estimate(
         _helps(_scatter_of_variance(reduced(beta1, beta2)), _scatter_of_variance(reduced(beta1, zero)), n), beta2, 0.0
     )
     one = reduced(beta1, beta2)
-    _, _, _, variance_error = _sums([one])
+    _, mean_variance, _, scatter = _sums([one])
     found = combine(offset, [one], beta1, beta2)
 
     return Moments(
         **vars(found),
         variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
-        std_variance_ratio=ratio(_scatter_of_variance(plain), n * variance_error**2, empty=1.0),
+        std_variance_ratio=ratio(
+            _scatter_of_variance(plain), n * _error_of_variance(scatter, mean_variance) ** 2, empty=1.0
+        ),
     )
 
 
@@ -370,19 +380,8 @@ def estimate_from_replicates(
         pull * (y - y.mean(axis=0)) / np.sqrt(R * (R - 1)) for pull, y in zip(pulls, (w, square), strict=True)
     )
     m1 = w.mean(axis=0)
-    mean_variance = (moves1**2).sum(axis=0)
-    # ⟨w⟩² exceeds its square by its variance, which is added back.
-    variance = np.maximum(square.mean(axis=0) - m1**2 + mean_variance, 0)
-    variance_variance = ((moves2 - 2 * m1 * moves1) ** 2).sum(axis=0) + 2 * mean_variance**2  # as in `_sums`
-    std = np.sqrt(variance)
-    return Estimates(
-        mean=offset + m1,
-        mean_error=np.sqrt(mean_variance),
-        std=std,
-        std_error=error_of_root(std, np.sqrt(variance_variance)),
-        coefficient=beta1,
-        second_coefficient=beta2,
-    )
+    scatter = ((moves2 - 2 * m1 * moves1) ** 2).sum(axis=0)
+    return _estimated(offset, (m1, (moves1**2).sum(axis=0), square.mean(axis=0), scatter), beta1, beta2)
 
 
 def error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
+from uq.estimators.estimate import Variables
 from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
 from uq.estimators.subsampled_difference import Chosen, Pooled
@@ -45,7 +46,7 @@ class Quantiles(NamedTuple):
     error: FloatArray
 
     @property
-    def variables(self) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    def variables(self) -> Variables:
         """The quantiles as variables of results."""
         by = ("quantile", "output")
         return {

@@ -50,9 +50,12 @@ ROUNDING = 1e-9  # of the variance
 Found = TypeVar("Found", bound=Estimates)
 
 
-def influences(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the influence of each sample (n, m) on the variance, from samples of the first and the second moment."""
-    moved = second - 2 * first.mean(axis=0) * first
+def influences(first: FloatArray, second: FloatArray, mean: FloatArray | None = None) -> FloatArray:
+    """Return the influence of each sample (n, m) on the variance, from samples of the first and the second moment.
+
+    Of a part of a sum, the `mean` (m,) of the first moment is that of the sum; by default it is that of the samples.
+    """
+    moved = second - 2 * (first.mean(axis=0) if mean is None else mean) * first
     return np.asarray(moved - moved.mean(axis=0))
 
 
@@ -66,6 +69,12 @@ def skewed(samples: FloatArray) -> FloatArray:
     deviations = ratio(deviations, np.abs(deviations).max(axis=0))  # sixth powers of small and large numbers are none
     squares = (deviations**2).sum(axis=0)
     return np.asarray(np.sqrt(1 + 2.16 * ratio((deviations**3).sum(axis=0) ** 2, squares**3)))
+
+
+def kurtosis(values: FloatArray) -> FloatArray:
+    """Fourth central moment of values (n, m) over the squared variance (m,); 3, as of normal ones, if all are equal."""
+    centred = values - values.mean(axis=0)
+    return ratio((centred**4).mean(axis=0), (centred**2).mean(axis=0) ** 2, empty=3.0)
 
 
 def concentration(moved: FloatArray, variance: float) -> float:
@@ -143,9 +152,10 @@ def counted(
         controlled = deviations, deviations**2
     first, moved = controlled[0], influences(*controlled)
     further = np.maximum(of_influences(found, inputs, moved), unseen(inputs, values) * found.std)
+    of_mean = 0.0 if _end(inputs) else np.minimum(missed(first), first.std(axis=0))
     return replace(
         found,
-        mean_error=np.hypot(found.mean_error * skewed(first), of_means(inputs, first)),
+        mean_error=np.hypot(found.mean_error * skewed(first), of_mean),
         std_error=np.hypot(found.std_error * skewed(moved), further),
     )
 
@@ -167,11 +177,6 @@ def with_tails(
     tails = [of_influences(found, inputs, one) for one in moved]
     tails[of] = np.maximum(tails[of], unseen(inputs, values) * found.std)
     return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
-
-
-def of_means(inputs: Inputs, first: FloatArray) -> FloatArray:
-    """Return the error (m,) of means due to what is beyond the samples (n, m) of them; zero as in `of_influences`."""
-    return np.zeros(first.shape[1]) if _end(inputs) else np.minimum(missed(first), first.std(axis=0))
 
 
 def of_influences(found: Estimates, inputs: Inputs, moved: FloatArray) -> FloatArray:

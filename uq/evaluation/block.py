@@ -13,7 +13,6 @@ from forward.model import (
     FloatArray,
     ForwardModel,
     Guess,
-    MeshError,
     Solution,
     SolveError,
     gathered,
@@ -142,7 +141,10 @@ class _MeshErrors:
         """
         found = solution.mesh_error()
         if found is not None:
-            self.errors[i] = _worth(found).outputs
+            if not found.nonlinearity < 1:
+                reason = "richer elements move the body too far for a few Newton steps: the mesh is much too coarse"
+                raise SolveError(reason)
+            self.errors[i] = found.outputs
         if self.saturations is None or self._spare is None:
             return
         try:
@@ -238,16 +240,3 @@ def _together(progress: Callable[[int, int], None], size: int, n: int) -> Callab
             told[:] = solves, failures
 
     return finished
-
-
-def _worth(found: MeshError) -> MeshError:
-    """Return an estimate of the error of the mesh.
-
-    Raises
-    ------
-    SolveError
-        If it is worth nothing.
-    """
-    if not found.nonlinearity < 1:
-        raise SolveError("richer elements move the body too far for a few Newton steps: the mesh is much too coarse")
-    return found

@@ -19,7 +19,6 @@ from typing import Any, Protocol, TypeVar
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
@@ -239,11 +238,6 @@ def load(path: Path, name: str = "/") -> Evaluations:
     return read(path, name)
 
 
-def _counts(work: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return counts (n, k) of an earlier version, which had fewer of them, with zeros for the others."""
-    return np.pad(work, ((0, 0), (0, max(0, len(WORK) - work.shape[1]))))
-
-
 def read(path: Path, name: str = "/") -> Evaluations:
     """Read evaluations from a file whose checksum was verified."""
     try:
@@ -254,7 +248,8 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 for f in json.loads(file["failures"][()])
             )
             rows = {name: np.asarray(file[name]) for name in ROWS if name in file or name not in ON_REQUEST}
-            rows["work"] = _counts(rows["work"])
+            counts = rows["work"]  # an earlier version had fewer of them
+            rows["work"] = np.pad(counts, ((0, 0), (0, max(0, len(WORK) - counts.shape[1]))))
             return Evaluations.of(rows, failures, np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)))
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

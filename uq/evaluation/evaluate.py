@@ -117,7 +117,7 @@ class _Asked:
 
 
 def _asked(block: Request) -> _Asked:
-    start = np.asarray(getattr(block.start, "point", np.zeros(0)), dtype=float)
+    start = np.zeros(0) if block.start is None else block.start.reference.parameters
     return _Asked(block.points, block.tangents, block.iterations, start, block.mesh_errors, block.saturations)
 
 

@@ -198,46 +198,44 @@ class Start(Protocol):
     A dataclass; its fields are part of the keys of the blocks that were started from it.
     """
 
+    @property
+    def reference(self) -> ReferenceSolution:
+        """The reference, with its whole state in canonical order."""
+
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A prediction of the state that is linear in the coordinates, with the factor at `point`.
+    """A prediction of the state that is linear in the coordinates, with the factor at the reference.
 
     Attributes
     ----------
-    point
-        Parameters (d,) of the expansion.
-    state
-        State (U,) there, in canonical order.
+    reference
+        The point of the expansion.
     slopes
-        Derivatives (d, U) of the state along the coordinates; empty (0, U) if the solver starts from the state at
-        `point`.
+        Derivatives (d, U) of the state along the coordinates; empty (0, U) if the solver starts from the state there.
     coordinates
         The coordinates.
-    spread
-        Standard deviations (d,) of the parameters, for the screen of stability.
-    joined
-        Whether the state at `point` is joined to rest.
     """
 
-    point: FloatArray
-    state: FloatArray
+    reference: ReferenceSolution
     slopes: FloatArray
     coordinates: Coordinates
-    spread: FloatArray | None = None
-    joined: bool = True
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
-        state, slopes = scattered(model, self.state[None, :])[0], scattered(model, self.slopes)
-        reference = ReferenceSolution(self.point, state, self.spread, self.joined)
+        reference, slopes = on_group(model, self.reference), scattered(model, self.slopes)
+        state, here = reference.state, self.coordinates.of(reference.parameters)
         if len(slopes) == 0:
             return lambda _: Guess(state, reference)
-        here = self.coordinates.of(self.point)
         return lambda parameters: Guess(state + (self.coordinates.of(parameters) - here) @ slopes, reference)
+
+
+def on_group(model: ForwardModel, whole: ReferenceSolution) -> ReferenceSolution:
+    """Return a reference with the part of its state that a group's model has on this rank."""
+    return replace(whole, state=scattered(model, whole.state[None, :])[0])
 
 
 def company_of(samples: int, most: int = COMPANY) -> int:

@@ -88,14 +88,6 @@ class Outcome:
         return cls(None if reason else dataset, reason, read(path, _SOLVED) if solved else None, seconds)
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What determines an outcome besides the study."""
-
-    number: int
-    name: str
-
-
 def run_tasks(
     ensemble: Ensemble,
     names: Sequence[str],
@@ -134,7 +126,7 @@ def run_tasks(
     from uq.evaluation.work_queue import abort_all
 
     world, group = ensemble.world, ensemble.group
-    keys = [] if checkpoint is None else [checkpoint.key(_Task(number, name)) for number, name in enumerate(names)]
+    keys = [] if checkpoint is None else [checkpoint.key(("task", number, name)) for number, name in enumerate(names)]
     outcomes: dict[int, Outcome] = {}
 
     def do(number: int) -> Outcome:

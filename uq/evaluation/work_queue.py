@@ -48,7 +48,7 @@ class WorkQueue:
     @contextmanager
     def of(cls, world: Any, group: Any, index: int, progress: Progress) -> Iterator[WorkQueue]:
         """Make the counters, and free them at the end; collective."""
-        with counter(world) as turn, counter(world) as solves, counter(world) as failures:
+        with Counter(world) as turn, Counter(world) as solves, Counter(world) as failures:
             yield cls(world, group, index, progress, (turn, solves, failures))
 
     def count(self, done: int, failed: int) -> None:
@@ -127,7 +127,7 @@ class WorkQueue:
 
 
 class Counter:
-    """A number in rank 0's memory that any rank can read and increase atomically."""
+    """A number in rank 0's memory that any rank can read and increase atomically; begun and left by all at once."""
 
     def __init__(self, world: Any) -> None:
         self._world = world
@@ -156,8 +156,10 @@ class Counter:
         self._window.Unlock(0)
         return int(value[0])
 
-    def free(self) -> None:
-        """Free the window; collective."""
+    def __enter__(self) -> Counter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._window.Free()
 
 
@@ -175,16 +177,6 @@ class _Tally:
         if self._progress is not None:
             new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
             self._progress(*new)
-
-
-@contextmanager
-def counter(world: Any) -> Iterator[Counter]:
-    """A counter of a world of ranks; collective."""
-    made = Counter(world)
-    try:
-        yield made
-    finally:
-        made.free()
 
 
 @contextmanager

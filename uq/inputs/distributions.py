@@ -89,11 +89,6 @@ class Triangular(Bounded):
     kind: Literal["triangular"] = "triangular"
     mode: float
 
-    @cached_property
-    def logarithmic(self) -> bool:
-        """As for every distribution: if it is positive and spans more than a decade."""
-        return self._over_decades()
-
     @property
     def _peak(self) -> float:
         return (self.mode - self.lower) / (self.upper - self.lower)
@@ -190,11 +185,6 @@ class TruncatedNormal(Bounded):
     mean: float
     std: PositiveFloat
 
-    @cached_property
-    def logarithmic(self) -> bool:
-        """As for every distribution: if it is positive and spans more than a decade."""
-        return self._over_decades()
-
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
         """As for every distribution."""
@@ -289,10 +279,6 @@ class LogNormal(Univariate):
     def logarithmic(self) -> bool:
         """As for every distribution."""
         return True
-
-    @property
-    def _frame(self) -> tuple[float, float]:
-        return 0.0, 1.0
 
     def _log_density(self, u: FloatArray) -> FloatArray:
         mean, std = self.of_coordinate

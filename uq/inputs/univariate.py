@@ -38,9 +38,9 @@ class Univariate(Settings):
     """Whether the recurrence of the orthogonal polynomials is known in closed form."""
 
     @property
-    @abstractmethod
     def _frame(self) -> tuple[float, float]:
         """Origin and unit of the variable u = (ω − origin)/unit of the next three methods."""
+        return 0.0, 1.0
 
     @abstractmethod
     def _log_density(self, u: FloatArray) -> FloatArray:
@@ -166,6 +166,11 @@ class Bounded(Univariate):
     def _frame(self) -> tuple[float, float]:
         return self.lower, self.upper - self.lower
 
+    @cached_property
+    def logarithmic(self) -> bool:
+        """As for every distribution: without closed forms, if it is positive and its bulk spans more than a decade."""
+        return not self.closed and self.lower > 0 and self.at(1 - RARE) > WIDE * self.at(RARE)
+
     def quantile(self, probability: FloatArray) -> FloatArray:
         """Inverse of the distribution function, of any shape."""
         return np.clip(super().quantile(probability), self.lower, self.upper)
@@ -182,10 +187,6 @@ class Bounded(Univariate):
         if not np.isfinite(self.upper - self.lower):
             message = f"lower = {self.lower:g} and upper = {self.upper:g}, expected a range that a number can hold"
             raise ValueError(message)
-
-    def _over_decades(self) -> bool:
-        """Whether the bulk of the distribution is positive and spans more than a decade."""
-        return self.lower > 0 and self.at(1 - 1e-4) > WIDE * self.at(1e-4)
 
 
 class Chaospy(Univariate):
@@ -261,10 +262,6 @@ class Chaospy(Univariate):
         z, weights = _normals()
         middle = self.at(0.5)
         return middle, self.from_normal(z)[0] - middle, weights
-
-    @property
-    def _frame(self) -> tuple[float, float]:
-        return 0.0, 1.0
 
     def _log_density(self, u: FloatArray) -> FloatArray:
         with np.errstate(divide="ignore"):

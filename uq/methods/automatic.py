@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from math import comb
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -73,15 +73,11 @@ class Automatic(Method):
         Whether the displacement field is estimated too, at each node.
     """
 
+    undecided: ClassVar[str] = "a first expansion"
     kind: Literal["automatic"] = "automatic"
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
-
-    @property
-    def aims(self) -> bool:
-        """It does nothing else."""
-        return True
 
     def planned(self, dimension: int) -> int:
         """Number of solves of the first expansion."""
@@ -92,19 +88,8 @@ class Automatic(Method):
         """All of them."""
         return samples
 
-    @property
-    def undecided(self) -> str:
-        """What the planned solves are for."""
-        return "a first expansion"
-
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Without a tolerance nothing can be chosen.
-
-        Raises
-        ------
-        ValueError
-            Always.
-        """
+        """Without a tolerance nothing can be chosen."""
         raise ValueError(UNASKED)
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
@@ -114,18 +99,12 @@ class Automatic(Method):
         -------
         xarray.Dataset
             The results of the method that was chosen; its attribute `chosen` says which, and why.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, or at too many samples.
         """
         recorder = Recorder(evaluate)
         pilot = self._pilot(inputs, recorder, goal)
         solves, reasons = recorder.solves, [pilot.reason]
         if pilot.control is None and pilot.found is not None:
-            chosen, amount = "chaos", f"{pilot.found.amount}: {pilot.found.error}"
-            dataset = self._chaos(inputs, goal).reported(recorder, pilot.found, amount)
+            chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, pilot.found)
         else:
             chosen, left = "quasi-monte-carlo", replace(goal, most=max(goal.most - solves, 2))
             dataset = self._quasi(pilot.control or "none").until(inputs, recorder, left, pilot.expanded)
@@ -263,8 +242,7 @@ class _Outlook:
         left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
         missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
         if gradients:
-            linear = centre.middle + inputs.coordinates.of(data.points) @ centre.output_slopes.T
-            missed["tangent"] = data.values - linear
+            missed["tangent"] = data.values - (centre.middle + centre.predicted(data.points))
             left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
         points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
         outside = regression.beyond(points).share

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
+from uq.estimators.estimate import Variables
 from uq.estimators.moments import Z, student
 from uq.estimators.quantiles import Quantiles, quantiles
 from uq.evaluation.block import merge
@@ -118,7 +119,7 @@ class Chaos(Amount):
     @property
     def aims(self) -> bool:
         """Whether it can stop at a goal: the points of a projection are all or nothing."""
-        return self.fit == "regression"
+        return super().aims and self.fit == "regression"
 
     def stream(self) -> tuple[Any, ...] | None:
         """Points of the design."""
@@ -128,7 +129,7 @@ class Chaos(Amount):
         """Say why an expansion in these parameters is impossible, or None."""
         if inputs.draws is not None and self.fit == "projection":
             return "parameters given by draws have no Gauss rules, expected method.fit = 'regression'"
-        return objection(inputs, self.kind)
+        return objection(inputs, f"method.kind = '{self.kind}'")
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Solve at the points of the design, fit and estimate.
@@ -138,19 +139,8 @@ class Chaos(Amount):
         xarray.Dataset
             Estimates by output, Sobol' indices, the expansion itself (`load` makes it callable) and, with `fields`,
             moments and coefficients by node and component; see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, or at too many samples for an expansion of order 1.
-        ValueError
-            If the parameters are correlated.
         """
-        return self.dataset_of(evaluate, self.expand(inputs, evaluate))
-
-    def dataset_of(self, evaluate: Evaluate, found: Expanded) -> xr.Dataset:
-        """Return the results of an expansion."""
-        return expansion_dataset(evaluate, found, self.seed, self.quantiles, fields=self.fields)
+        return self.reported(evaluate, self.expand(inputs, evaluate))
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
         """Solve at the points of the design and fit; errors as in `run`."""
@@ -166,11 +156,11 @@ class Chaos(Amount):
             found, reached = one.held_to(goal)
             if reached <= 1:
                 break
-        return self.reported(evaluate, found, f"{found.amount}: {found.error}")
+        return self.reported(evaluate, found)
 
-    def reported(self, evaluate: Evaluate, found: Expanded, stopped: str) -> xr.Dataset:
-        """Return the results of an expansion that ended for a reason."""
-        return self.dataset_of(evaluate, replace(found, stopped=stopped))
+    def reported(self, evaluate: Evaluate, found: Expanded) -> xr.Dataset:
+        """Return the results of an expansion."""
+        return expansion_dataset(evaluate, found, self.seed, self.quantiles, fields=self.fields)
 
     def most(self, goal: Goal) -> int:
         """Return how many samples an expansion may take for a goal."""
@@ -232,10 +222,10 @@ class Chaos(Amount):
             target = int(min(limit, np.ceil(growth * count), paid))
 
 
-def objection(inputs: Inputs, kind: str) -> str | None:
-    """Say why a method of this kind cannot expand in these parameters, or None."""
+def objection(inputs: Inputs, asked: str) -> str | None:
+    """Say why what is asked for cannot expand in these parameters, or None."""
     if inputs.correlations:
-        return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
+        return f"polynomial chaos needs independent parameters, expected no correlations for {asked}"
     return None
 
 
@@ -370,7 +360,7 @@ def expansion_dataset(
         reach = np.array([beyond_of_field(field)])
         within = np.array([left])
         add(dataset, *of_reach(["the displacement field"], reach, within, within, len(data.points)))
-    dataset.attrs["stopped"] = expanded.stopped
+    dataset.attrs["stopped"] = expanded.stopped or f"{expanded.amount}: {expanded.error}"
     failed = int((~evaluations.ok).sum())
     if failed:
         dataset.attrs["note"] = (
@@ -380,7 +370,7 @@ def expansion_dataset(
     return dataset
 
 
-def _of_joint(basis: Basis) -> dict[str, tuple[tuple[str, ...], Any]]:
+def _of_joint(basis: Basis) -> Variables:
     """Return what else is needed to evaluate functions of draws."""
     if basis.joint is None:
         return {}
@@ -391,9 +381,7 @@ def _of_joint(basis: Basis) -> dict[str, tuple[tuple[str, ...], Any]]:
     }
 
 
-def _distribution(
-    seed: int, probabilities: tuple[float, ...], regression: Regression
-) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+def _distribution(seed: int, probabilities: tuple[float, ...], regression: Regression) -> Variables:
     """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
 
     If the moments are those of the samples, so are the quantiles; densities are those of the expansion plus its errors

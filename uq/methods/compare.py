@@ -21,7 +21,7 @@ from forward.findings import Finding, Severity
 from forward.model import FloatArray
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
-from uq.estimators.estimate import ESTIMATED
+from uq.estimators.estimate import ESTIMATED, Variables
 from uq.estimators.moments import ESTIMATES
 from uq.estimators.scores import rate, score
 from uq.evaluation.request import OWN, Evaluate, Request
@@ -293,14 +293,6 @@ class Compare(Method):
         xarray.Dataset
             The reference (`mean`, `mean_error`, …) by output; all estimates by row (a method at a budget) and repeat;
             true errors and costs by row; see docs/results.md. All but `TIMES` is the same after a restart.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, or the reference none.
-        ValueError
-            If a method cannot take the parameters or needs derivatives that the model does not have, or if a given
-            reference leaves an output out.
         """
         objection = self.objection(inputs)
         if objection is not None:
@@ -308,7 +300,9 @@ class Compare(Method):
         memory = Memory(evaluate)
         centre = linearise(inputs, memory)
         floors = self._floors(inputs, evaluate, memory, centre)
-        reference = self._find_reference(inputs, evaluate)
+        method = self.reference.model_copy(update=_moments_only(self.reference))
+        found = method.run(inputs, evaluate.on(TIGHT) if method.planned(len(inputs.names)) else evaluate)
+        reference = {name: found[name].to_numpy() for name in ESTIMATES}
         rows = [(entry, budget) for entry in self.methods for budget in sorted(entry.budgets)]
         trials: list[list[Trial]] = [[] for _ in rows]
         for r in range(self.repeats):
@@ -327,15 +321,7 @@ class Compare(Method):
             dataset.attrs["note"] = f"{lost} repeats gave no estimate and are left out: {reason}"
         return dataset
 
-    def _find_reference(self, inputs: Inputs, evaluate: Evaluate) -> dict[str, FloatArray]:
-        """Return the estimates of the reference by output."""
-        method = self.reference.model_copy(update=_moments_only(self.reference))
-        found = method.run(inputs, evaluate.on(TIGHT) if method.planned(len(inputs.names)) else evaluate)
-        return {name: found[name].to_numpy() for name in ESTIMATES}
-
-    def _floors(
-        self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation
-    ) -> dict[str, tuple[tuple[str, ...], Any]]:
+    def _floors(self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation) -> Variables:
         """Measure the errors of solver and mesh, and the cost of a plain solve, by the textbook and here."""
         m = len(evaluate.outputs)
         solver, mesh = np.full(m, np.nan), np.full(m, np.nan)
@@ -390,8 +376,8 @@ def _compared(
     rows: Sequence[tuple[Entry, int]],
     trials: Sequence[Sequence[Trial]],
     reference: dict[str, FloatArray],
-    floors: dict[str, tuple[tuple[str, ...], Any]],
-) -> dict[str, tuple[tuple[str, ...], Any]]:
+    floors: Variables,
+) -> Variables:
     """Return reference, estimates, errors and costs as labelled arrays."""
 
     def each(pick: Callable[[Trial], Any]) -> FloatArray:
@@ -408,7 +394,7 @@ def _compared(
     derived = plain if np.isfinite(textbook) else []
     shown = [*range(len(rows)), *derived]
     labels = [*names, *(f"{names[i]}, textbook solver" for i in derived)]
-    data: dict[str, tuple[tuple[str, ...], Any]] = {
+    data: Variables = {
         "row_method": (("row",), labels),
         "budget": (("row",), np.array([budget for _, budget in rows])[shown]),
         "derived": (("row",), np.arange(len(shown)) >= len(rows)),

@@ -27,10 +27,9 @@ The bounds, the active subspace and their errors are computed from the same prod
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
@@ -40,7 +39,7 @@ from uq.estimators.moments import Estimates, estimate_from_replicates, running
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.distributions import (
     Beta,
@@ -54,10 +53,11 @@ from uq.inputs.distributions import (
     Uniform,
 )
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
+from uq.inputs.sampling import check_scrambles, in_order, power_of_two
 from uq.inputs.univariate import Chaospy
 from uq.methods.method import Amount
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
+from uq.methods.scrambles import Sets
 from uq.surrogates.basis import FULL, gauss, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import Regression
@@ -137,13 +137,6 @@ class DerivativeBased(Amount):
         xarray.Dataset
             Measures, bounds, and the active subspace by output with standard errors; total indices from an expansion
             fitted to the same samples; moments; see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, or in fewer than two scrambles.
-        ValueError
-            If the parameters are correlated, or the model has no derivatives.
         """
         objection = self.objection(inputs)
         if objection is not None:
@@ -247,54 +240,22 @@ def _by_polynomials(marginal: Distribution, degree: int, *, logarithm: bool) -> 
 # --- estimates -----------------------------------------------------------------------------------------------------
 
 
-class _Samples:
-    """Scrambles of the same number of points, with values and tangents there.
-
-    Attributes
-    ----------
-    each
-        Number n of points of each scramble.
-    points, outputs, tangents, ok
-        (R, n, d), (R, n, m), (R, n, m, d) and (R, n).
-    """
+class _Samples(Sets):
+    """Scrambles with values and tangents."""
 
     def __init__(self, method: DerivativeBased, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
-        self._method, self._inputs, self._evaluate, self._centre = method, inputs, evaluate, centre
+        super().__init__(inputs, evaluate, centre.prediction, method.seed, method.scrambles, tangents=True)
+        self._method, self._centre = method, centre
         # By ω and by ln ω (2, d).
         self._constants = np.array(
             [[poincare(m, logarithm=logarithm) for m in inputs.marginals.values()] for logarithm in (False, True)]
         )
-        R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
-        self.each = 0
-        self.points = np.empty((R, 0, d))
-        self.outputs = np.empty((R, 0, m))
-        self.tangents = np.empty((R, 0, m, d))
-        self.ok = np.empty((R, 0), dtype=bool)
-        self._reasons: set[str] = set()
-
-    def extend(self, each: int) -> None:
-        """Go on to `each` points in every scramble."""
-        R, d = self.points.shape[0], self.points.shape[2]
-        cubes = [sobol_points(self._method.seed, r, self.each, each, d) for r in range(R)]
-        points = self._inputs.points(np.concatenate(cubes))
-        found: Evaluations = self._evaluate(Request(points, tangents=True, start=self._centre.prediction))
-        assert found.tangents is not None
-        self.each = each
-        self._reasons |= {failure.reason for failure in found.failures}
-
-        def longer(kept: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
-            return np.concatenate([kept, new.reshape(R, -1, *kept.shape[2:])], axis=1)
-
-        self.points, self.outputs = longer(self.points, points), longer(self.outputs, found.outputs)
-        self.tangents, self.ok = longer(self.tangents, found.tangents), longer(self.ok, found.ok)
 
     def _sums(self, each: int) -> tuple[FloatArray, FloatArray]:
         """Sums (R', J, m) of what is averaged, over the scrambles that have answers, and their numbers (R',)."""
+        self.check(each)
         ok = self.ok[:, :each]
         some = ok.any(axis=1)
-        if some.sum() < 2:
-            reasons = "; ".join(sorted(self._reasons)[:3])
-            raise SolveError(f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}")
         ok, points = ok[some], self.points[some, :each]
         tangents = np.where(ok[..., None, None], self.tangents[some, :each], 0.0)
         scaled = tangents * self._centre.coordinates.steps(points)[:, :, None, :]
@@ -318,7 +279,7 @@ class _Samples:
         deviation = self.outputs[:, :each] - centre.middle
         if not self.ok[:, :each].all():
             return deviation, deviation**2
-        prediction = centre.coordinates.of(self.points[:, :each]) @ centre.output_slopes.T
+        prediction = centre.predicted(self.points[:, :each])
         return deviation - prediction, deviation**2 - prediction**2 + (centre.output_slopes**2).sum(axis=1)
 
     def _from_means(self, means: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -371,10 +332,9 @@ class _Samples:
         """Return all estimates as labelled arrays."""
         method, inputs = self._method, self._inputs
         points, values, ok = (in_order(a) for a in (self.points, self.outputs, self.ok))
-        scramble = np.tile(np.arange(method.scrambles), self.each)
+        scramble = self.scramble
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], method.quantiles)
-        rounds = [1 << k for k in range(self.each.bit_length()) if self.ok[:, : 1 << k].any(axis=1).sum() > 1]
-        moments = {method.scrambles * each: self._moments(each) for each in rounds}
+        moments = {method.scrambles * each: self._moments(each) for each in self.rounds}
         last = moments[method.scrambles * self.each]
         local = self._centre.output_slopes**2
         logarithmic = inputs.coordinates.logarithmic

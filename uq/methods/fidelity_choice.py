@@ -18,13 +18,13 @@ from forward.findings import Finding
 from forward.model import FloatArray
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, correlations
-from uq.estimators.moments import Estimates, ratio
+from uq.estimators.moments import ratio
 from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
 from uq.estimators.subsampled_difference import FLOOR, Chosen, Design, Pool, Pooled, choice
 from uq.estimators.tails import with_tails
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Fidelities, Taken
-from uq.methods.fidelity_ways import FEWEST, UNLIMITED, sizes
+from uq.methods.fidelity_ways import FEWEST, UNLIMITED, Way
 
 TRIED = 60  # numbers of full solves
 OF_POOL = 0.5  # largest part of a pool that is chosen
@@ -51,7 +51,7 @@ class _Taken:
         return np.isin(np.arange(self.pool.count), self.pool.chosen)
 
 
-class ByChoice:
+class ByChoice(Way):
     """A pool of all cheap models, and full solves of those points where two of them differ.
 
     Attributes
@@ -60,8 +60,11 @@ class ByChoice:
         What all pools so far tell.
     """
 
+    found: Chosen
+
     def __init__(self, team: Fidelities, pilot: Found, *, known: bool) -> None:
-        self._team, self._known = team, known
+        super().__init__(team)
+        self._known = known
         self._all = team.groups.index(tuple(range(1, len(team.members))))
         g = PILOT if PILOT in team.taken else 0
         first = team.taken[g]
@@ -70,12 +73,7 @@ class ByChoice:
         best = np.argsort(-follows, kind="stable")[:2] + 1
         self._pair = (int(best[0]), int(best[1]))
         self._pools: list[_Taken] = []
-        self.found = self._estimated()
-
-    @property
-    def estimates(self) -> Estimates:
-        """Mean and standard deviation."""
-        return self.found.estimates
+        self._estimate()
 
     def _pool(self, taken: Taken, chosen: NDArray[np.intp]) -> Pool:
         """A pool of points of which these are chosen."""
@@ -90,13 +88,14 @@ class ByChoice:
             pools = [self._pilot.pool, *pools]
         return Pooled(pools, self._team.slopes, self._team.inputs.correlation, self._known)
 
-    def _estimated(self) -> Chosen:
+    def _estimate(self) -> None:
         team, pooled = self._team, self._pooled()
         found = pooled.estimated(team.offsets[0])
         parts = found.rest[1] * len(found.rows), found.cheap[1] * len(found.cheap[1])
         moved = [one - one.mean(axis=0) for one in parts]
         values = team.offsets[0] + found.predicted
-        return replace(found, estimates=with_tails(found.estimates, team.inputs, moved, values, of=1))
+        self.estimates = with_tails(found.estimates, team.inputs, moved, values, of=1)
+        self.found = replace(found, estimates=self.estimates)
 
     def _design(self) -> Design:
         """Which differences count now."""
@@ -121,7 +120,7 @@ class ByChoice:
         per_point, least = float(team.costs[self._all]), min(FEWEST, cost / 2)
         full = np.geomspace(least, max(OF_POOL * cost / (per_point + OF_POOL), least), TRIED)[:, None]
         more = (cost - full) / per_point
-        variances = (ratio(rest, before + full) + cheap / (points + more)) / sizes(self.estimates) ** 2
+        variances = (ratio(rest, before + full) + cheap / (points + more)) / self.estimates.size**2
         i = int(variances.max(axis=1).argmin())
         number = int(full[i, 0] + 1e-9)
         return Amounts(number, int((cost - number) / per_point + 1e-9), float(variances[i].max()))
@@ -156,7 +155,7 @@ class ByChoice:
         values = taken.values[rows, 0] - team.offsets[0]
         pool = replace(pool, chosen=rows, values=values, design=design, floor=floor, intensity=intensity)
         self._pools.append(_Taken(pool, taken))
-        self.found = self._estimated()
+        self._estimate()
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs."""
@@ -192,15 +191,11 @@ class ByChoice:
         relative = ratio(found.estimates.std_error, found.estimates.std)
         yield from of_tails(team.evaluate.outputs, values, relative, moved - moved.mean(axis=0))
 
-    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
-        found, e = self.found, self.found.estimates
-        centred = found.predicted - found.predicted.mean(axis=0)
-        kurtosis = ratio((centred**4).mean(axis=0), (centred**2).mean(axis=0) ** 2, empty=3.0)
-        plain = (e.std**2, (kurtosis - 1) * e.std**4)
-        for which, (variance, error) in enumerate(zip(plain, (e.mean_error, 2 * e.std * e.std_error), strict=True)):
-            gain = ratio(variance, error**2 * cost, empty=1.0)
-            yield gain, gain * np.sqrt(found.relative[which] + 4 * ratio(e.std_error, e.std) ** 2)
+    def _values(self) -> FloatArray:
+        return self.found.predicted
+
+    def _relative(self) -> FloatArray:
+        return self.found.relative
 
     @property
     def plain(self) -> tuple[FloatArray, FloatArray]:

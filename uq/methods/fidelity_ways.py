@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,21 +12,10 @@ from forward.findings import Finding
 from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Problem
 from uq.estimators.doubts import of_tails
-from uq.estimators.fidelities import Found, Samples, estimated, gains
-from uq.estimators.moments import (
-    Estimates,
-    Z,
-    combine,
-    controlled,
-    either,
-    estimate,
-    monomials,
-    ratio,
-    student,
-    term,
-)
+from uq.estimators.fidelities import Found, Samples, estimated
+from uq.estimators.moments import Estimates, Z, combine, controlled, either, estimate, monomials, ratio, student, term
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
-from uq.estimators.tails import influences, with_tails
+from uq.estimators.tails import influences, kurtosis, with_tails
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Fidelities
 from uq.surrogates.field_regression import Deviations, deviations
@@ -39,15 +29,45 @@ ORDER = 6  # largest order of the expansion
 UNLIMITED = 1e9
 
 
-class OfSamples:
-    """A way by samples of a team, of which a pilot tells something (`pilot`)."""
+class Way:
+    """A way to spend what a study has on a team.
 
-    def __init__(self, team: Fidelities, pilot: Found) -> None:
-        self._team, self.pilot = team, pilot
+    Attributes
+    ----------
+    estimates
+        Mean and standard deviation.
+    """
+
+    estimates: Estimates
+
+    def __init__(self, team: Fidelities) -> None:
+        self._team = team
 
     def blocks(self) -> list[Block]:
         """What was taken."""
         return self._team.blocks()
+
+    def _values(self) -> FloatArray:
+        """Outputs (n, m) of the study's model, or what stands for them."""
+        return own_values(self._team)
+
+    @abstractmethod
+    def _relative(self) -> FloatArray:
+        """Relative variances (2, m) of the squared errors of mean and variance, or (1, m) that of the mean alone."""
+
+    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
+        e = self.estimates
+        errors = (e.std**2, e.mean_error), ((kurtosis(self._values()) - 1) * e.std**4, 2 * e.std * e.std_error)
+        for (variance, error), relative in zip(errors, self._relative(), strict=False):
+            gain = ratio(variance, error**2 * cost, empty=1.0)
+            yield gain, gain * np.sqrt(relative + 4 * ratio(e.std_error, e.std) ** 2)
+
+
+class OfPilot(Way):
+    """A way by samples of groups, of which a pilot tells something (`pilot`)."""
+
+    pilot: Found
 
     @property
     def plain(self) -> tuple[FloatArray, FloatArray]:
@@ -56,7 +76,7 @@ class OfSamples:
         return plain, np.einsum("mkk->mk", self.pilot.covariance)[:, 0]
 
 
-class ByModels(OfSamples):
+class ByModels(OfPilot):
     """Groups of models that share their samples.
 
     Attributes
@@ -65,10 +85,12 @@ class ByModels(OfSamples):
         What all samples so far tell.
     """
 
+    found: Found
+
     def __init__(self, team: Fidelities) -> None:
-        self._team = team
-        self.found = self._estimated()
-        super().__init__(team, self.found)
+        super().__init__(team)
+        self._estimate()
+        self.pilot = self.found
 
     def _samples(self) -> tuple[list[Samples], Samples | None]:
         """All groups that count, the pilot as long as nothing else was taken; and one that tells weights only."""
@@ -82,29 +104,20 @@ class ByModels(OfSamples):
         samples, apart = self._samples()
         return quantiles_of_groups(samples, self._team.offsets[0], probabilities, apart)
 
-    def _estimated(self) -> Found:
+    def _estimate(self) -> None:
         team = self._team
         samples, apart = self._samples()
         found = estimated(samples, team.offsets[0], team.variances, apart)
-        return replace(found, estimates=with_tails(found.estimates, team.inputs, found.moved, own_values(team)))
+        self.estimates = with_tails(found.estimates, team.inputs, found.moved, own_values(team))
+        self.found = replace(found, estimates=self.estimates)
 
-    @property
-    def estimates(self) -> Estimates:
-        """Mean and standard deviation."""
-        return self.found.estimates
-
-    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances."""
-        return gains(own_values(self._team), cost, self.found)
-
-    def _sizes(self) -> FloatArray:
-        """What errors of means are relative to (m,)."""
-        return sizes(self.estimates)
+    def _relative(self) -> FloatArray:
+        return self.found.relative
 
     def _problem(self) -> Problem | None:
         """How to choose numbers; None if controls leave nothing."""
         team = self._team
-        found = self.found.problem(team.groups, team.costs, team.counts(), self._sizes())
+        found = self.found.problem(team.groups, team.costs, team.counts(), self.estimates.size)
         return found if len(found.told) else None
 
     def expected(self, cost: float) -> float:
@@ -139,7 +152,7 @@ class ByModels(OfSamples):
         for g in np.flatnonzero(numbers):
             team.take(int(g), int(numbers[g]))
         if numbers.any():
-            self.found = self._estimated()
+            self._estimate()
 
     def doubts(self) -> Iterator[Finding]:
         """Find what a few samples decide."""
@@ -159,7 +172,7 @@ def _share(found: Found, i: int) -> FloatArray:
     return ratio(errors[i], errors.sum(axis=0))
 
 
-class ByExpansion(OfSamples):
+class ByExpansion(OfPilot):
     """An expansion fitted to the pilot, and samples of the study's model that correct what it leaves.
 
     Attributes
@@ -169,8 +182,8 @@ class ByExpansion(OfSamples):
     """
 
     def __init__(self, team: Fidelities, told: Found, fitted: Deviations, scale: Estimates) -> None:
-        super().__init__(team, told)
-        self._fitted, self._scale = fitted, scale
+        super().__init__(team)
+        self.pilot, self._fitted, self._scale = told, fitted, scale
         self._control: Control = expansion(fitted)
         self._repeats = [expansion(one) for one in fitted.repeats]
         self.left: FloatArray = np.maximum(fitted.relative, fitted.trial.relative) * scale.std
@@ -180,7 +193,7 @@ class ByExpansion(OfSamples):
     def of(cls, team: Fidelities, told: Found) -> ByExpansion | None:
         """Fit to values, and gradients where there are some, at the pilot; None if that is impossible."""
         pilot, centre = team.members[0].first, team.members[0].centre
-        if pilot is None or objection(team.inputs, "multifidelity") is not None:
+        if pilot is None or objection(team.inputs, "") is not None:
             return None
         ok = pilot.ok
         tangents = None if pilot.tangents is None else pilot.tangents[ok]
@@ -198,16 +211,14 @@ class ByExpansion(OfSamples):
             Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
         )
 
-    def gains(self, cost: float) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield how many plain samples each unit of cost was worth, and the standard error, for means."""
-        gain = ratio(self.plain[0], self.estimates.mean_error**2 * cost, empty=1.0)
-        yield gain, gain * np.sqrt(2 / len(own_values(self._team)))
+    def _relative(self) -> FloatArray:
+        return np.full((1, self.left.size), 2 / len(own_values(self._team)))
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs, of the samples of the study's model alone."""
-        return quantiles(self._values()[1], probabilities)
+        return quantiles(self._alone()[1], probabilities)
 
-    def _values(self) -> tuple[FloatArray, FloatArray]:
+    def _alone(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, d) and outputs (n, m) of samples of the study's model alone that have an answer."""
         samples, taken = self._team.samples(self._own), self._team.taken[self._own]
         return taken.points[samples.answered], taken.values[samples.answered, 0]
@@ -220,7 +231,7 @@ class ByExpansion(OfSamples):
     def expected(self, cost: float) -> float:
         """Predict the largest relative variance of a mean with so many samples more."""
         before = self._team.counts()[self._own]
-        return float(ratio(self.left**2, sizes(self._scale) ** 2).max() / (before + max(cost, 1)))
+        return float(ratio(self.left**2, self._scale.size**2).max() / (before + max(cost, 1)))
 
     def needed(self, target: float) -> float:
         """Predict what has to be spent for a largest relative variance."""
@@ -244,13 +255,13 @@ class ByExpansion(OfSamples):
         claims, without = (np.hypot(one.mean_error, one.std_error) for one in (found, plain))
         stands = agree(found, plain) & (claims <= without)
         self.estimates = either(stands, found, plain)
-        values = self._values()[1]
+        values = self._alone()[1]
         self._moved = np.where(stands, moved, influences(values - team.offsets[0], (values - team.offsets[0]) ** 2))
 
     def _controlled(self) -> tuple[Estimates, FloatArray]:
         """Estimates with the expansion as control, and the influences (n, m) of the samples on the variance."""
         team, offset = self._team, self._team.offsets[0]
-        points, values = self._values()
+        points, values = self._alone()
         values = values - offset
         shift = offset - team.members[0].centre.outputs  # the expansion is one of deviations from these
 
@@ -264,8 +275,7 @@ class ByExpansion(OfSamples):
         controls = centred(self._control)
         found = combine(offset, [term(values, values**2, controls)])
         first, squares = controlled(values, values**2, controls)
-        moved = squares - 2 * first.mean(axis=0) * first
-        moved = moved - moved.mean(axis=0)
+        moved = influences(first, squares)
         factor = student(max(len(values) - 1, 1)) / Z
         others = [centred(one) for one in self._repeats]
         C, D = (np.array([one[i] - controls[i] for one in others]) for i in range(2))
@@ -290,15 +300,9 @@ class ByExpansion(OfSamples):
     def doubts(self) -> Iterator[Finding]:
         """Find what a few samples decide."""
         team = self._team
-        values = self._values()[1]
+        values = self._alone()[1]
         relative = self.estimates.relative_std_error
         yield from of_tails(team.evaluate.outputs, values, relative, self._moved, expanded=True)
-
-
-def sizes(estimates: Estimates) -> FloatArray:
-    """Return what errors of means are relative to (m,): the mean, or the standard deviation where that is larger."""
-    found = np.maximum(np.abs(estimates.mean), estimates.std)
-    return np.where(found > 0, found, 1.0)
 
 
 def own_values(team: Fidelities) -> FloatArray:

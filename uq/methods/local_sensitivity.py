@@ -28,13 +28,7 @@ class LocalSensitivity(Method):
         return 1
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Linearise at the mean parameters.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer there.
-        """
+        """Linearise at the mean parameters."""
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
             raise ModelError(message)

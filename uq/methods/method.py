@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -31,7 +31,18 @@ TEXTBOOK = 15  # ratio of the times of a solve from zero and a predicted one, at
 
 
 class Method(Settings):
-    """A method: random parameters and an evaluation of models in, a dataset out."""
+    """A method: random parameters and an evaluation of models in, a dataset out.
+
+    Attributes
+    ----------
+    undecided
+        What the planned solves are for, if they decide how many more there are; otherwise empty.
+    in_turn
+        Whether it takes draws of equal weight in turn (`Inputs.random`).
+    """
+
+    undecided: ClassVar[str] = ""
+    in_turn: ClassVar[bool] = False
 
     if TYPE_CHECKING:  # a field of every kind
 
@@ -58,8 +69,8 @@ class Method(Settings):
 
     @property
     def aims(self) -> bool:
-        """Whether it can stop as soon as errors are those of a goal (`until`)."""
-        return False
+        """Whether it can stop as soon as errors are those of a goal: methods that have an `until` of their own."""
+        return type(self).until is not Method.until
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
         """Solve and estimate as `run` does, until the errors of means and standard deviations are those of a goal.
@@ -80,16 +91,6 @@ class Method(Settings):
     @property
     def open_ended(self) -> bool:
         """Whether fewer solves than planned may be enough."""
-        return False
-
-    @property
-    def undecided(self) -> str:
-        """What the planned solves are for, if they decide how many more there are; otherwise empty."""
-        return ""
-
-    @property
-    def in_turn(self) -> bool:
-        """Whether it takes draws of equal weight in turn (`Inputs.random`)."""
         return False
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
 from uq.estimators.doubts import of_control, of_field_tails, of_tails
+from uq.estimators.estimate import Variables
 from uq.estimators.moments import (
     POWERS,
     Coefficient,
@@ -63,6 +64,7 @@ class MonteCarlo(Amount):
         Whether mean and standard deviation of the displacement field are computed at each node.
     """
 
+    in_turn: ClassVar[bool] = True
     kind: Literal["monte-carlo"] = "monte-carlo"
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
@@ -81,11 +83,6 @@ class MonteCarlo(Amount):
         """Random points."""
         return ("random",)
 
-    @property
-    def in_turn(self) -> bool:
-        """It takes each draw once before any twice."""
-        return True
-
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
 
@@ -94,20 +91,8 @@ class MonteCarlo(Amount):
         xarray.Dataset
             Estimates by output (`mean`, `mean_error`, `std`, `std_error`, `quantiles`, …) and, with `fields`, by node
             and component (`field_mean`, …); samples (`points`, `values`, `ok`); see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters or at fewer than two samples.
-        ModelError
-            If the tangent is the control, and the model has no derivatives.
         """
         return self.until(inputs, evaluate, None)
-
-    @property
-    def aims(self) -> bool:
-        """It can stop at a goal."""
-        return True
 
     @property
     def _control(self) -> tuple[Coefficient, SecondMoment] | None:
@@ -215,10 +200,8 @@ def _scalar_moments(
     if control is None:
         plain = estimate(monomials(values - centre.outputs, None).sum(axis=1), n, centre.outputs)
         return counted(plain, inputs, values)
-    deviations, slopes = values - centre.middle, centre.output_slopes
-    predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
-    variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
-    found = estimate_from_samples(deviations, predictions, centre.middle, variance, *control)
+    predictions, variance = centre.predicted(evaluations.points[ok]), centre.predicted_variance(inputs.correlation)
+    found = estimate_from_samples(values - centre.middle, predictions, centre.middle, variance, *control)
     return counted(found, inputs, values, _controlled(evaluations, centre, found))
 
 
@@ -226,7 +209,7 @@ def _controlled(evaluations: Evaluations, centre: Linearisation, found: Estimate
     """Samples (n, m) of the first two moments that have an answer, with the tangent as control."""
     ok = evaluations.ok
     first = evaluations.outputs[ok] - centre.middle
-    predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
+    predicted = centre.predicted(evaluations.points[ok])
     return first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2
 
 
@@ -296,7 +279,7 @@ def _dataset(
     return dataset
 
 
-def by_node(field: Estimates, displacements: int) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+def by_node(field: Estimates, displacements: int) -> Variables:
     """Return estimates of a state, whose first entries are displacements, as arrays by node and component."""
     return {
         f"field_{name}": (("node", "component"), values[:displacements].reshape(-1, 3))

@@ -13,7 +13,7 @@ correct what it leaves.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,7 @@ class Multifidelity(Amount):
         Seed of the random points; every group of models has its own stream.
     """
 
+    undecided: ClassVar[str] = "linearisations and the pilot"
     kind: Literal["multifidelity"] = "multifidelity"
     cheap: Annotated[tuple[Annotated[CheapModel, OfKind(CHEAP)], ...], Field(min_length=1, max_length=MOST_MODELS)]
     pilot: Annotated[int, Field(ge=FEWEST)] | None = None
@@ -121,11 +122,6 @@ class Multifidelity(Amount):
     def limit(self) -> float:
         """What may be spent, in solves of the study's model."""
         return float(self.samples or UNLIMITED)
-
-    @property
-    def undecided(self) -> str:
-        """What the planned solves are for."""
-        return "linearisations and the pilot"
 
     def planned(self, dimension: int) -> int:
         """Number of solves of linearisations and pilot on all models, which decide how many more are needed."""
@@ -180,13 +176,6 @@ class Multifidelity(Amount):
             Estimates by output (`mean`, `mean_error`, `std`, `std_error`, `quantiles`, …), the `gain` over plain Monte
             Carlo, what each model costs and how it is correlated (`fidelity_…`), what was taken of each group
             (`group_…`), and what other methods are predicted to need (`alternative_solves`); see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If a model has no answer at the mean parameters, or too few samples have answers of all models.
-        ValueError
-            If a cheap model without unknowns has no `cost`.
         """
         recorder = Recorder(evaluate)
         team = Fidelities(self.cheap, inputs, recorder, self.seed, controlled=self.control != "none")
@@ -199,7 +188,9 @@ class Multifidelity(Amount):
         cost = max(min(cost, self._left(team)), FEWEST)
         way: ByModels | ByExpansion | ByChoice = self._full_solves(team, models, cost)
         if expansion is not None and expansion.expected(cost) < BETTER * way.expected(cost):
-            told.append(preferred(way.expected(cost), expansion.expected(cost)))
+            by_models, better = way.expected(cost), expansion.expected(cost)
+            times = f"{by_models / better:.3g} times" if better > 0 else "infinitely"
+            told.append(Finding("expansion-instead", "note", {"times": times}))
             way = expansion
             way.spend(max(FEWEST, min(cost, MOST_GROWTH * team.spent)))
         elif not self.reuse:
@@ -247,7 +238,8 @@ def described(
     by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
     estimates, pilot, blocks = way.estimates, models.pilot, way.blocks()
     dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=True)
-    K = len(team.members)
+    K, together = len(team.members), team.samples(PILOT if PILOT in team.taken else 0)
+    centred = together.deviations[together.answered] - together.deviations[together.answered].mean(axis=0)
     inside = np.array([np.isin(np.arange(K), one.group) for one in blocks])
     sizes_of = np.array([len(one.taken.points) for one in blocks])
     dataset = dataset.assign_coords(fidelity=[one.label for one in team.members], group=np.arange(len(blocks)))
@@ -257,7 +249,7 @@ def described(
             "fidelity_cost": (fidelity, np.array([one.cost for one in team.members])),
             "fidelity_samples": (fidelity, sizes_of @ inside),
             "fidelity_nominal": (("output", "fidelity"), np.array([m.centre.outputs for m in team.members]).T),
-            "fidelity_correlation": (("output", "fidelity"), plain_correlations(team)),
+            "fidelity_correlation": (("output", "fidelity"), correlations(np.einsum("nkm,nlm->mkl", centred, centred))),
             "fidelity_remainder_correlation": (("output", "fidelity"), correlations(pilot.covariance)),
             "group_models": (("group", "fidelity"), inside),
             "group_pilot": (group, np.array([one.pilot for one in blocks])),
@@ -323,14 +315,6 @@ def rarely_failing(team: Fidelities, asked: NDArray[np.bool_], answered: NDArray
             yield Finding("cheap-model-fails", "warning", {"model": one.label, "lost": lost, "asked": of, "few": few})
 
 
-def plain_correlations(team: Fidelities) -> FloatArray:
-    """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
-    samples = team.samples(PILOT if PILOT in team.taken else 0)
-    deviations = samples.deviations[samples.answered]
-    centred = deviations - deviations.mean(axis=0)
-    return correlations(np.einsum("nkm,nlm->mkl", centred, centred))
-
-
 def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool) -> Finding:
     """Say what other methods are predicted to need for the errors that were reached."""
     words = {
@@ -346,12 +330,6 @@ def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool
         instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least
         return Finding("fidelities-not-worth", "note", values | {"instead": instead})
     return Finding("fidelities-expansion-taken" if expanded_used else "fidelities-compared", "note", values)
-
-
-def preferred(by_models: float, by_expansion: float) -> Finding:
-    """Say that an expansion takes the place of the cheap models."""
-    times = f"{by_models / by_expansion:.3g} times" if by_expansion > 0 else "infinitely"
-    return Finding("expansion-instead", "note", {"times": times})
 
 
 def useless(team: Fidelities, found: Found) -> Iterator[Finding]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -67,6 +67,7 @@ class MultilevelMonteCarlo(Amount):
         Seed of the random points; every mesh has its own stream.
     """
 
+    undecided: ClassVar[str] = "linearisations and pilots"
     kind: Literal["multilevel-monte-carlo"] = "multilevel-monte-carlo"
     levels: Annotated[int, Field(ge=2, le=10)] = 3
     pilot: Annotated[int, Field(ge=4)] = 8
@@ -82,11 +83,6 @@ class MultilevelMonteCarlo(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves of the linearisations and pilots on all meshes, which decide how many more are needed."""
         return self.levels + self.pilot * (2 * self.levels - 1)
-
-    @property
-    def undecided(self) -> str:
-        """What the planned solves are for."""
-        return "linearisations and pilots"
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
         """Return the body on the finer meshes."""
@@ -114,14 +110,6 @@ class MultilevelMonteCarlo(Amount):
             Estimates by output (`mean`, `mean_error`, `std`, `std_error`, and the errors `bias_error` of the mesh and
             `total_error`), what was found on each mesh (`mesh_…` by level), rates of convergence and samples; see
             docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters on one of the meshes, or on both meshes of fewer than two
-            samples of a difference.
-        ValueError
-            If the model has no derivatives, which the control needs.
         """
         if self.control != "none" and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
@@ -135,7 +123,7 @@ class MultilevelMonteCarlo(Amount):
             meshes.refine()
         while True:
             found = Found.of(meshes)
-            reached = float(found.relative(found.total_error).max())
+            reached = float((found.total_error / found.estimates.size).max())
             left = self._left(recorder)
             allocation = _allocate(self, meshes, found, left)
             if self.met(reached):
@@ -157,7 +145,7 @@ class MultilevelMonteCarlo(Amount):
         """Whether a finer mesh is the next step."""
         if len(meshes.members) == self.levels or not meshes.affords_finer(left):
             return False
-        error = float(found.relative(found.bias_error).max())
+        error = float((found.bias_error / found.estimates.size).max())
         if self.tolerance is not None:
             # First sample as if there were no finer mesh: only this shows how far the mesh error can be trusted.
             return allocation.settled and 2 * error**2 > self.tolerance**2
@@ -166,7 +154,8 @@ class MultilevelMonteCarlo(Amount):
     def _why(self, meshes: Meshes, found: Found, reached: float, allocation: _Allocation) -> str:
         blocks = meshes.blocks()
         counts = " + ".join(str(len(one.taken.points)) for one in blocks)
-        mesh, sampling = (float(found.relative(e).max()) for e in (found.bias_error, found.estimates.mean_error))
+        mesh = float((found.bias_error / found.estimates.size).max())
+        sampling = float(found.estimates.relative_error.max())
         error = f"relative total error {reached:.3g} (mesh {mesh:.2g}, sampling {sampling:.2g})"
         amount = f"{counts} samples on {len(blocks)} meshes"
         if self.tolerance is not None and mesh > self.tolerance and len(blocks) == self.levels:
@@ -292,7 +281,7 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Meshes, found: Found, left: 
     counts = np.array([float(len(one.ok)) for one in meshes.blocks()])
     limit = float(method.samples or UNLIMITED)
     # Relative to the square of what the tolerance is relative to.
-    variances = found.relative(found.relative(np.array([one.term.variance for one in found.levels])))
+    variances = np.array([one.term.variance for one in found.levels]) / found.estimates.size**2
     variances = np.maximum(variances, 1e-30)
     if len(counts) >= FIRST_MESHES:
         # A few samples may agree by chance: no finer mesh is assumed to vary much less than expected.
@@ -329,7 +318,7 @@ def _target(method: MultilevelMonteCarlo, meshes: Meshes, found: Found, unit: fl
     assert method.tolerance is not None
     allowed = method.tolerance**2
     # A little more than its estimate, so that the total is met when sampling meets its share.
-    remaining = allowed - (1.001 * float(found.relative(found.bias_error).max())) ** 2
+    remaining = allowed - (1.001 * float((found.bias_error / found.estimates.size).max())) ** 2
     if remaining >= allowed / 2:
         return remaining
     # Less than half is left: sample for it if that is cheaper than another mesh.

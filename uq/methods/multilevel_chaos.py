@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import WORK, FloatArray
+from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments
 from uq.estimators.moments import ESTIMATES, Moments, estimate, monomials, ratio
 from uq.evaluation.evaluate import Recorder
@@ -105,7 +106,7 @@ class MultilevelChaos(Amount):
         if self.order > inputs.largest_degree:
             most = inputs.largest_degree
             return f"the draws tell polynomials up to degree {most} apart, expected at most that as method.order"
-        return objection(inputs, self.kind)
+        return objection(inputs, f"method.kind = '{self.kind}'")
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find that there is no solver that could be stopped early."""
@@ -136,13 +137,6 @@ class MultilevelChaos(Amount):
             As in `uq.methods.chaos.Chaos`, from the last level; the same moments from its samples with the expansion of
             the level before as control variate (`control_mean`, …); and by level what it has cost and reached
             (`level_residual`, `level_change`, …); see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, or at too many samples of a level.
-        ValueError
-            If the parameters are correlated, or the samples fewer than the terms.
         """
         d = len(inputs.names)
         for refusal in (self.objection(inputs), self.shortage(d)):
@@ -248,7 +242,7 @@ def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | 
     if first == "tangent" and centre.prediction is not None:
         return centre.prediction
     none = np.zeros((len(centre.point), centre.state.size))
-    return Prediction(centre.point, centre.state, none, centre.coordinates, centre.spread, centre.joined)
+    return Prediction(centre.reference, none, centre.coordinates)
 
 
 def _of_tangent(centre: Linearisation, count: int) -> _Known:
@@ -283,7 +277,7 @@ def _controlled(data: Data, known: _Known) -> Moments:
     return estimate(sums, len(data.points), known.mean, known.std**2)
 
 
-def _by_level(levels: list[_Level]) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+def _by_level(levels: list[_Level]) -> Variables:
     """Cost and progress of the levels."""
     residuals = [level.found.residuals[level.found.ok] for level in levels]
     by_output = ("level", "output")

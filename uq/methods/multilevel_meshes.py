@@ -20,8 +20,18 @@ from itertools import pairwise
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from uq.estimators.moments import Estimates, Moments, Term, combine, controlled, estimate, monomials, ratio, term
-from uq.estimators.tails import with_tails
+from uq.estimators.moments import (
+    Estimates,
+    Moments,
+    Term,
+    combine,
+    controlled,
+    estimate,
+    monomials,
+    ratio,
+    term,
+)
+from uq.estimators.tails import influences, kurtosis, with_tails
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN
 from uq.inputs.random_parameters import Inputs
@@ -105,9 +115,8 @@ class Meshes(Team):
         centres = [self.members[k].centre for k in of.group]
         parts, sums = [], []
         for k, centre in zip(of.group, centres, strict=True):
-            slopes, w = centre.output_slopes, values[:, k] - centre.middle
-            V = np.einsum("mi,ij,mj->m", slopes, self.inputs.correlation, slopes)
-            T = centre.coordinates.of(points) @ slopes.T
+            w, T = values[:, k] - centre.middle, centre.predicted(points)
+            V = centre.predicted_variance(self.inputs.correlation)
             parts.append(np.array([w, w**2, T, T**2 - V]))
             sums.append((monomials(w, T if self._controlled else None).sum(axis=1), V if self._controlled else None))
         first, second, *controls = parts[0] - sum(parts[1:])
@@ -155,9 +164,7 @@ class Level:
 
     def moved(self, mean: FloatArray) -> FloatArray:
         """By how much each sample (n, m) moves the variance on the finest mesh, with the mean (m,) of w there."""
-        first, second = controlled(self.first, self.second, self.controls)
-        moved = second - 2 * mean * first
-        return np.asarray(moved - moved.mean(axis=0))
+        return influences(*controlled(self.first, self.second, self.controls), mean)
 
     @property
     def variance(self) -> FloatArray:
@@ -167,9 +174,7 @@ class Level:
     @property
     def kurtosis(self) -> FloatArray:
         """Fourth central moment over the squared variance (m,) of the controlled difference."""
-        r = self.first if self.controls is None else self.first - self.controls[0]
-        r = r - r.mean(axis=0)
-        return ratio((r**4).mean(axis=0), (r**2).mean(axis=0) ** 2, empty=3.0)
+        return kurtosis(self.first if self.controls is None else self.first - self.controls[0])
 
 
 @dataclass(frozen=True)
@@ -240,11 +245,6 @@ class Found:
     def total_error(self) -> FloatArray:
         """Error (m,) of the mean, of sampling and mesh."""
         return np.hypot(self.bias_error, self.estimates.mean_error)
-
-    def relative(self, error: FloatArray) -> FloatArray:
-        """An error (…, m) over the mean, or over the standard deviation if that is larger."""
-        scale = np.maximum(np.abs(self.estimates.mean), self.estimates.std)
-        return ratio(error, np.broadcast_to(scale, error.shape))
 
 
 def _consistency(coarser: Level, finer: Level) -> FloatArray:

@@ -8,7 +8,7 @@ their scatter gives an honest standard error without any assumption on the smoot
 from __future__ import annotations
 
 from math import comb
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -23,12 +23,13 @@ from uq.evaluation.request import Evaluate, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
+from uq.methods.chaos import objection
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.methods.scrambles import Scrambles
 from uq.surrogates.basis import FULL, ROWS_PER_TERM
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.taylor import expansion, held_expansion, quadratic, tangent
+from uq.surrogates.taylor import expansion, quadratic, tangent
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,6 +80,7 @@ class QuasiMonteCarlo(MonteCarlo):
         of ranks as points in a scramble have work.
     """
 
+    in_turn: ClassVar[bool] = False  # Sobol' points lead to draws by their weights
     kind: Literal["quasi-monte-carlo"] = "quasi-monte-carlo"  # type: ignore[assignment]
     scrambles: Annotated[int, Field(ge=2)] = 16
     control: Literal["none", "tangent", "quadratic", "chaos"] = "tangent"
@@ -109,11 +111,6 @@ class QuasiMonteCarlo(MonteCarlo):
         """Number of samples to which the control variate is fitted."""
         return max(0, samples - self.limit)
 
-    @property
-    def in_turn(self) -> bool:
-        """Sobol' points lead to draws by their weights."""
-        return False
-
     def stream(self) -> tuple[Any, ...] | None:
         """Scrambled Sobol' points."""
         return "sobol", self.scrambles
@@ -129,11 +126,7 @@ class QuasiMonteCarlo(MonteCarlo):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters do not allow the control, or None."""
-        if self.control == "chaos" and inputs.correlations:
-            return (
-                "polynomial chaos needs independent parameters, expected no correlations for method.control = 'chaos'"
-            )
-        return None
+        return objection(inputs, "method.control = 'chaos'") if self.control == "chaos" else None
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -144,14 +137,6 @@ class QuasiMonteCarlo(MonteCarlo):
             As in `MonteCarlo`, with the scramble of each sample (`scramble`), its worth in plain samples
             (`variance_ratio`, `std_variance_ratio`) and the estimates from the first points of all scrambles
             (`running_mean`, `running_mean_error`); see docs/results.md.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer at the mean parameters, at one of the points that the quadratic control needs,
-            or in fewer than two scrambles (four with the optimal coefficient), or at too many samples of the fit.
-        ValueError
-            If the model has no derivatives, which controls need, or the chaos control has correlated parameters.
         """
         return self.until(inputs, evaluate, None)
 
@@ -162,9 +147,9 @@ class QuasiMonteCarlo(MonteCarlo):
 
         Its samples must not be among those of the scrambles. Results and errors as in `run`.
         """
-        objection = self.objection(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refusal = self.objection(inputs)
+        if refusal is not None:
+            raise ValueError(refusal)
         if self.control != "none" and expanded is None and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ModelError(message)
@@ -175,15 +160,16 @@ class QuasiMonteCarlo(MonteCarlo):
             control = tangent(inputs, centre)
         elif self.control == "quadratic":
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
-        fitted = held = None
+        fitted = None
         start: Start | None = centre.prediction
         if self.control == "chaos":
             fitted = expanded or self._expand(inputs, evaluate, centre)
-            control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
+            control, start = expansion(fitted), fitted.prediction or start
         growing: Evaluate = evaluate
         if self.fields and fitted is None:
             growing = grown(inputs, evaluate, centre, self.limit)
-        samples = Scrambles(self, inputs, growing, centre, control, held, start, fitted)
+        about = self.seed, self.scrambles, self.coefficient
+        samples = Scrambles(inputs, growing, centre, control, fitted, start, *about, fields=self.fields)
         most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
         last = power_of_two(most // self.scrambles)
         open_ended = self.open_ended or goal is not None
@@ -231,7 +217,7 @@ class QuasiMonteCarlo(MonteCarlo):
         # What plain Monte Carlo would claim from as many independent samples.
         plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
         plain = counted(plain, inputs, values[ok])
-        rounds = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
+        rounds = [(each, samples.scalars(each)) for each in samples.rounds]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
         dataset = dataset.assign_coords(quantile=list(self.quantiles), round=[samples.scrambles * n for n, _ in rounds])

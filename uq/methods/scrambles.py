@@ -5,9 +5,9 @@ The controls share the scrambles and their sums, hence one file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from forward.model import FloatArray, ForwardModel, Solution, SolveError, scatte
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
 from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed
-from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, Start
+from uq.evaluation.request import Evaluate, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis
@@ -60,35 +60,8 @@ class _FieldProducts(FieldSum):
         return rows
 
 
-class Asked(Protocol):
-    """What a method asks of its scrambles."""
-
-    @property
-    def seed(self) -> int:
-        """Of all scrambles."""
-
-    @property
-    def scrambles(self) -> int:
-        """Number R of scrambles, to begin with."""
-
-    @property
-    def fields(self) -> bool:
-        """Whether sums of the fields are kept."""
-
-    @property
-    def control(self) -> str:
-        """Name of the control variate."""
-
-    @property
-    def coefficient(self) -> Coefficient:
-        """Of the control."""
-
-
-class Scrambles:
-    """All scrambles, each of the same number of points, and the sums of the fields over each of them.
-
-    The sums are kept for every scramble, since a longer study goes on with them: 4 R fields on rank 0, 512 bytes for
-    each unknown with 16 scrambles, which is less than the factor of the stiffness that every model keeps.
+class Sets:
+    """Scrambles of the same number of points, and what a model answers there.
 
     Attributes
     ----------
@@ -96,31 +69,29 @@ class Scrambles:
         Number n of points of each scramble.
     points, outputs, ok
         (R, n, d), (R, n, m) and (R, n).
+    tangents
+        (R, n, m, d), if they are asked for.
     """
+
+    needed = 2  # scrambles with answers, for estimates
 
     def __init__(
         self,
-        asked: Asked,
         inputs: Inputs,
         evaluate: Evaluate,
-        centre: Linearisation,
-        control: Control | None,
-        held: Control | None,
         start: Start | None,
-        fitted: Deviations | None,
+        seed: int,
+        scrambles: int,
+        *,
+        tangents: bool = False,
+        fields: FieldSum | None = None,
     ) -> None:
-        self._asked, self._inputs, self._evaluate = asked, inputs, evaluate
-        self._centre, self._control, self._held, self._start, self._fitted = centre, control, held, start, fitted
-        repeats = () if fitted is None else fitted.repeats
-        self._repeats = [(expansion(one), held_expansion(inputs, one)) for one in repeats]
-        d, m = len(inputs.names), len(evaluate.outputs)
-        self._field_control = control if control is not None and len(control.state) else None
+        self._inputs, self._evaluate, self._seed = inputs, evaluate, seed
+        self._asked = Request(np.empty((0, len(inputs.names))), tangents=tangents, fields=fields, start=start)
         self.each = 0
-        self.points = np.empty((asked.scrambles, 0, d))
-        self.outputs = np.empty((asked.scrambles, 0, m))
-        self.ok = np.empty((asked.scrambles, 0), dtype=bool)
-        self._sums: list[FloatArray | None] = [None] * asked.scrambles
-        self._higher: FloatArray | None = None
+        d, m = len(inputs.names), len(evaluate.outputs)
+        self.points, self.outputs = np.empty((scrambles, 0, d)), np.empty((scrambles, 0, m))
+        self.tangents, self.ok = np.empty((scrambles, 0, m, d)), np.empty((scrambles, 0), dtype=bool)
         self._reasons: set[str] = set()
 
     @property
@@ -134,6 +105,93 @@ class Scrambles:
         return self.scrambles * self.each
 
     @property
+    def scramble(self) -> NDArray[np.int64]:
+        """Scramble (R n,) of each sample in the order of results."""
+        return np.tile(np.arange(self.scrambles), self.each)
+
+    def extend(self, each: int, scrambles: int | None = None) -> None:
+        """Go on to `each` points in every scramble, of which there may be more from now on."""
+        R = self.scrambles
+        if each > self.each:
+            self._take(range(R), self.each, each, axis=1)
+        if scrambles is not None and scrambles > R:
+            self._take(range(R, scrambles), 0, each, axis=0)
+        self.each = each
+
+    def _take(self, scrambles: range, start: int, stop: int, *, axis: int) -> None:
+        """Solve at points of some scrambles, from one number to another: all at once, or apart for sums."""
+        r, new = len(scrambles), stop - start
+        cubes = [sobol_points(self._seed, number, start, stop, len(self._inputs.names)) for number in scrambles]
+        points = self._inputs.points(np.concatenate(cubes))
+        parts = [points] if self._asked.fields is None else np.split(points, r)
+        found = [self._evaluate(replace(self._asked, points=part)) for part in parts]
+        for number, one in zip(scrambles, found, strict=False):
+            self._reasons |= {failure.reason for failure in one.failures}
+            if one.fields.size:
+                self._sum(number, one.fields)
+
+        def longer(kept: NDArray[Any], more: Sequence[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate([kept, np.concatenate(more).reshape(r, new, *kept.shape[2:])], axis=axis)
+
+        self.points = longer(self.points, [points])
+        self.outputs = longer(self.outputs, [one.outputs for one in found])
+        self.ok = longer(self.ok, [one.ok for one in found])
+        if self._asked.tangents:
+            self.tangents = longer(self.tangents, [one.tangents for one in found if one.tangents is not None])
+
+    def _sum(self, number: int, fields: FloatArray) -> None:
+        """Take the sums of the fields over more points of a scramble."""
+
+    def answered(self, each: int) -> int:
+        """Return how many scrambles have an answer among their first `each` points."""
+        return int(self.ok[:, :each].any(axis=1).sum())
+
+    @property
+    def rounds(self) -> list[int]:
+        """Powers of two up to the number of points of each scramble, of which enough scrambles have an answer."""
+        return [1 << k for k in range(self.each.bit_length()) if self.answered(1 << k) >= self.needed]
+
+    def check(self, each: int) -> None:
+        """Raise a SolveError unless enough scrambles have an answer among their first `each` points."""
+        if (found := self.answered(each)) < self.needed:
+            reasons = "; ".join(sorted(self._reasons)[:3])
+            raise SolveError(f"{found} of {self.scrambles} scrambles have an answer, expected more: {reasons}")
+
+
+class Scrambles(Sets):
+    """Scrambles with the controls of their moments, and the sums of the fields over each of them.
+
+    The sums are kept for every scramble, since a longer study goes on with them: 4 R fields on rank 0, 512 bytes for
+    each unknown with 16 scrambles, which is less than the factor of the stiffness that every model keeps.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        centre: Linearisation,
+        control: Control | None,
+        fitted: Deviations | None,
+        start: Start | None,
+        seed: int,
+        scrambles: int,
+        coefficient: Coefficient,
+        *,
+        fields: bool,
+    ) -> None:
+        field_control = control if control is not None and len(control.state) else None
+        wanted = _FieldProducts(centre.state, field_control) if fields and centre.state.size else None
+        super().__init__(inputs, evaluate, start, seed, scrambles, fields=wanted)
+        self._centre, self._control, self._fitted = centre, control, fitted
+        self._held = None if fitted is None else held_expansion(inputs, fitted)
+        self._field_control, self._coefficient = field_control, coefficient
+        self.needed = 4 if coefficient == "optimal" else 2
+        repeats = () if fitted is None else fitted.repeats
+        self._repeats = [(expansion(one), held_expansion(inputs, one)) for one in repeats]
+        self._sums: dict[int, FloatArray] = {}
+        self._higher: FloatArray | None = None
+
+    @property
     def wider(self) -> int:
         """Number of scrambles where half as many samples more are to be enough."""
         return self.scrambles + self.scrambles // 2
@@ -143,74 +201,14 @@ class Scrambles:
         """What so many scrambles make of half the width of an interval."""
         return float(np.sqrt(self.scrambles / self.wider) * student(self.wider - 1) / student(self.scrambles - 1))
 
-    @property
-    def rounds(self) -> list[int]:
-        """Powers of two up to the number of points of each scramble."""
-        return [1 << k for k in range(self.each.bit_length())]
-
-    @property
-    def scramble(self) -> NDArray[np.int64]:
-        """Scramble (R n,) of each sample in the order of results."""
-        return np.tile(np.arange(self.scrambles), self.each)
-
-    def extend(self, each: int, scrambles: int | None = None) -> None:
-        """Go on to `each` points in every scramble, of which there may be more from now on."""
-        R, more = self.scrambles, (scrambles or self.scrambles) - self.scrambles
-        self._sums += [None] * more
-        outputs, ok, points = self._solved(range(R), self.each, each)
-        self.points = np.concatenate([self.points, points], axis=1)
-        self.outputs = np.concatenate([self.outputs, outputs], axis=1)
-        self.ok = np.concatenate([self.ok, ok], axis=1)
-        if more:
-            outputs, ok, points = self._solved(range(R, R + more), 0, each)
-            self.points = np.concatenate([self.points, points])
-            self.outputs = np.concatenate([self.outputs, outputs])
-            self.ok = np.concatenate([self.ok, ok])
-        self.each = each
-
-    def _solved(self, scrambles: range, start: int, stop: int) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
-        """Outputs (r, n, m), answers (r, n) and points (r, n, d) of some scrambles, from a number of point to another.
-
-        Their fields are added to the sums.
-        """
-        asked, centre = self._asked, self._centre
-        r, d, new = len(scrambles), len(self._inputs.names), stop - start
-        outputs, ok = np.empty((r, new, self.outputs.shape[2])), np.empty((r, new), dtype=bool)
-        points = np.empty((r, new, d))
-        if not new:
-            return outputs, ok, points
-        cubes = [sobol_points(asked.seed, number, start, stop, d) for number in scrambles]
-        points = self._inputs.points(np.concatenate(cubes)).reshape(r, new, d)
-        if asked.fields and centre.state.size:
-            wanted = _FieldProducts(centre.state, self._field_control)
-            for row, number in enumerate(scrambles):
-                found = self._ask(Request(points[row], fields=wanted, start=self._start))
-                outputs[row], ok[row] = found.outputs, found.ok
-                if found.fields.size:
-                    kept, products, higher = self._sums[number], found.fields[:-2], found.fields[-2:]
-                    self._sums[number] = products if kept is None else kept + products
-                    self._higher = higher if self._higher is None else self._higher + higher
-        else:
-            found = self._ask(Request(points.reshape(-1, d), start=self._start))
-            outputs, ok = found.outputs.reshape(outputs.shape), found.ok.reshape(ok.shape)
-        return outputs, ok, points
-
-    def _ask(self, request: Request) -> Evaluations:
-        found = self._evaluate(request)
-        self._reasons |= {failure.reason for failure in found.failures}
-        return found
-
-    def usable(self, each: int) -> bool:
-        """Whether enough scrambles have an answer among their first `each` points."""
-        needed = 4 if self._asked.coefficient == "optimal" else 2
-        return int(self.ok[:, :each].any(axis=1).sum()) >= needed
+    def _sum(self, number: int, fields: FloatArray) -> None:
+        kept, products, higher = self._sums.get(number), fields[:-2], fields[-2:]
+        self._sums[number] = products if kept is None else kept + products
+        self._higher = higher if self._higher is None else self._higher + higher
 
     def scalars(self, each: int) -> Estimates:
         """Estimate the moments of the outputs from the first `each` points of every scramble that has answers there."""
-        if not self.usable(each):
-            answers = int(self.ok[:, :each].any(axis=1).sum())
-            reasons = "; ".join(sorted(self._reasons)[:3])
-            raise SolveError(f"{answers} of {self.scrambles} scrambles have an answer, expected more: {reasons}")
+        self.check(each)
         found, hidden = self._estimated(each, self._controls(each))
         if self._fitted is None:  # Taylor polynomials of a low order have little far out
             return found
@@ -229,12 +227,12 @@ class Scrambles:
         deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
-        found = estimate_from_replicates(means, centre.outputs, expected, self._asked.coefficient)
+        found = estimate_from_replicates(means, centre.outputs, expected, self._coefficient)
         values, controlled = self.outputs[:, :each][ok], self._left(found, each, controls)
         plain = values - values.mean(axis=0)
         found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(some.sum()))
         tails = counted(found, self._inputs, values, controlled)
-        if controlled is None or self._asked.control == "tangent":
+        if controlled is None or (self._control is not None and self._control.linear):
             return tails, np.zeros_like(tails.std)
         first, moved = controlled[0] - controlled[0].mean(axis=0), influences(*controlled)
         assert known is not None
@@ -362,16 +360,17 @@ class Scrambles:
 
     def field_doubts(self, found: Estimates) -> Iterator[Finding]:
         """Find what speaks against the estimates of the displacements."""
-        count, sums = self._evaluate.displacements, [one for one in self._sums if one is not None]
+        count = self._evaluate.displacements
         assert self._higher is not None
-        powers = np.concatenate([np.sum([one[:2, :count] for one in sums], axis=0), self._higher[:, :count]])
+        sums = np.sum([self._sums[number][:2, :count] for number in sorted(self._sums)], axis=0)
+        powers = np.concatenate([sums, self._higher[:, :count]])
         volumes = self._evaluate.node_volumes
         yield from of_field_tails(powers, int(self.ok.sum()), found.relative_std_error[:count], volumes)
 
     def field(self) -> Estimates | None:
         """Estimate the moments of the state, where its sums were kept."""
         counts = self.ok.sum(axis=1)
-        means = [total / n for total, n in zip(self._sums, counts, strict=True) if total is not None]
+        means = [self._sums[number] / counts[number] for number in sorted(self._sums)]
         if not means:
             return None
         expected = None if self._field_control is None else self._field_control.expected(self._field_control.state)
@@ -381,4 +380,4 @@ class Scrambles:
         if self._which_held(self.each).any() or refused.any():
             # What is known of the field is where the samples of the expansion are not: it controls nothing.
             replicates, expected = replicates[:2], None
-        return estimate_from_replicates(replicates, self._centre.state, expected, self._asked.coefficient)
+        return estimate_from_replicates(replicates, self._centre.state, expected, self._coefficient)

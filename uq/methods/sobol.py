@@ -27,7 +27,7 @@ from uq.inputs.sampling import check_scrambles, power_of_two
 from uq.methods.chaos import LARGEST, Chaos
 from uq.methods.method import Amount
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
-from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Design, Rows, by_output, by_round, with_maps
+from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Rows, by_output, by_round, with_maps
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
 from uq.surrogates.regression import Regression
@@ -116,12 +116,8 @@ class Sobol(Amount):
             return 1
         if self.design == "chaos":
             return 1 + (self.samples or LARGEST)
-        size = self.products(dimension).size
+        size = RowProducts(dimension + len(self.groups), dimension if self.second_order else 0).size
         return 1 + size * (self.samples or self.scrambles * power_of_two(UNLIMITED // size // self.scrambles))
-
-    def products(self, dimension: int) -> RowProducts:
-        """What is averaged over the rows of exchanged points."""
-        return RowProducts(dimension + len(self.groups), dimension if self.second_order else 0)
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters have no Sobol' indices, or None."""
@@ -160,12 +156,8 @@ class Sobol(Amount):
 
         Raises
         ------
-        SolveError
-            If the model has no answer at the mean parameters, or at too many samples.
         FileNotFoundError
-            If the source holds no results of this model and these parameters.
-        ValueError
-            If the parameters are correlated, or a group has unknown ones.
+            If the source holds no results of this model and these parameters; otherwise as every method.
         """
         objection = self.objection(inputs) or self.unknown(inputs)
         if objection is not None:
@@ -217,7 +209,7 @@ class Sobol(Amount):
             fields=self.fields,
         )
         expanded = method.expand(inputs, evaluate)
-        dataset = method.dataset_of(evaluate, expanded)
+        dataset = method.reported(evaluate, expanded)
         return self._with_indices(dataset, inputs, expanded.regression, evaluate.node_volumes)
 
     def _with_indices(
@@ -285,10 +277,9 @@ class Sobol(Amount):
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         members = np.vstack([np.eye(len(inputs.names), dtype=bool), self._members(inputs)])
-        products = self.products(len(inputs.names))
-        design = Design(products, self.scrambles, self.seed, self.second_order, self.fields, self.quantiles)
-        rows = Rows(design, inputs, evaluate, centre, members)
-        K, R = products.size, self.scrambles
+        about = {"pairs": self.second_order, "fields": self.fields}
+        rows = Rows(inputs, evaluate, centre, members, self.seed, self.scrambles, **about)
+        K, R = rows.products.size, self.scrambles
         last = (self.planned(len(inputs.names)) - 1) // K // R
         rows.extend(min(last, power_of_two(FIRST_ROUND // R)) if self.open_ended else last)
         while True:
@@ -298,7 +289,7 @@ class Sobol(Amount):
             if self.met(reached) or rows.each >= last or solves > self.affordable(evaluate.solves, evaluate.seconds):
                 break
             rows.extend(2 * rows.each)
-        dataset = rows.dataset(found)
+        dataset = rows.dataset(found, self.quantiles)
         add(dataset, *of_indices(dataset))
         amount = f"{R * rows.each} rows of {K} solves of Sobol' points"
         error = f"errors of the indices up to {reached:.2g}"
@@ -314,6 +305,8 @@ def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evalua
     FileNotFoundError
         If they are of others.
     """
+    import tomllib
+
     for what, expected in (("parameter", inputs.names), ("output", evaluate.outputs)):
         theirs = tuple(source[what].values)
         if theirs != expected:
@@ -322,7 +315,8 @@ def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evalua
     if not ("multi_index" in source or "values" in source):
         message = f"{directory}: holds neither samples nor an expansion, expected results of chaos or of sampling"
         raise FileNotFoundError(message)
-    ours, written = _as_written(inputs), _distributions(source.attrs.get("config"))
+    ours = {name: marginal.model_dump(mode="json", exclude_none=True) for name, marginal in inputs.marginals.items()}
+    written = tomllib.loads(source.attrs.get("config") or "").get("parameters", {})
     if not (
         np.allclose(source["parameter_mean"], inputs.mean, rtol=1e-10, atol=0)
         and np.allclose(source["parameter_std"], inputs.std, rtol=1e-10, atol=0)
@@ -330,14 +324,3 @@ def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evalua
     ):
         raise FileNotFoundError(f"{directory}: holds results of other distributions, expected those of this study")
     return source
-
-
-def _distributions(config: str | None) -> dict[str, Any]:
-    """Return the distributions of a recorded study, if there is a record."""
-    import tomllib
-
-    return dict(tomllib.loads(config or "").get("parameters", {}))
-
-
-def _as_written(inputs: Inputs) -> dict[str, Any]:
-    return {name: marginal.model_dump(mode="json", exclude_none=True) for name, marginal in inputs.marginals.items()}

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError, scattered
 from uq.estimators.doubts import of_field_tails, of_tails
+from uq.estimators.estimate import Variables
 from uq.estimators.indices import (
     ExchangedVariances,
     RowProducts,
@@ -54,7 +55,6 @@ DIMENSIONS = {
     "sobol_second": ("output", "parameter", "partner"),
 }
 RUNNING = ("sobol_first", "sobol_total")
-Variables = dict[str, tuple[tuple[str, ...], Any]]
 
 
 def by_output(found: dict[str, FloatArray]) -> Variables:
@@ -105,34 +105,6 @@ def with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
 
 
 @dataclass(frozen=True)
-class Design:
-    """What is asked of the rows.
-
-    Attributes
-    ----------
-    products
-        What is averaged over them, with K points to a row.
-    parts
-        Number R of parts of the scrambled sequence.
-    seed
-        Of the sequence.
-    pairs
-        Whether rows have points for pairs of parameters.
-    fields
-        Whether the displacement field is looked at.
-    quantiles
-        Probabilities of the quantiles of the outputs.
-    """
-
-    products: RowProducts
-    parts: int
-    seed: int
-    pairs: bool
-    fields: bool
-    quantiles: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class _FieldProducts:
     """Sum of the products of the state's deviations in a row, and of third and fourth powers at the points A and B."""
 
@@ -169,20 +141,23 @@ class Rows:
 
     def __init__(
         self,
-        design: Design,
         inputs: Inputs,
         evaluate: Evaluate,
         centre: Linearisation,
         members: NDArray[np.bool_],
+        seed: int,
+        parts: int,
+        *,
+        pairs: bool,
+        fields: bool,
     ) -> None:
-        self._design, self._inputs, self._evaluate, self._centre = design, inputs, evaluate, centre
-        self._members = members
-        self.products = design.products
+        self._inputs, self._evaluate, self._centre = inputs, evaluate, centre
+        self._members, self._seed, self._parts, self._fields = members, seed, parts, fields
+        d, m = len(inputs.names), len(evaluate.outputs)
+        self.products = RowProducts(len(members), d if pairs else 0)
         self._of_fields = RowProducts(len(members))
-        R, d, m = design.parts, len(inputs.names), len(evaluate.outputs)
-        K = self.products.size
+        R, K = parts, self.products.size
         self.each = 0
-        self._parts = R
         self.points = np.empty((0, K, d))
         self.outputs = np.empty((0, K, m))
         self.ok = np.empty(0, dtype=bool)
@@ -191,12 +166,12 @@ class Rows:
 
     def extend(self, each: int) -> None:
         """Extend every part to `each` rows: to all from none, or to twice as many."""
-        design, centre, K = self._design, self._centre, self.products.size
+        centre, K = self._centre, self.products.size
         d, before, after = len(self._inputs.names), len(self.ok), self._parts * each
-        cubes = sobol_points(design.seed, 0, before, after, 2 * d)
+        cubes = sobol_points(self._seed, 0, before, after, 2 * d)
         first, second = (self._inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
-        points = exchanged(first, second, self._members, pairs=design.pairs)
-        if design.fields and centre.state.size:
+        points = exchanged(first, second, self._members, pairs=self.products.pairs > 0)
+        if self._fields and centre.state.size:
             joint = _FieldProducts(self._of_fields, K, centre.state)
             parts = points.reshape(-1, each * K, d)
             found = [self._ask(Request(part, start=centre.prediction, joint=joint)) for part in parts]
@@ -240,7 +215,7 @@ class Rows:
         """Estimate the indices from the first R parts of `each` rows, with standard errors."""
         sums, counts = self._of_outputs(each)
         found = self._indices(self.products.variances(sums.sum(axis=0) / counts.sum()))
-        drawn = self._indices(self.products.variances(bootstrap(sums, counts, self._design.seed)))
+        drawn = self._indices(self.products.variances(bootstrap(sums, counts, self._seed)))
         for name, values in drawn.items():
             found[f"{name}_error"] = bootstrap_error(values, len(counts), axis=0)
         return found
@@ -289,22 +264,22 @@ class Rows:
         doubts = of_field_tails(powers, 2 * n, moments.relative_std_error, volumes)
         return found | by_node(moments, count), list(doubts)
 
-    def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
-        """Return all estimates as labelled arrays."""
-        design, centre, K = self._design, self._centre, self.products.size
+    def dataset(self, found: dict[str, FloatArray], probabilities: tuple[float, ...]) -> xr.Dataset:
+        """Return all estimates as labelled arrays, with quantiles of these probabilities."""
+        centre, K = self._centre, self.products.size
         part = np.repeat(np.arange(self._parts), self.each * K)
         answered = ~np.isnan(self.outputs).any(axis=2).ravel()
         whole = np.repeat(self.ok, K)
         independent = whole & (np.arange(whole.size) % K < 2)  # A and B
         values = self.outputs.reshape(whole.size, -1)
-        of_quantiles = quantiles_from_replicates(values[independent], part[independent], design.quantiles)
+        of_quantiles = quantiles_from_replicates(values[independent], part[independent], probabilities)
         rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
         moments = {each: self._moments(each) for each in rounds}
         indices = {each * self._parts * K: self.indices(each) for each in rounds}
         of_field, doubts = self.field()
-        dataset = local_dataset(self._inputs, self._evaluate, centre, fields=design.fields)
+        dataset = local_dataset(self._inputs, self._evaluate, centre, fields=self._fields)
         dataset = dataset.assign_coords(
-            quantile=list(design.quantiles), round=list(indices), index_round=list(indices)
+            quantile=list(probabilities), round=list(indices), index_round=list(indices)
         ).assign(
             {
                 **moments[self.each].variables(),

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
+from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
-from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
+from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, on_group
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
 from uq.surrogates.gate import Trial, repeated
@@ -198,32 +199,24 @@ class StateExpansion:
         The P functions.
     coefficients
         (P, U), in canonical order.
-    point, state
-        Parameters (d,) of the factor, and the state (U,) there.
-    spread
-        Standard deviations (d,) of the parameters.
-    joined
-        Whether the state at `point` is joined to rest.
+    reference
+        Where the factor is.
     """
 
     basis: Basis
     coefficients: FloatArray
-    point: FloatArray
-    state: FloatArray
-    spread: FloatArray
-    joined: bool = True
+    reference: ReferenceSolution
 
     @classmethod
     def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
         """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
         coefficients = solved(fit, fields[fit.chosen.which])
         coefficients[(basis.indices == 0).all(axis=1)] += centre.state
-        return cls(basis, coefficients, centre.point, centre.state, centre.spread, centre.joined)
+        return cls(basis, coefficients, centre.reference)
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
-        coefficients, state = scattered(model, self.coefficients), scattered(model, self.state[None, :])[0]
-        reference = ReferenceSolution(self.point, state, self.spread, self.joined)
+        coefficients, reference = scattered(model, self.coefficients), on_group(model, self.reference)
         return lambda parameters: Guess(self.basis.at(parameters) @ coefficients, reference)
 
 
@@ -305,7 +298,7 @@ def estimates_of_field(
     terms: NDArray[np.int64],
     outputs: Regression,
     estimates: dict[str, FloatArray],
-) -> dict[str, tuple[tuple[str, ...], FloatArray | float]]:
+) -> Variables:
     """Coefficients of the functions `terms` (T,), mean and standard deviation of the displacements, and their errors.
 
     Errors are those of the sketches and of the outputs, scaled by the residuals, which come from the same rows. The

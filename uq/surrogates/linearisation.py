@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ReferenceSolution, Solution, SolveError
+from uq.estimators.estimate import Variables
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Prediction, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
@@ -57,7 +58,12 @@ class Linearisation:
         """The prediction of the state, linear if there are slopes; None for a model without derivatives."""
         if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
-        return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread, self.joined)
+        return Prediction(self.reference, self.state_slopes, self.coordinates)
+
+    @property
+    def reference(self) -> ReferenceSolution:
+        """The state and where it is, as the solver's reference."""
+        return ReferenceSolution(self.point, self.state, self.spread, self.joined)
 
     @property
     def output_slopes(self) -> FloatArray:
@@ -80,6 +86,15 @@ class Linearisation:
         if np.isnan(self.tangents).all():
             return self.outputs
         return np.asarray(self.outputs - self.output_slopes @ self.coordinates.of(self.point))
+
+    def predicted(self, points: FloatArray) -> FloatArray:
+        """Return what the tangent predicts (…, m) of deviations from `middle` at points (…, d)."""
+        return np.asarray(self.coordinates.of(points) @ self.output_slopes.T)
+
+    def predicted_variance(self, correlation: FloatArray) -> FloatArray:
+        """Return the variance (m,) of that prediction, from the correlation (d, d) of the coordinates."""
+        slopes = self.output_slopes
+        return np.asarray(np.einsum("mi,ij,mj->m", slopes, correlation, slopes))
 
     @property
     def state_middle(self) -> FloatArray:
@@ -145,7 +160,7 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
     import xarray as xr
 
     ranges = np.array([np.nan if m.support is None else m.support[1] - m.support[0] for m in inputs.marginals.values()])
-    data: dict[str, tuple[tuple[str, ...], FloatArray]] = {
+    data: Variables = {
         "nominal": (("output",), centre.outputs),
         "parameter_mean": (("parameter",), inputs.mean),
         "parameter_std": (("parameter",), inputs.std),

@@ -100,20 +100,20 @@ class Regression:
         Without another analysis these are moments and Sobol' indices, or Shapley effects where parameters depend on
         each other.
         """
-        if of is None and not self.inputs.independent:
-            return self._dependent()
         missing = self.missing()
-        hidden = None if missing is None else self._hidden(missing)
-        return _estimates(self.fit, self.largest.indices, self.data, missing, of or coefficient_moments, hidden)
+        if of is None and not self.inputs.independent:
+            return self._dependent(missing)
+        hidden = None if missing is None else self.hidden(missing)
+        return self._estimates(of or coefficient_moments, missing, hidden)
 
-    def _dependent(self) -> dict[str, FloatArray]:
+    def _dependent(self, missing: FloatArray | None) -> dict[str, FloatArray]:
         """Moments and, of few parameters, Shapley effects."""
         draws = self.inputs.draws
         assert draws is not None
         if len(draws.names) > MOST:
-            return _estimates(self.fit, self.largest.indices, self.data, self.missing(), moments)
+            return self._estimates(moments, missing, missing)
         of = Shapley.of(self.largest, draws)
-        found = _estimates(self.fit, self.largest.indices, self.data, self.missing(), of.analysis)
+        found = self._estimates(of.analysis, missing, missing)
         of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
 
@@ -143,12 +143,140 @@ class Regression:
                 least = np.minimum(least, self._left_of_following(places, q))
         return np.sqrt(shares(self.fit.squares, least))
 
-    def _hidden(self, missing: FloatArray) -> FloatArray:
-        """Return errors (m,) of standard deviations by what is `missing` (m,): that itself of many parameters."""
-        tails = tails_of(self.inputs)
+    def hidden(self, missing: FloatArray) -> FloatArray:
+        """Return errors (m,) of standard deviations by what a fit lacks in tails: that itself (m,) of many parameters.
+
+        If a function ψ of norm 1 that the basis lacks is part of an output with the norm t, then the fit leaves it out,
+        and its coefficients c take up what of ψ looks like the basis at the samples: with the columns A = QR of the
+        regression they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and
+        t²/(2σ). For t stands the most that the residuals allow, see `missing`.
+        """
+        from scipy.linalg import solve_triangular
+
+        tails, basis, data, fit = tails_of(self.inputs), self.basis, self.data, self.fit
         if tails.size > FULL or self.inputs.draws is not None:
             return missing
-        return of_std(self.inputs, tails, self.basis, self.data, self.fit, missing)
+        left = data.left(basis)
+        q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
+        following = orthonormal(self.inputs, np.array(list(_neighbours(basis.indices, tails))))
+        columns = data.left(following).reshape(len(q), -1)
+        along = q.T @ columns
+        sizes = ((columns - q @ along) ** 2).sum(axis=0)
+        varying = (basis.indices != 0).any(axis=1)
+        moved = solve_triangular(triangle, along)[varying]
+        c = fit.coefficients[varying]
+        std = np.linalg.norm(c, axis=0)
+        pulls = np.abs(shares(moved.T @ c, std))
+        norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
+        largest = (norms * pulls).max(axis=0)
+        return np.asarray(np.sqrt((PULLS * largest) ** 2 + (LEAST * missing) ** 2 + shares(missing**2, std) ** 2))
+
+    def _estimates(self, of: Analysis, missing: FloatArray | None, hidden: FloatArray | None) -> dict[str, FloatArray]:
+        """Moments and indices by output, with standard errors by the jackknife over samples and the residual variance.
+
+        The jackknife is taken around the estimate itself, so that a bias counts too. If functions were selected, each
+        of its fits selects again, since the selection is as uncertain as the samples.
+
+        The jackknife tests a fit in the gap that a sample leaves, and its error is too large; a regression with
+        independent errors takes the smooth remainder for random errors, and its error is too small. The error of the
+        mean is the geometric mean of the two: in 30 settings of five functions its 95 % intervals covered 92 to 100 %,
+        those of the jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for
+        each parameter it is the jackknife's.
+
+        None of this sees what lies outside the basis. So there are other estimates too, from the samples, each with the
+        fit without it as control (`_unseen`): half the distance to them counts as an error, and for the standard
+        deviation the residual variance λ², λ the leave-one-out error. Above `ROUGH` their error counts for the mean,
+        and above `TRUSTED` they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
+
+        In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have
+        tails, the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, or
+        what this does to it (`hidden`), and over √n for the mean, whose error is the jackknife's. What the fit leaves
+        where samples are, λ, is no such error of the standard deviation: it is known by samples, as of bounded
+        parameters.
+
+        Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
+        """
+        fit, largest = self.fit, self.largest.indices
+        indices = largest[fit.chosen.which]
+        central = of(fit.coefficients.T, indices)
+        left_out = of(np.swapaxes(fit.without, 1, 2), largest)
+        groups, n = len(fit.without), len(fit.unseen)
+        seen = self._unseen()
+        trusted = fit.relative <= TRUSTED
+        cautious = missing is not None
+        beyond_samples = np.zeros_like(fit.loo) if missing is None else missing
+        tails = np.maximum(fit.loo, beyond_samples) if cautious else beyond_samples
+        bias = shares(fit.loo**2, 2 * central["std"])
+        whole: FloatArray = np.where(trusted, central["std"], seen["std"])
+        share = shares(fit.loo**2, whole**2)
+        # The norm of what a fit may leave beyond λ, which n samples know to λ√(κ/n), κ the kurtosis of the errors at
+        # samples that are left out: few of them decide λ where a function grows towards an end of a range, and there it
+        # is larger still where none of few samples is.
+        squares = fit.unseen**2
+        unsure = np.sqrt(shares((squares**2).mean(axis=0), squares.sum(axis=0)))
+        further = {
+            "mean": np.sqrt(
+                np.maximum(tails, unsure) ** 2 / n
+                + (seen["mean"] - central["mean"]) ** 2 / 4
+                + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
+            ),
+            "std": np.sqrt(
+                (beyond_samples if hidden is None else hidden) ** 2
+                + unsure**2
+                + bias**2
+                + (seen["std"] - central["std"]) ** 2 / 4
+            ),
+        }
+        for name, values in left_out.items():
+            spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
+            if name == "mean" and not cautious and n > 2 * largest.shape[1]:
+                spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
+            if name in further:
+                known = np.hypot(seen[f"{name}_error"], tails if name == "std" else 0.0)
+                if name == "mean":
+                    known = np.maximum(known, np.hypot(spread, tails / np.sqrt(n)))
+                central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), known)
+                central[name] = np.where(trusted, central[name], seen[name])
+            else:
+                by_index = (-1, *(1,) * (spread.ndim - 1))
+                something = (fit.relative <= NOTHING).reshape(by_index)
+                central[f"{name}_error"] = np.where(something, np.hypot(spread, share.reshape(by_index)), np.nan)
+                central[name] = np.where(something, central[name], np.nan)
+        return central
+
+    def _unseen(self) -> dict[str, FloatArray]:
+        """Moments by output from the samples, each with the fit without it as control, and their standard errors.
+
+        With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and likewise for the square: unbiased
+        for independent samples, however bad the fits are; with constants as fits it is plain Monte Carlo.
+        """
+        data = self.data
+        weights = (data.weights / data.weights.sum())[:, None]
+        independent = 1 / (weights**2).sum()  # samples of equal weight that are as informative
+        first, second, offset = self._unseen_samples()
+        mean = (weights * first).sum(axis=0)
+        second = second - 2 * mean * first + mean**2
+        scale = student(max(len(data.values) - 1, 1)) / Z / np.sqrt(max(independent - 1, 1))
+        mean_error = scale * np.sqrt((weights * (first - mean) ** 2).sum(axis=0))
+        variance = (weights * second).sum(axis=0)
+        variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
+        std = np.sqrt(np.maximum(variance + mean_error**2, 0.0))
+        return {
+            "mean": offset + mean,
+            "mean_error": mean_error,
+            "std": std,
+            "std_error": error_of_root(std, variance_error),
+        }
+
+    def _unseen_samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Samples (n, m) of both moments of deviations from values (m,), each with the fit without it as control."""
+        fit, data, largest = self.fit, self.data, self.largest.indices
+        offset = data.values.mean(axis=0)
+        constant = (largest == 0).all(axis=1)
+        mean = (fit.without[:, constant].sum(axis=1) - offset)[fit.held]
+        square = (fit.without[:, ~constant] ** 2).sum(axis=1)[fit.held] + mean**2
+        f = data.values - offset
+        return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
     def _left_of_following(self, places: IntArray, q: FloatArray) -> FloatArray:
         """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
@@ -192,7 +320,7 @@ class Regression:
         yield from of_shape([names[i] for i in trusted], values, self.fit.relative[trusted], n)
         if np.ptp(self.data.weights) == 0:
             which = np.flatnonzero(self.fit.relative > CLOSE)
-            first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
+            first, second, _ = self._unseen_samples()
             yield from of_tails(
                 [names[i] for i in which],
                 self.data.values[:, which],
@@ -222,165 +350,6 @@ def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, F
     known, new = alone.values(points), plain.values(points)
     left = new - known @ (known.T @ (draws.weights[:, None] * new))
     return plain, np.sqrt(draws.weights @ left**2)
-
-
-def _estimates(
-    fit: Fit,
-    largest: IntArray,
-    data: Data,
-    missing: FloatArray | None,
-    of: Analysis,
-    hidden: FloatArray | None = None,
-) -> dict[str, FloatArray]:
-    """Moments and indices by output, with standard errors from the jackknife over samples and the residual variance.
-
-    The jackknife is taken around the estimate itself, so that a bias counts too. If functions were selected, each of
-    its fits selects again, since the selection is as uncertain as the samples.
-
-    The jackknife tests a fit in the gap that a sample leaves, and its error is too large; a regression with independent
-    errors takes the smooth remainder for random errors, and its error is too small. The error of the mean is the
-    geometric mean of the two: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
-    jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for each parameter
-    it is the jackknife's.
-
-    None of this sees what lies outside the basis. So there are other estimates too, from the samples, each with the fit
-    without it as control (`_unseen`): half the distance to them counts as an error, and for the standard deviation the
-    residual variance λ², λ the leave-one-out error. Above `ROUGH` their error counts for the mean, and above `TRUSTED`
-    they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
-
-    In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have tails,
-    the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, or what this
-    does to it (`hidden`), and over √n for the mean, whose error is the jackknife's. What the fit leaves where samples
-    are, λ, is no such error of the standard deviation: it is known by samples, as of bounded parameters.
-
-    Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
-    """
-    indices = largest[fit.chosen.which]
-    central = of(fit.coefficients.T, indices)
-    left_out = of(np.swapaxes(fit.without, 1, 2), largest)
-    groups, n = len(fit.without), len(fit.unseen)
-    seen = _unseen(fit, largest, data)
-    trusted = fit.relative <= TRUSTED
-    cautious = missing is not None
-    beyond_samples = np.zeros_like(fit.loo) if missing is None else missing
-    tails = np.maximum(fit.loo, beyond_samples) if cautious else beyond_samples
-    bias = shares(fit.loo**2, 2 * central["std"])
-    whole: FloatArray = np.where(trusted, central["std"], seen["std"])
-    share = shares(fit.loo**2, whole**2)
-    unsure = _unsure(fit)
-    further = {
-        "mean": np.sqrt(
-            np.maximum(tails, unsure) ** 2 / n
-            + (seen["mean"] - central["mean"]) ** 2 / 4
-            + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
-        ),
-        "std": np.sqrt(
-            (beyond_samples if hidden is None else hidden) ** 2
-            + unsure**2
-            + bias**2
-            + (seen["std"] - central["std"]) ** 2 / 4
-        ),
-    }
-    for name, values in left_out.items():
-        spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
-        if name == "mean" and not cautious and n > 2 * largest.shape[1]:
-            spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
-        if name in further:
-            known = np.hypot(seen[f"{name}_error"], tails if name == "std" else 0.0)
-            if name == "mean":
-                known = np.maximum(known, np.hypot(spread, tails / np.sqrt(n)))
-            central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), known)
-            central[name] = np.where(trusted, central[name], seen[name])
-        else:
-            by_index = (-1, *(1,) * (spread.ndim - 1))
-            something = (fit.relative <= NOTHING).reshape(by_index)
-            central[f"{name}_error"] = np.where(something, np.hypot(spread, share.reshape(by_index)), np.nan)
-            central[name] = np.where(something, central[name], np.nan)
-    return central
-
-
-def _unsure(fit: Fit) -> FloatArray:
-    """Norm (m,) of what a fit may leave beyond its leave-one-out error λ, which n samples know to λ√(κ/n).
-
-    κ is the kurtosis of the errors at samples that are left out: few of them decide λ where a function grows towards
-    an end of a range, and there it is larger still where none of few samples is.
-    """
-    squares = fit.unseen**2
-    return np.asarray(np.sqrt(shares((squares**2).mean(axis=0), squares.sum(axis=0))))
-
-
-def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
-    """Moments by output from the samples, each with the fit without it as control, and their standard errors.
-
-    With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and likewise for the square: unbiased for
-    independent samples, however bad the fits are; with constants as fits it is plain Monte Carlo.
-    """
-    weights = (data.weights / data.weights.sum())[:, None]
-    independent = 1 / (weights**2).sum()  # samples of equal weight that are as informative
-    first, second, offset = _unseen_samples(fit, largest, data)
-    mean = (weights * first).sum(axis=0)
-    second = second - 2 * mean * first + mean**2
-    scale = student(max(len(data.values) - 1, 1)) / Z / np.sqrt(max(independent - 1, 1))
-    mean_error = scale * np.sqrt((weights * (first - mean) ** 2).sum(axis=0))
-    variance = (weights * second).sum(axis=0)
-    variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
-    std = np.sqrt(np.maximum(variance + mean_error**2, 0.0))
-    return {
-        "mean": offset + mean,
-        "mean_error": mean_error,
-        "std": std,
-        "std_error": error_of_root(std, variance_error),
-    }
-
-
-def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Samples (n, m) of the first two moments of deviations, each with the fit without it as control.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        The samples, and the values (m,) from which they deviate.
-    """
-    offset = data.values.mean(axis=0)
-    constant = (largest == 0).all(axis=1)
-    mean = (fit.without[:, constant].sum(axis=1) - offset)[fit.held]
-    square = (fit.without[:, ~constant] ** 2).sum(axis=1)[fit.held] + mean**2
-    f = data.values - offset
-    return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
-
-
-def of_std(
-    inputs: Inputs, tails: NDArray[np.bool_], basis: Basis, data: Data, fit: Fit, missing: FloatArray
-) -> FloatArray:
-    """Return errors (m,) of standard deviations by what a fit lacks in tails.
-
-    If a function ψ of norm 1 that the basis lacks is part of an output with the norm t, then the fit leaves it out, and
-    its coefficients c take up what of ψ looks like the basis at the samples: with the columns A = QR of the regression
-    they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and t²/(2σ). For t
-    stands the most that the residuals allow, see `Regression.missing`.
-
-    Parameters
-    ----------
-    tails
-        Which parameters (d,) have some.
-    missing
-        Norms (m,) of what is missed, by the next powers of single parameters.
-    """
-    from scipy.linalg import solve_triangular
-
-    left = data.left(basis)
-    q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
-    columns = data.left(orthonormal(inputs, np.array(list(_neighbours(basis.indices, tails))))).reshape(len(q), -1)
-    along = q.T @ columns
-    sizes = ((columns - q @ along) ** 2).sum(axis=0)
-    varying = (basis.indices != 0).any(axis=1)
-    moved = solve_triangular(triangle, along)[varying]
-    c = fit.coefficients[varying]
-    std = np.linalg.norm(c, axis=0)
-    pulls = np.abs(shares(moved.T @ c, std))
-    norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
-    largest = (norms * pulls).max(axis=0)
-    return np.asarray(np.sqrt((PULLS * largest) ** 2 + (LEAST * missing) ** 2 + shares(missing**2, std) ** 2))
 
 
 def _neighbours(indices: IntArray, tails: NDArray[np.bool_]) -> Iterator[IntArray]:

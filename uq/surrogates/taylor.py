@@ -66,6 +66,11 @@ class Control:
     features_mean: FloatArray
     features_second: FloatArray
 
+    @property
+    def linear(self) -> bool:
+        """Whether it is a tangent."""
+        return isinstance(self.polynomials, Monomials) and not self.polynomials.pairs
+
     def features(self, points: FloatArray) -> FloatArray:
         """Return φ (…, k) at points (…, d)."""
         return self.polynomials.values(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:-1], -1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ReferenceSolution, SolveError
 from forward.readable import number, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
@@ -110,8 +110,8 @@ def at_mean(inputs: Inputs, first: Evaluations | None) -> Prediction | None:
         return None
     if first.tangents is None or first.fields.size == 0:
         return None
-    joined = bool(first.joined[0])
-    return Prediction(inputs.mean, first.fields[0], first.fields[:0], inputs.coordinates, inputs.std, joined)
+    reference = ReferenceSolution(inputs.mean, first.fields[0], inputs.std, bool(first.joined[0]))
+    return Prediction(reference, first.fields[:0], inputs.coordinates)
 
 
 def stressed(model: Any, mean: FloatArray) -> FloatArray | None:

@@ -1,12 +1,12 @@
 """Multilevel chaos: levels that converge to the model, honest errors, and far less work than Newton's method takes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from forward.model import Guess, SolveError, Stability, Work
+from forward.model import Guess, ReferenceSolution, SolveError, Stability, Work
 from forward.pointwise import FunctionModel, OneByOne
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
@@ -192,7 +192,7 @@ def test_settings_that_cannot_work_are_refused():
 def test_an_expansion_predicts_and_is_part_of_the_name_of_a_block(tmp_path):
     basis = orthonormal(INPUTS, hyperbolic(2, 3, 1.0))
     rng = np.random.default_rng(0)
-    start = StateExpansion(basis, rng.random((10, 3)), INPUTS.mean, np.zeros(3), INPUTS.std)
+    start = StateExpansion(basis, rng.random((10, 3)), ReferenceSolution(INPUTS.mean, np.zeros(3), INPUTS.std))
     guess = start.on(Contraction())
     reference = guess(INPUTS.mean).reference
     points = rng.random((5, 2))
@@ -201,7 +201,7 @@ def test_an_expansion_predicts_and_is_part_of_the_name_of_a_block(tmp_path):
         np.testing.assert_allclose(guess(point).state, row @ start.coefficients, rtol=1e-14)
     np.testing.assert_array_equal(reference.parameters, INPUTS.mean)
     checkpoint = Checkpoint(tmp_path, "study")
-    other = StateExpansion(basis, start.coefficients * (1 + 1e-15), INPUTS.mean, np.zeros(3), INPUTS.std)
+    other = replace(start, coefficients=start.coefficients * (1 + 1e-15))
     keys = {checkpoint.key(Request(points, start=s, iterations=i)) for s in (start, other, None) for i in (None, 1, 2)}
     assert len(keys) == 9
 
@@ -263,7 +263,7 @@ def test_a_chaos_prediction_saves_corrections(beam):
         np.array([model.solve(p, Guess(centre.prediction.on(model)(p).state)).state for p in points])
     )
     coefficients = np.linalg.lstsq(basis.values(points), states, rcond=None)[0]
-    start = StateExpansion(basis, coefficients, centre.point, centre.state, centre.spread)
+    start = StateExpansion(basis, coefficients, centre.reference)
     fresh = inputs.points(np.random.default_rng(1).random((20, 2)))
     tangent, expanded = (evaluate(Request(fresh, start=s)) for s in (centre.prediction, start))
     np.testing.assert_allclose(expanded.outputs, tangent.outputs, rtol=1e-7)
