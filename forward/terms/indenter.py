@@ -112,7 +112,7 @@ class Indenter(Term):
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
         placed = zip(("x", "y", "z", *POINTING), (*self.at, *self.along), strict=True)
-        return found | {name: Scalar(value, tools.Placed, name) for name, value in placed}
+        return found | {name: Scalar(value, tools.Pose, name) for name, value in placed}
 
     @property
     def size(self) -> float:

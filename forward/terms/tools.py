@@ -28,7 +28,7 @@ NUMPY = SimpleNamespace(
 )
 
 
-class Placed(Settings):
+class Pose(Settings):
     """Where a tool is, and how it points.
 
     Parameters
