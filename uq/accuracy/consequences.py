@@ -80,7 +80,9 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
         yield Consequence("density_edge", 0, moved, _in_units)
     if not inputs.independent:
         return
-    names = [name for name in (*SINGLE, *GROUPED, PAIRED, *BOUNDS) if _by_output(dataset, name)]
+    last = {**dict.fromkeys(GROUPED, ("group",)), PAIRED: ("parameter", "partner")}
+    every = (*SINGLE, *GROUPED, PAIRED, *BOUNDS)
+    names = [name for name in every if has(dataset, name, "output", *last.get(name, ("parameter",)))]
     if names:
         projected = _Projected.on(dataset, inputs, points)
         for name in names:
@@ -91,11 +93,6 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
 def has(dataset: xr.Dataset, name: str, *dims: str) -> bool:
     """Whether there is such a variable: methods from outside may give others, or none."""
     return name in dataset and dataset[name].dims == dims
-
-
-def _by_output(dataset: xr.Dataset, name: str) -> bool:
-    last = ("group",) if name in GROUPED else ("parameter", "partner") if name == PAIRED else ("parameter",)
-    return has(dataset, name, "output", *last)
 
 
 def _in_units(values: FloatArray, rho: float, std: float) -> FloatArray:

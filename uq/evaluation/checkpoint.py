@@ -144,7 +144,7 @@ class Checkpoint:
 
 
 def digest(value: object, before: bytes = b"") -> bytes:
-    """Return a hash of a value, after some text; arrays count by their numbers, dataclasses by their fields."""
+    """Return a hash of a value, after some text; arrays count by their numbers, dataclasses and tuples part by part."""
     hashed = hashlib.sha256(before)
     _feed(hashed, value)
     return hashed.digest()
@@ -159,6 +159,10 @@ def _feed(digest: Any, value: object) -> None:
         for field in fields(value):
             digest.update(field.name.encode())
             _feed(digest, getattr(value, field.name))
+    elif isinstance(value, tuple):
+        digest.update(f"({len(value)})".encode())
+        for one in value:
+            _feed(digest, one)
     else:
         digest.update(repr(value).encode())
 

@@ -104,21 +104,10 @@ class SerialEvaluate(OfModel):
         return merge(found, request.fields)
 
 
-@dataclass(frozen=True)
-class _Asked:
+def _asked(block: Request) -> tuple[object, ...]:
     """What determines a block: of a start only its point, as its state has rounding errors if ranks share a model."""
-
-    points: FloatArray
-    tangents: bool
-    iterations: int | None
-    start: FloatArray
-    mesh_errors: bool
-    saturations: float | None
-
-
-def _asked(block: Request) -> _Asked:
     start = np.zeros(0) if block.start is None else block.start.reference.parameters
-    return _Asked(block.points, block.tangents, block.iterations, start, block.mesh_errors, block.saturations)
+    return block.points, block.tangents, block.iterations, start, block.mesh_errors, block.saturations
 
 
 class Recorder(OfEvaluate):

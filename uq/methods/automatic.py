@@ -107,7 +107,15 @@ class Automatic(Method):
             chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, pilot.found)
         else:
             chosen, left = "quasi-monte-carlo", replace(goal, most=max(goal.most - solves, 2))
-            dataset = self._quasi(pilot.control or "none").until(inputs, recorder, left, pilot.expanded)
+            method = QuasiMonteCarlo(
+                samples=SCRAMBLES * power_of_two(LIMITLESS // SCRAMBLES),  # the goal says how many
+                scrambles=SCRAMBLES,
+                control=pilot.control or "none",
+                seed=self.seed,
+                quantiles=self.quantiles,
+                fields=self.fields,
+            )
+            dataset = method.until(inputs, recorder, left, pilot.expanded)
             if solves:
                 reasons.append(f"In all {recorder.solves:,} solves, {solves:,} of them to find out.")
         dataset.attrs["chosen"] = json.dumps({"method": chosen, "reasons": reasons}, ensure_ascii=False)
@@ -161,16 +169,6 @@ class Automatic(Method):
         return Chaos(
             samples=max(2, min(LARGEST, goal.most - 1)),
             max_order=order_for(len(inputs.names)),
-            seed=self.seed,
-            quantiles=self.quantiles,
-            fields=self.fields,
-        )
-
-    def _quasi(self, control: Control) -> QuasiMonteCarlo:
-        return QuasiMonteCarlo(
-            samples=SCRAMBLES * power_of_two(LIMITLESS // SCRAMBLES),  # the goal says how many
-            scrambles=SCRAMBLES,
-            control=control,
             seed=self.seed,
             quantiles=self.quantiles,
             fields=self.fields,

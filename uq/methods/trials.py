@@ -53,41 +53,38 @@ class Trial:
 def trial_of(method: Amount, inputs: Inputs, memory: Memory) -> Trial:
     """Run a method once; a run without an estimate says why."""
     recorder = Recorder(memory)
-    begin, before = time.process_time(), memory.clock.seconds
+    begin, before = time.process_time(), memory.seconds
     try:
         found = method.run(inputs, recorder)
     except SolveError as error:
         nothing = np.full(len(memory.outputs), np.nan)
         return Trial(dict.fromkeys(ESTIMATES, nothing), 0.0, recorder.solves, recorder.seconds, 0.0, str(error))
-    own = time.process_time() - begin - (memory.clock.seconds - before)
+    own = time.process_time() - begin - (memory.seconds - before)
     estimates = {name: found[name].to_numpy() for name in ESTIMATES}
     doubts = tuple(findings(found))
     return Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0), doubts=doubts)
-
-
-@dataclass
-class _Clock:
-    """Processor time (s) that evaluations took on this rank."""
-
-    seconds: float = 0.0
 
 
 class Memory(OfEvaluate):
     """An evaluation that solves each point once, and returns the result, with its time, as often as requested.
 
     Sums of fields over several points are not remembered.
+
+    Attributes
+    ----------
+    seconds
+        Processor time (s) that evaluations of all models took on this rank, in that of the first model.
     """
 
-    def __init__(self, evaluate: Evaluate, clock: _Clock | None = None) -> None:
-        self._evaluate = evaluate
+    def __init__(self, evaluate: Evaluate, whole: Memory | None = None) -> None:
+        self._evaluate, self._whole, self.seconds = evaluate, whole or self, 0.0
         self._others: dict[str, Memory] = {}
         self._known: dict[tuple[bytes, bytes], Evaluations] = {}
-        self.clock = clock or _Clock()
 
     def on(self, model: str) -> Memory:
         """Return the evaluation of another of the models, with its own memory."""
         if model not in self._others:
-            self._others[model] = Memory(self._evaluate.on(model), self.clock)
+            self._others[model] = Memory(self._evaluate.on(model), self._whole)
         return self._others[model]
 
     def __call__(self, request: Request) -> Evaluations:
@@ -98,7 +95,7 @@ class Memory(OfEvaluate):
                 return self._evaluate(request)
             return self._remembered(request)
         finally:
-            self.clock.seconds += time.process_time() - begin
+            self._whole.seconds += time.process_time() - begin
 
     def _remembered(self, request: Request) -> Evaluations:
         from uq.evaluation.checkpoint import digest
