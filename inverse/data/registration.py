@@ -14,7 +14,7 @@ point goes on to e^[ω](Rx + t − c) + c + τ: (ω, τ) are the six unknowns he
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -24,9 +24,6 @@ from forward.readable import told
 from forward.settings import Settings
 from inverse.data.rigid import Rigid, check_rigid, orthonormal, slopes, turned
 from inverse.data.table import DataError
-
-if TYPE_CHECKING:
-    from forward.bodies.surface import Surface
 
 MOTIONS = tuple(f"{what} {axis}" for what in ("rotation about", "shift along") for axis in "xyz")
 STEPS, SETTLED = 100, 1e-8
@@ -286,6 +283,17 @@ class Registered:
     def std(self) -> FloatArray:
         """Standard deviations (6,) of (ω, τ): rad, m."""
         return np.asarray(np.linalg.norm(self.root, axis=0))
+
+
+class Surface(Protocol):
+    """A surface."""
+
+    @property
+    def middle(self) -> FloatArray:
+        """Centre (3,) of the box around it."""
+
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the nearest places (n, 3) to points (n, 3), and the normals (n, 3) there, of either sign."""
 
 
 def _fitted(
