@@ -90,7 +90,7 @@ def criticise(found: Points, posterior: Posterior, data: Measurements) -> Critic
     used = found.weights > 0
     w, x = found.weights[used], found.x[used]
     scale, r = posterior.scale(x), posterior.residuals(found.outputs[used], x)
-    pointwise = -posterior.noise.minus_log(r) - np.log(scale)
+    pointwise = -(r**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2
     log_ratio = np.log(w)[:, None] - pointwise
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
