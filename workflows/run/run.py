@@ -355,8 +355,17 @@ def results_of(
 ) -> xr.Dataset:
     """Run a study and return its results; under mpirun collective, and the results are those of the first rank.
 
-    An interrupted study in the directory is continued, a finished one read. Without a directory nothing is written to
-    disk, and there is no report.
+    Parameters
+    ----------
+    study
+        What `load` returns, or `tissuq.Study(...)`.
+    directory
+        Where results go; an interrupted study there is continued, a finished one is read. By default nothing is written
+        to disk.
+    quiet
+        Print no progress.
+    report
+        Write report.html too, if there is a directory.
 
     Returns
     -------
