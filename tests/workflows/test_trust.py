@@ -60,17 +60,18 @@ def strings(node):
 
 
 def made(function):
-    """The findings that a function makes: codes of each, and whether outputs are given."""
+    """The findings that a function makes: codes of each, and what is given by keywords, as outputs may be."""
     assigned = {}
     for node in ast.walk(function):
         for name in node.targets if isinstance(node, ast.Assign) else ():
             for one in ast.walk(name):
                 assigned.setdefault(getattr(one, "id", None), set()).update(strings(node.value))
     for node in ast.walk(function):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == "Finding":
+        if isinstance(node, ast.Call) and getattr(node.func, "id", None) in {"Finding", "_of_output"}:
             code = node.args[0]
             codes = assigned.get(code.id, set()) if isinstance(code, ast.Name) else strings(code)
-            yield codes & set(OWN), any(word.arg == "about" for word in node.keywords)
+            given = {word.arg for word in node.keywords}
+            yield codes & set(OWN), given if node.func.id == "Finding" else given | {"about"}
 
 
 def test_findings_bring_what_their_words_have_places_for():
@@ -78,8 +79,8 @@ def test_findings_bring_what_their_words_have_places_for():
     for path in (path for package in PACKAGES for path in (ROOT / package.__name__).rglob("*.py")):
         source = path.read_text()
         for function in ast.walk(ast.parse(source)) if "Finding(" in source else ():
-            for codes, about in made(function) if isinstance(function, ast.FunctionDef) else ():
-                known = strings(function) | ({"about"} if about else set())
+            for codes, given in made(function) if isinstance(function, ast.FunctionDef) else ():
+                known = strings(function) | given
                 for code in codes:
                     assert places(OWN[code].text + (OWN[code].short or "")) <= known, (path, code)
                 used |= codes

@@ -38,8 +38,8 @@ ROUGH = 0.02  # relative leave-one-out error from which the shape of an expansio
 SEEN = 1e-3  # of the standard deviation: smaller errors there are not reported
 
 
-def _of(name: str, code: str, severity: Severity, **values: Any) -> Finding:
-    """A finding of one output."""
+def _of_output(code: str, severity: Severity, name: str, **values: Any) -> Finding:
+    """A finding about one output."""
     return Finding(code, severity, values, about=entries([name]))
 
 
@@ -99,13 +99,13 @@ def of_tails(
         logarithmic = spread(values[:, i]) if relative[i] > SEEN else 0.0
         wider = (n / 64) ** WIDENS
         if logarithmic > HOPELESS[0] * wider and kappa > HOPELESS[1] / TAILS * largest:
-            yield _of(name, "tails-hopeless", "error", n=n, spread=logarithmic)
+            yield _of_output("tails-hopeless", "error", name, n=n, spread=logarithmic)
         elif logarithmic > SPREAD * wider and kappa <= largest:
-            yield _of(name, "tails-log-normal", "warning", n=n, spread=logarithmic)
+            yield _of_output("tails-log-normal", "warning", name, n=n, spread=logarithmic)
         elif kappa > largest or beyond[i] > most * variance:
             kurtosis = (deviations[:, i] ** 4).mean() / variance**2
             kappa = max(kappa, concentration(plain[:, i], variance))
-            yield _of(name, "tails", "warning", n=n, worth=n / kappa, kurtosis=kurtosis)
+            yield _of_output("tails", "warning", name, n=n, worth=n / kappa, kurtosis=kurtosis)
 
 
 def of_differences(
@@ -131,7 +131,9 @@ def of_differences(
             kappa = concentration(one[:, i], std[i] ** 2)
             if kappa > largest or tails[i] > most * std[i] ** 2:
                 worth = n / max(kappa, 1.0)
-                yield _of(names[i], "tails-of-difference", "warning", n=n, coarser=level - 1, level=level, worth=worth)
+                yield _of_output(
+                    "tails-of-difference", "warning", names[i], n=n, coarser=level - 1, level=level, worth=worth
+                )
 
 
 def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
@@ -139,7 +141,7 @@ def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
     n = len(values)
     for name, value, alike in zip(names, values[0].tolist(), equal(values).tolist(), strict=True):
         if alike:
-            yield _of(name, "constant", "warning", n=n, value=value, unmet=unmet(n))
+            yield _of_output("constant", "warning", name, n=n, value=value, unmet=unmet(n))
 
 
 def equal(values: FloatArray) -> NDArray[np.bool_]:
@@ -193,7 +195,7 @@ def of_control(names: Sequence[str], control: str, found: Estimates) -> Iterator
         ]
         if dropped and found.relative_std_error[i] > MATTERS:
             be = "are" if len(dropped) > 1 else "is"
-            yield _of(name, "control-dropped", "note", control=control, dropped=" and ".join(dropped), be=be)
+            yield _of_output("control-dropped", "note", name, control=control, dropped=" and ".join(dropped), be=be)
 
 
 def of_expansion(
@@ -202,9 +204,9 @@ def of_expansion(
     """Find the outputs that an expansion does not explain, from its relative leave-one-out errors (m,)."""
     for name, error in zip(names, relative.tolist(), strict=True):
         if error > nothing:
-            yield _of(name, "expansion-explains-nothing", "error", error=error, samples=samples)
+            yield _of_output("expansion-explains-nothing", "error", name, error=error, samples=samples)
         elif error > trusted:
-            yield _of(name, "expansion-rough", "warning", error=error, samples=samples)
+            yield _of_output("expansion-rough", "warning", name, error=error, samples=samples)
 
 
 def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samples: int) -> Iterator[Finding]:
@@ -220,7 +222,7 @@ def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samp
     for i, (name, error) in enumerate(zip(names, relative.tolist(), strict=True)):
         kappa = concentration(moved[:, i], float(deviations[:, i].var())) if error > ROUGH else 0.0
         if kappa > largest:
-            yield _of(name, "expansion-shape", "warning", kappa=kappa, error=error)
+            yield _of_output("expansion-shape", "warning", name, kappa=kappa, error=error)
 
 
 def of_reach(
@@ -233,7 +235,7 @@ def of_reach(
     for name, share, left, whole in zip(names, outside.tolist(), relative.tolist(), rest.tolist(), strict=True):
         error = max(left, whole) if share > MOSTLY else left
         if share > BEYOND_SAMPLES and error > SEEN:
-            yield _of(name, "expansion-reach", "warning", share=share, samples=samples, error=error)
+            yield _of_output("expansion-reach", "warning", name, share=share, samples=samples, error=error)
 
 
 def of_centre(
@@ -244,7 +246,7 @@ def of_centre(
     limits = np.maximum(np.maximum(CENTRE * loo, SEEN * std), rounding)
     for name, error, left, limit in zip(names, np.abs(errors).tolist(), loo.tolist(), limits.tolist(), strict=True):
         if error > limit:
-            yield _of(name, "expansion-at-mean", "warning", error=error, left=left)
+            yield _of_output("expansion-at-mean", "warning", name, error=error, left=left)
 
 
 def of_field(rest: float, trusted: float, nothing: float) -> Iterator[Finding]:
@@ -281,7 +283,7 @@ def of_indices(dataset: xr.Dataset) -> Iterator[Finding]:
             for i in np.flatnonzero(sign * (value - limit) > BEYOND * error + ROUNDING):
                 times = min(abs(value[i] - limit[i]) / max(error[i], 1e-300), 999)
                 values = {"what": what, "parameter": names[i], "value": value[i], "excess": excess, "limit": limit[i]}
-                yield _of(of, "index-out-of-bounds", "error", **values, times=times)
+                yield _of_output("index-out-of-bounds", "error", of, **values, times=times)
         together = float(np.sqrt((S_error**2).sum()))
         if S.sum() > 1 + BEYOND * together + ROUNDING:
-            yield _of(of, "indices-add-up", "error", total=S.sum(), together=together)
+            yield _of_output("indices-add-up", "error", of, total=S.sum(), together=together)
