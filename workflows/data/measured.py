@@ -17,7 +17,6 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from forward.bodies.geometry import AXES, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
-from forward.combine import selected
 from forward.files import meshes
 from forward.settings import Settings, one_line
 from inverse.data.files import SCANS, distinct, files
@@ -232,6 +231,8 @@ def observing(model: Any, data: Measurements) -> ForwardModel:
         If a place is farther from the mesh than the mesh can be from the body.
     """
     if data.some:
+        from forward.combine import selected
+
         return selected(model, tuple(model.outputs.index(name) for name in data.names))
     found: ForwardModel = model.observing(data.places, data.axes, data.cases, data.along)
     return found
