@@ -196,11 +196,11 @@ class Noise:
 
     def minus_log(self, r: FloatArray) -> FloatArray:
         """Return ρ, −ln of the density, of residuals of any shape."""
-        from scipy.special import gammaln
-
         nu = self.dof
         if nu is None:
             return np.asarray(r**2 / 2 + HALF_LOG)
+        from scipy.special import gammaln
+
         constant = gammaln(nu / 2) - gammaln((nu + 1) / 2) + np.log(nu * np.pi) / 2
         return np.asarray((nu + 1) / 2 * np.log1p(r**2 / nu) + constant)
 
@@ -226,8 +226,8 @@ class Noise:
 
     def normal_scores(self, r: FloatArray) -> FloatArray:
         """Return standard normal values of the same probabilities."""
-        from scipy.special import ndtri, stdtr
-
         if self.dof is None:
             return r
+        from scipy.special import ndtri, stdtr
+
         return np.asarray(-np.sign(r) * ndtri(np.maximum(stdtr(self.dof, -np.abs(r)), 1e-300)))

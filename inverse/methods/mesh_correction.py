@@ -240,9 +240,8 @@ def corrected_field(
             return None, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1), 0.0
         found = error_of(look, np.asarray(point.solution.outputs), point.values, data)
         found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.seen)]))
-        over = (
-            found.error * posterior.measured / point.posterior.noise.sigma
-        )  # nothing is said of data that are not there
+        # Nothing is said of data that are not there.
+        over = found.error * posterior.measured / point.posterior.noise.sigma
         moved = _moved(here, found.error if mesh is None else found.error - mesh.error)
         width = here.found.marginal(weights)[1]
         shift = np.array([weights @ moved / width])

@@ -177,7 +177,7 @@ class Fidelities(Team):
         self.spent = 0.0
         for one in cheap:
             stopped = one.stopped_after
-            other, found = evaluate if stopped else evaluate.on(one.label), centre
+            other, found = evaluate.on(one.label) if stopped is None else evaluate, centre
             cost = one.predicted(evaluate.displacements, other.displacements)
             if cost is None:
                 raise ValueError(f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`")

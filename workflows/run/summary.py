@@ -71,25 +71,24 @@ def _counts(study: StudyKind, evaluations: Mapping[str, Evaluations], outcomes: 
     """Number of solves, or of data sets that were inverted side by side, and which failed."""
     explains = study.explains
     solves = [(label, failure) for label, found in evaluations.items() for failure in found.failures]
-    failures: list[dict[str, Any]] = [
-        {"parameters": {"data_set": float(k)}, "reason": one.reason}
-        for k, one in enumerate(outcomes)
-        if one.dataset is None
+    failed = [(label, failure) for label, failure in solves if not (explains and failure.inadmissible)]
+    lost = [(k, one.reason) for k, one in enumerate(outcomes) if one.dataset is None]
+    listed: list[dict[str, Any]] = [
+        {"parameters": {"data_set": float(k)}, "reason": reason} for k, reason in lost[:LISTED]
     ]
     if not outcomes:
-        failures = [
+        listed = [
             {
                 **({} if label == "/" else {"model": label}),
                 "parameters": dict(zip(study.parameters_of(label), failure.parameters, strict=True)),
                 "reason": failure.reason,
             }
-            for label, failure in solves
-            if not (explains and failure.inadmissible)
+            for label, failure in failed[:LISTED]
         ]
     unlikely = sum(failure.inadmissible for _, failure in solves)  # at parameters for which there is no model
     return {
         "evaluations": len(outcomes) or sum(len(found.points) for found in evaluations.values()),
-        "failed": len(failures),
+        "failed": len(lost if outcomes else failed),
         **({"zero_likelihood": unlikely} if outcomes or explains else {}),
-        "failures": failures[:LISTED],
+        "failures": listed,
     }
