@@ -81,7 +81,7 @@ class Univariate(Settings):
     @property
     def range(self) -> tuple[float, float]:
         """Ends of the support or, for a tail, the quantile that one of ten thousand samples exceeds."""
-        return self.support or (self.at(RARE), self.at(1 - RARE))
+        return self.ends(3.7190164854556804)  # −Φ⁻¹(RARE)
 
     @cached_property
     def logarithmic(self) -> bool:
@@ -124,6 +124,13 @@ class Univariate(Settings):
         z = np.asarray(z, dtype=float)
         u, log_density = self._inverse(np.maximum(ndtr(z), TAIL), np.maximum(ndtr(-z), TAIL))
         return origin + unit * u, abs(unit) * np.exp(-(z**2) / 2 - np.log(2 * np.pi) / 2 - log_density)
+
+    def ends(self, z: float) -> tuple[float, float]:
+        """Ends of the support or, for a tail, the values that belong to the standard normal ones −z and z."""
+        if self.support is not None:
+            return self.support
+        lower, upper = self.from_normal(np.array([-z, z]))[0]
+        return float(lower), float(upper)
 
     def at(self, probability: float) -> float:
         """Quantile of one probability."""

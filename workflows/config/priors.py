@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from uq.inputs.draws import Draws
     from workflows.config.blocks import Correlation
 
-NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
+NEGLIGIBLE = 5.9978070150076865  # standard normal value: a tail of probability 1e-9 may lie outside what is admissible
 LEAST = 0.5  # smallest probability of admissible constants
 
 
@@ -66,7 +66,7 @@ def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mist
     """Find a prior of the factor on standard deviations of errors that allows values ≤ 0."""
     if prior is None:
         return
-    lowest = prior.support[0] if prior.support is not None else prior.at(NEGLIGIBLE)
+    lowest, _ = prior.ends(NEGLIGIBLE)
     if lowest < 0:
         message = f"reaches {lowest:.4g}, expected a factor on standard deviations, which is positive"
         yield place, message, prior.model_dump()
@@ -85,8 +85,7 @@ def mistakes_of_parameters(spec: ModelSpec, parameters: Mapping[str, Distributio
             continue
         if path in constants:
             continue
-        ends = distribution.support or (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-        for end in ends:
+        for end in distribution.ends(NEGLIGIBLE):
             objection = scalars[path].objection(end)
             if objection is not None:
                 message = f"reaches {end:.4g}, where the model is impossible ({objection})"

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.inclusions import derived, log_factor
-from forward.fem.finer import counted as counted_on
 from forward.findings import Finding, Severity
+from forward.finer_meshes import counted as counted_on
 from forward.model import FloatArray
 from forward.readable import told
 from inverse.criticism import doubts as criticism

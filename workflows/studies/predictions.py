@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from forward.fem.cost import REPORT, START
+from forward.finer_meshes import finer, graded
 from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
@@ -62,8 +63,6 @@ def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
     ValueError
         If there are none, or they would be too large.
     """
-    from forward.fem.finer import finer, graded
-
     both = ((finer(one), graded(one)) for one in spec.bodies if one.body.structured)
     return tuple(mesh for pair in both for mesh in pair if mesh is not None)
 

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from forward.finer_meshes import finer
 from forward.materials.material_point import MaterialTest
 from forward.model import ForwardModel
 from forward.readable import named
@@ -172,8 +173,6 @@ class SelectionBlocks(OfCandidates):
             return str(method.unchecked)
         if not has_mesh(spec):
             return spec.hidden or f"a model of kind '{spec.kind}' has no mesh"
-        from forward.fem.finer import finer
-
         try:
             for body in spec.bodies:
                 finer(body)

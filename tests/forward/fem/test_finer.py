@@ -9,7 +9,8 @@ from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh import contents, divided
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.finer import HALVED, OF_LINEAR, OtherMesh, counted, extrapolated, finer, graded, held, share
+from forward.fem.finer import OtherMesh, extrapolated
+from forward.finer_meshes import HALVED, OF_LINEAR, counted, finer, graded, held, share
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.specimen import Specimen

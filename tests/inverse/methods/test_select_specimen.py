@@ -16,7 +16,7 @@ from mpi4py import MPI
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-import forward.fem.finer
+import forward.finer_meshes
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
@@ -73,7 +73,7 @@ HEAD = "# made up\nx,y,z,ux,uy,uz,sigma\n"
 @pytest.fixture(autouse=True)
 def fewer_cells(monkeypatch):
     """Finer meshes of two cells along an edge, for time; as they are: `tests/forward/fem/test_finer.py`."""
-    monkeypatch.setattr(forward.fem.finer, "LEAST", {1.5: 2, 1.0: 1})
+    monkeypatch.setattr(forward.finer_meshes, "LEAST", {1.5: 2, 1.0: 1})
 
 
 @pytest.fixture(scope="module")

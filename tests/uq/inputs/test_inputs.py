@@ -41,6 +41,9 @@ def test_distribution_agrees_with_scipy(block, reference):
     p = np.array([1e-6, 0.01, 0.3, 0.5, 0.9, 1 - 1e-6])
     np.testing.assert_allclose(block.quantile(p), reference.ppf(p), rtol=1e-6)
     np.testing.assert_allclose(block.moments, (reference.mean(), reference.std()), rtol=1e-5)
+    ends = reference.ppf(stats.norm.cdf([-6.0, 6.0])) if block.support is None else reference.support()
+    np.testing.assert_allclose(block.ends(6.0), ends, rtol=1e-6)
+    assert block.range == (block.support or pytest.approx(tuple(reference.ppf([1e-4, 1 - 1e-4])), rel=1e-9))
 
 
 @pytest.mark.unit

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -166,3 +168,19 @@ def test_what_takes_the_place_of_factors_is_cheaper_where_it_is_chosen():
         assert alone.bytes < both.bytes < factor.bytes
         assert both.first < factor.first
         assert both.factorisation == factor.factorisation
+
+
+def test_a_check_imports_no_library_of_methods():
+    """These take as long as all else of a check."""
+    names = [str(CONFIGS / f"{name}.toml") for name in ("inclusion", "beam", "slab")]
+    code = f"""
+import sys
+from pathlib import Path
+from workflows.config.study import load
+from workflows.run.plan import plan
+for name in {names}:
+    plan(load(Path(name)))
+print([name for name in ("scipy", "xarray", "chaospy", "dolfinx", "mpi4py") if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
