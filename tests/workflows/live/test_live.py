@@ -11,6 +11,7 @@ import urllib.request
 import numpy as np
 import pytest
 
+from forward.machine import compiled_forms
 from forward.reduced.data import save
 from forward.reduced.model import ReducedModel
 from tests.browser import browser, executable
@@ -43,8 +44,12 @@ def test_the_surface_of_hexahedra_and_tetrahedra():
 
 @contextlib.contextmanager
 def live(small, folder, *words, files=1024):  # noqa: F811
-    """A program that serves, with a folder of its own for the token; its ports and the token."""
+    """A program that serves, with a folder of its own for the token beside what is compiled; its ports and the token."""
     save(small, folder / "model.npz")
+    (folder / "tissuq").mkdir(exist_ok=True)
+    for compiled in compiled_forms().iterdir():
+        if compiled.is_dir():
+            (folder / "tissuq" / compiled.name).symlink_to(compiled)
     port, page = free_port(), free_port()
     command = [TISSUQ, "live", folder / "model.npz", "--port", str(port), "--page", str(page), *words]
     served = subprocess.Popen(
