@@ -271,8 +271,14 @@ def reference():
     return module
 
 
-def test_generated_pages_tell_what_is_there(reference):
-    pages = dict(reference.pages())
+@pytest.fixture(scope="module")
+def generated(reference):
+    """Pages that are made of the code, by name."""
+    return dict(reference.pages())
+
+
+def test_generated_pages_tell_what_is_there(generated):
+    pages = generated
     assert "| `max_order` | whole number ≥ 1 ≤ 20 | `6` | Largest order that is tried" in pages["reference/settings.md"]
     assert "usage: tissuq run" in pages["reference/commands.md"]
     assert "## treloar" in pages["studies.md"]
@@ -293,9 +299,8 @@ def test_quotations_are_found(reference):
     assert "- `x, y`: Some \\*number\\* below 1." in text
 
 
-def test_pages_are_in_the_menu_or_linked(reference):
+def test_pages_are_in_the_menu_or_linked(generated):
     named = set(re.findall(r"[\w/.-]+\.md", (ROOT / "mkdocs.yml").read_text()))
-    generated = dict(reference.pages())
     written = {str(page.relative_to(ROOT / "docs")) for page in PAGES[1:]}
     linked = set(
         re.findall(r"\]\((?:\.\./)?([\w/.-]+\.md)", "".join([*generated.values(), *map(Path.read_text, PAGES)]))

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-LONG = {"06_pipeline"}  # four studies
+LONG = {"02_error_against_time", "04_materials", "06_pipeline"}  # repeats, five materials, four studies
 SHORT = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG)) for path in NOTEBOOKS]
 
 

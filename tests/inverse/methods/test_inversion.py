@@ -26,7 +26,7 @@ from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.record import Problem, as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
-from tests.launch import TISSUQ, run, run_script, tissuq_on_two_ranks
+from tests.launch import TISSUQ, run, run_script
 from tests.problems import curved
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import SerialEvaluate

@@ -44,7 +44,7 @@ def test_the_surface_of_hexahedra_and_tetrahedra():
 
 @contextlib.contextmanager
 def live(small, folder, *words, files=1024):  # noqa: F811
-    """A program that serves, with a folder of its own for the token beside what is compiled; its ports and the token."""
+    """A program that serves, with a folder of its own for the token beside compiled forms; its ports and the token."""
     save(small, folder / "model.npz")
     (folder / "tissuq").mkdir(exist_ok=True)
     for compiled in compiled_forms().iterdir():

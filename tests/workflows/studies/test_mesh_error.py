@@ -262,18 +262,6 @@ def test_the_plan_says_what_it_takes():
 
 
 @pytest.mark.fem
-def test_a_study_without_it_imports_nothing_of_it():
-    script = f"""
-import sys
-from pathlib import Path
-from workflows.config.study import load
-load(Path({str(TINY)!r}), {[OFF, "model.body.cells=[2,1,1]", "method.samples=2"]!r}).run()
-assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and name != "uq.accuracy.budget"]
-"""
-    done = run_script(None, script)
-    assert done.returncode == 0, done.stderr
-
-
 def test_models_without_a_mesh_say_so_where_its_error_is_asked_for():
     own = ROOT / "configs" / "own-model.toml"
     texts = [one.text for one in load(own, ["accuracy.mesh_error=true"]).findings]

@@ -309,20 +309,6 @@ def test_a_schema_knows_draws():
     assert "source" not in schema()["$defs"]["Study"]["properties"]
 
 
-def test_a_study_without_draws_imports_nothing_of_them(folder):
-    path = study(folder, 'a = { kind = "normal", mean = 0, std = 0.1 }')
-    script = (
-        "import sys; from workflows.__main__ import main; "
-        f"main(['run', {str(path)!r}, '--out', {str(folder / 'out')!r}, '--quiet']); "
-        "ends = ('.draws', '.posteriors', 'of_draws', 'estimators.shapley'); "
-        "print([n for n in sys.modules if n.endswith(ends)])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=environment(), check=False
-    )
-    assert done.stdout.splitlines()[-1] == "[]", done.stderr
-
-
 # --- of studies that have found a posterior ---------------------------------------------------------------------------
 
 STRETCH = np.linspace(1.05, 1.5, 10)

@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -307,18 +306,6 @@ def test_after_a_kill_it_is_the_same_model(folder, tmp_path):
     done = launch.run(None, *command)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "reduced.npz").read_bytes() == (folder / "model.npz").read_bytes()
-
-
-def test_studies_without_it_import_nothing_of_it(tmp_path):
-    (tmp_path / "body.toml").write_text(SAMPLED)
-    script = (
-        "import sys; from workflows.__main__ import main\n"
-        f"main(['run', {str(tmp_path / 'body.toml')!r}, '--out', {str(tmp_path / 'out')!r}, '--no-report', '--quiet']"
-        ")\n"
-        "print([name for name in sys.modules if 'reduc' in name and name.startswith(('forward', 'workflows'))])"
-    )
-    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    assert out.splitlines()[-1] == "[]"
 
 
 COLUMN = """

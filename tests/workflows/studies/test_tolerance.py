@@ -451,12 +451,3 @@ def test_a_number_of_samples_of_the_method_is_the_limit_that_is_named(tmp_path):
     assert any(
         "More solves than accuracy.solves = 100 and method.samples = 8" in one["text"] for one in summary["findings"]
     )
-
-
-def test_a_study_without_a_tolerance_imports_nothing_of_it():
-    script = (
-        "import sys; from pathlib import Path; from workflows.config.study import load\n"
-        f"load(Path('{OWN}'), {NAMED}).run()\n"
-        "print([name for name in sys.modules if 'tolerance' in name or name.endswith(('accuracy.goal', 'automatic'))])"
-    )
-    assert run_script(None, script).stdout.strip() == "[]"
