@@ -1,4 +1,4 @@
-"""Files of VTK as pyvista reads them: polygons, grids, pieces, words among the arrays, every compression."""
+"""Files of VTK as VTK reads them: polygons, grids, pieces, words among the arrays, every compression."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from forward.model import FloatArray
 if TYPE_CHECKING:
     import meshio
 
+Arrays = dict[str, FloatArray]  # by name
 ABSENT = -9.87654321e30  # in place of "nan" in a text, where the reader of the old format ends at a word
 NAN = re.compile(rb"(?<=\s)[-+]?nan(?:\([^)\s]*\))?(?=\s)", re.IGNORECASE)
 ASCII = re.compile(rb"[^\n]*\n[^\n]*\n\s*ASCII")
@@ -37,84 +38,114 @@ def read(path: Path) -> meshio.Mesh:
     Raises
     ------
     ImportError
-        Where pyvista is not installed.
+        Where VTK is not installed.
     ValueError
         If VTK finds anything wrong, or the file has no points.
     """
-    if find_spec("pyvista") is None:
-        raise ImportError("No module named 'pyvista'", name="pyvista")
+    if find_spec("vtkmodules") is None:
+        raise ImportError("No module named 'vtk'", name="vtk")
     command = [sys.executable, "-m", __name__, str(path.absolute())]
     found = subprocess.run(command, capture_output=True, check=False, cwd=Path(__file__).resolve().parents[2])
     if found.returncode == REFUSED:
         raise ValueError(found.stdout.decode())
     if found.returncode or WRONG.search(found.stderr):
         raise ValueError(DAMAGED)
-    made: meshio.Mesh = pickle.loads(found.stdout)
-    return made
+    return _mesh(*pickle.loads(found.stdout))
 
 
-def mesh(path: Path) -> meshio.Mesh:
-    """Read a file in this process; raises ValueError as `read`."""
+def _mesh(points: FloatArray, at_points: Arrays, at_cells: Arrays, cells: tuple[NDArray[np.int64], ...]) -> meshio.Mesh:
+    """Return the mesh of what a process has read; cells stand kind by kind, with numbers at them."""
     import meshio
-    import pyvista
+    from meshio._vtk_common import vtk_to_meshio_type
+
+    blocks, order = [], []
+    if cells:
+        kinds, starts, corner = cells
+        sizes = np.diff(starts)
+        for kind, size in sorted(set(zip(kinds.tolist(), sizes.tolist(), strict=True))):
+            mine = np.flatnonzero((kinds == kind) & (sizes == size))
+            usual, turned = BRICKS.get(kind, (kind, slice(None)))
+            corners = corner[starts[mine][:, None] + np.arange(size)][:, turned].astype(np.int64)
+            blocks.append((vtk_to_meshio_type.get(usual, "polygon"), corners))
+            order.append(mine)
+    of_cells = {name: [values[rows] for rows in order] for name, values in at_cells.items() if blocks}
+    return meshio.Mesh(points, blocks, point_data=at_points, cell_data=of_cells)
+
+
+def contents(path: Path) -> tuple[FloatArray, Arrays, Arrays, tuple[NDArray[np.int64], ...]]:
+    """Read a file in this process: points, numbers at points and at cells, and cells, none of a regular grid.
+
+    Cells are the kind of each, where its corners begin, and the corners of all. Raises ValueError as `read`.
+    """
+    from vtkmodules.vtkIOLegacy import vtkDataSetReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     whole = path.read_bytes()
     if (b"DATASET " if path.suffix == ".vtk" else b"VTKFile") not in whole:
         raise ValueError("expected a data set of VTK")
-    kinds = {".vtk": pyvista.VTKDataSetReader, ".vtu": pyvista.XMLUnstructuredGridReader}
-    reader: Any = kinds.get(path.suffix, pyvista.XMLPolyDataReader)(path)
+    kinds = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader}
+    reader: Any = kinds.get(path.suffix, vtkXMLPolyDataReader)()
+    reader.SetFileName(str(path))
     if ASCII.match(whole):
         text = NAN.sub(repr(ABSENT).encode(), whole)
-        reader.reader.ReadFromInputStringOn()
-        reader.reader.SetBinaryInputString(text, len(text))
-    data = reader.read()
-    if not data.n_points:
+        reader.ReadFromInputStringOn()
+        reader.SetBinaryInputString(text, len(text))
+    reader.Update()
+    data = reader.GetOutput()
+    if data is None or not data.GetNumberOfPoints():
         raise ValueError("it has no points")
-    blocks, order = _cells(data)
-    at_cells = _arrays(data.cell_data) if blocks else {}
-    of_cells = {name: [values[rows] for rows in order] for name, values in at_cells.items()}
-    return meshio.Mesh(np.array(data.points), blocks, point_data=_arrays(data.point_data), cell_data=of_cells)
+    if data.IsA("vtkPointSet"):
+        points = _numbers(data.GetPoints().GetData())
+    else:
+        points = np.array([data.GetPoint(i) for i in range(data.GetNumberOfPoints())])
+    return points, _arrays(data.GetPointData()), _arrays(data.GetCellData()), _cells(data)
 
 
-def _cells(data: Any) -> tuple[list[tuple[str, NDArray[np.int64]]], list[NDArray[np.int64]]]:
-    """Return cells kind by kind, and their numbers in the file; none of a regular grid."""
-    from meshio._vtk_common import vtk_to_meshio_type
-    from pyvista import convert_array
+def _cells(data: Any) -> tuple[NDArray[np.int64], ...]:
+    """Return the kind of each cell, where its corners begin, and the corners; none of a regular grid."""
+    if data.GetDataObjectType() not in LISTED or not data.GetNumberOfCells():
+        return ()
+    from vtkmodules.vtkFiltersCore import vtkAppendFilter
 
-    if data.GetDataObjectType() not in LISTED or not data.n_cells:
-        return [], []
-    grid = data.cast_to_unstructured_grid()
-    kinds, cells = grid.celltypes, grid.GetCells()
-    starts, corner = (np.array(convert_array(one)) for one in (cells.GetOffsetsArray(), cells.GetConnectivityArray()))
+    grid = vtkAppendFilter()
+    grid.AddInputData(data)
+    grid.Update()
+    cells = grid.GetOutput().GetCells()
+    kinds, starts, corner = map(
+        _numbers, (grid.GetOutput().GetCellTypesArray(), cells.GetOffsetsArray(), cells.GetConnectivityArray())
+    )
     sizes = np.diff(starts)
     whole = len(sizes) == len(kinds) and (sizes > 0).all() and sizes.sum() == len(corner)
-    if not whole or not 0 <= corner.min() <= corner.max() < data.n_points:
+    if not whole or not 0 <= corner.min() <= corner.max() < data.GetNumberOfPoints():
         raise ValueError(DAMAGED)
-    blocks, order = [], []
-    for kind, size in sorted(set(zip(kinds.tolist(), sizes.tolist(), strict=True))):
-        mine = np.flatnonzero((kinds == kind) & (sizes == size))
-        usual, turned = BRICKS.get(kind, (kind, slice(None)))
-        corners = corner[starts[mine][:, None] + np.arange(size)][:, turned].astype(np.int64)
-        blocks.append((vtk_to_meshio_type.get(usual, "polygon"), corners))
-        order.append(mine)
-    return blocks, order
+    return kinds, starts, corner
 
 
-def _arrays(data: Any) -> dict[str, FloatArray]:
+def _arrays(attributes: Any) -> Arrays:
     """Return the arrays of numbers by name."""
     found = {}
-    for name, array in data.items():
-        numbers = np.array(array)
+    for i in range(attributes.GetNumberOfArrays()):
+        array = attributes.GetArray(i)  # None for words
+        if array is None or not array.GetName():
+            continue
+        numbers = _numbers(array)
         if np.issubdtype(numbers.dtype, np.floating):
             numbers[numbers == numbers.dtype.type(ABSENT)] = np.nan
-        if np.issubdtype(numbers.dtype, np.number):
-            found[name] = numbers
+        found[array.GetName()] = numbers
     return found
+
+
+def _numbers(array: Any) -> NDArray[Any]:
+    """Return a copy of an array of VTK."""
+    from vtkmodules.util import numpy_support
+
+    views: Any = numpy_support  # without types
+    return np.array(views.vtk_to_numpy(array))
 
 
 if __name__ == "__main__":
     try:
-        sys.stdout.buffer.write(pickle.dumps(mesh(Path(sys.argv[1]))))
+        sys.stdout.buffer.write(pickle.dumps(contents(Path(sys.argv[1]))))
     except ValueError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)

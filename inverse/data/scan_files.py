@@ -64,7 +64,7 @@ def points_of(path: Path) -> Points:
         raise
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
-        wanted = {"pyvista": "'tissuq[vtk]'"}.get(package, package)
+        wanted = {"vtk": "'tissuq[vtk]'"}.get(package, package)
         raise DataError(f"{path.name}: files of this kind need {package} (pip install {wanted})") from None
     except Exception as error:  # files may be anything, and their readers fail in many ways
         reason = " ".join(str(error).split()) or type(error).__name__
