@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import Vector
 from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume
-from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
+from forward.materials.material_point import HomogeneousModel, MaterialTest, stresses_of, unfit
 from forward.registry import KindError
 from forward.scalars import Mistake, Scalar, refuse
-from forward.settings import Settings, nearest, shown
+from forward.settings import nearest, shown
 from forward.solid import block
 from forward.spec import ModelSpec
 
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges
 
-PATH = "material."  # before the name of a constant, as in the model of a body
+Constants = dict[str, float | str | tuple[Vector, ...]]  # of a material: its kind, constants and fibres by name
 
 
 class Stress(NamedTuple):
@@ -31,17 +31,21 @@ class Stress(NamedTuple):
     unit: str = "Pa"
 
 
-class TestedMaterial(Settings):
-    """A kind of material with constants; without those of the volume (D1), an energy is incompressible.
+class MaterialTests(ModelSpec):
+    """Stresses of homogeneous tests of a material; without constants of the volume (D1), an energy is incompressible.
 
     Parameters
     ----------
     material
         Its kind, its constants, and fibres where it has them, by their components along the first stretch, along the
         second one and across both.
+    tests
+        What is prescribed, and which stress is measured.
     """
 
-    material: dict[str, float | str | tuple[Vector, ...]]
+    material: Constants
+    kind: Literal["material-tests"] = "material-tests"
+    tests: tuple[MaterialTest, ...] = Field(min_length=1)
 
     @property
     def energy(self) -> str:
@@ -54,54 +58,25 @@ class TestedMaterial(Settings):
         return {name: value for name, value in self.material.items() if isinstance(value, float)}
 
     @property
+    def paths(self) -> dict[str, str]:
+        """Paths of the constants by their names, as in the model of a body."""
+        return {name: f"material.{name}" for name in self.fixed}
+
+    @property
+    def varied(self) -> list[str]:
+        """Constants that are parameters of the same name, and have no value."""
+        return [name for name, path in self.paths.items() if name == path]
+
+    @property
     def fibres(self) -> tuple[Vector, ...]:
         """Directions of the families of fibres."""
         found = self.material.get("fibres", ())
         return found if isinstance(found, tuple) else ()
 
-    def mistakes_of_material(self, varied: Collection[str] = ()) -> Iterator[str]:
-        """Find what is wrong with the kind or the constants, some of which are `varied` and need not be stated."""
-        kind = self.material.get("kind")
-        if kind is None:
-            yield "material.kind: missing"
-            return
-        try:
-            MATERIALS[str(kind)]
-        except KindError as error:
-            yield f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
-            return
-        words = [name for name in self.material if name not in {"kind", "fibres", *self.fixed}]
-        if words:
-            yield f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
-        known = constants(self.energy)
-        given = dict.fromkeys([*self.fixed, *varied])
-        for name in given:
-            if name not in known:
-                yield f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
-            if name in self.fixed and name in varied:
-                yield f"'{name}' is given in material and in parameters, expected one of them"
-        left_out = of_volume(self.energy) if incompressible(self.energy, given) else ()
-        missing = [name for name in known if name not in given and name not in left_out]
-        if missing:
-            yield f"missing: {', '.join(missing)}, expected in material{' or parameters' if varied else ''}"
-
-
-class MaterialTests(TestedMaterial, ModelSpec):
-    """Stresses of homogeneous tests of a material.
-
-    Parameters
-    ----------
-    tests
-        What is prescribed, and which stress is measured.
-    """
-
-    kind: Literal["material-tests"] = "material-tests"
-    tests: tuple[MaterialTest, ...] = Field(min_length=1)
-
-    @cached_property
+    @property
     def outputs(self) -> tuple[Stress, ...]:
         """The stresses of all tests, one after the other."""
-        return tuple(Stress(name) for name in self.build(None, ()).outputs)
+        return tuple(map(Stress, stresses_of(self.tests)))
 
     @property
     def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
@@ -115,15 +90,14 @@ class MaterialTests(TestedMaterial, ModelSpec):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """The constants, by their paths in the model of a body."""
-        made = block(self.energy)
-        return {f"{PATH}{name}": Scalar(value, made, name) for name, value in self.fixed.items()}
+        """The constants, by their paths."""
+        made, values = block(self.energy), self.fixed
+        return {path: Scalar(values.get(name, math.nan), made, name) for name, path in self.paths.items()}
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
         """Return the material as a function of some constants, by their paths."""
-        own = {name: f"{PATH}{name}" for name in self.fixed}
-        stated = {name: own[name] if own[name] in parameters else value for name, value in self.fixed.items()}
-        return Materials(self.energy, {"material": stated})
+        varied = {name: path for name, path in self.paths.items() if path in parameters}
+        return Materials(self.energy, {"material": {**self.fixed, **varied}})
 
     @property
     def description(self) -> str:
@@ -144,16 +118,66 @@ class MaterialTests(TestedMaterial, ModelSpec):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        wrong = next(self.mistakes_of_material(), None)
+        wrong = next(self._of_material(), None)
         if wrong is not None:
-            yield ("material",), wrong, self.material
+            yield (), wrong, self.material
             return
         labels = [test.label for test in self.tests]
         for i, test in enumerate(self.tests):
             if labels.index(test.label) < i:
                 yield ("tests", i, "name"), "the name of a test before, expected another one", test.label
-            said = unfit(self.energy, test.mode, self.fibres)
-            if said is not None:
-                yield ("tests", i, "mode"), said, test.mode
-        for _, said in self.materials().objections({}):
+        said = next(filter(None, (unfit(self.energy, test.mode, self.fibres) for test in self.tests)), None)
+        if said is not None:
+            yield ("material",), said, self.material
+        for _, said in () if self.varied else self.materials().objections({}):
             yield ("material",), said, dict(self.fixed)
+
+    def _of_material(self) -> Iterator[str]:
+        """Find what is wrong with the kind or the constants."""
+        kind = self.material.get("kind")
+        if kind is None:
+            yield "material.kind: missing"
+            return
+        try:
+            MATERIALS[str(kind)]
+        except KindError as error:
+            yield f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
+            return
+        words = [name for name in self.material if name not in {"kind", "fibres", *self.fixed}]
+        if words:
+            yield f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
+        known = constants(self.energy)
+        given = dict.fromkeys([*self.fixed, *self.varied])
+        for name in given:
+            if name not in known:
+                yield f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+            if name in self.fixed and name in self.varied:
+                yield f"'{name}' is given in material and in parameters, expected one of them"
+        left_out = of_volume(self.energy) if incompressible(self.energy, given) else ()
+        missing = [name for name in known if name not in given and name not in left_out]
+        if missing:
+            yield f"missing: {', '.join(missing)}, expected in material{' or parameters' if self.varied else ''}"
+
+
+class CandidateTests(MaterialTests):
+    """The same of a candidate, whose parameters are constants that have no value besides; ranks may all work on it.
+
+    Parameters
+    ----------
+    parameters
+        Their names.
+    """
+
+    shareable: ClassVar[bool] = True
+
+    parameters: tuple[str, ...]
+
+    @property
+    def description(self) -> str:
+        """The model in words: tests are those of the data."""
+        return self.energy
+
+    @property
+    def paths(self) -> dict[str, str]:
+        """Names of the parameters, by themselves."""
+        return {name: name for name in self.parameters}

@@ -102,6 +102,14 @@ def named(test: str, component: Component) -> str:
     return test if component == "P1" else f"{test} {component}"
 
 
+def stresses_of(tests: Sequence[MaterialTest]) -> tuple[str, ...]:
+    """Return the names of the stresses of tests, numbered where a test has several."""
+    many = {test.label for test in tests if len(test.at) > 1}
+    return tuple(
+        f"{test.label}.{i}" if test.label in many else test.label for test in tests for i in range(1, len(test.at) + 1)
+    )
+
+
 class HomogeneousModel(OneByOne):
     """A forward model: stresses (Pa) of material tests as outputs, the constants of a material as parameters.
 
@@ -157,12 +165,7 @@ class HomogeneousModel(OneByOne):
         self._readings = [
             reading(energy, test.mode, self._names, units, test.component, test.stress == "cauchy") for test in tests
         ]
-        many = {test.label for test in tests if len(test.at) > 1}
-        self.outputs = tuple(
-            f"{test.label}.{i}" if test.label in many else test.label
-            for test in tests
-            for i in range(1, len(test.at) + 1)
-        )
+        self.outputs = stresses_of(tests)
 
     def stresses(self, points: FloatArray) -> FloatArray:
         """Return the stresses (n, m) at parameters (n, d), NaN where undefined (fully extended Gent chains)."""

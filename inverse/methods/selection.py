@@ -29,7 +29,7 @@ from inverse.low_dimensional.evidence import LEAST, nested
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
-from inverse.methods.mesh_correction import MeshTreatment, Treatment
+from inverse.methods.mesh_correction import MeshTreatment
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
 
@@ -87,7 +87,7 @@ class StatedNoise(Settings):
         return replace(other, sigma=sigma, factor=self.factor)
 
 
-class Select(Settings):
+class Select(MeshTreatment, Settings):
     """Bayesian model selection: evidence and probability of every candidate, and how far they can be trusted.
 
     Parameters
@@ -111,6 +111,13 @@ class Select(Settings):
         constants and predictions are theirs; those by "hmc" tell the evidence too, where weighted points cannot.
     check
         "dynesty": compute the evidences by nested sampling too.
+    mesh_error
+        What the error of each candidate's mesh, if it has one, does to the data, to the evidence and to the unknowns,
+        by solves on finer meshes with thinner cells at the faces that are held: "correct" the candidate by it where it
+        exceeds a fifth of the noise or of an unknown's deviation; "report" it only; false: not at all, and no evidence
+        is said to be trusted.
+    mesh_check
+        An older name: false is mesh_error = false.
     """
 
     kind: Literal["select"] = "select"
@@ -123,6 +130,8 @@ class Select(Settings):
     starts: Annotated[int, Field(ge=1)] = 4
     chains: Kind | None = None
     check: Literal["dynesty"] | None = None
+    mesh_error: Literal["correct", "report", False] = "correct"
+    mesh_check: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> Select:
@@ -253,29 +262,6 @@ class Select(Settings):
             return result
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
         return result.assign(motion_eigenvalue=(("model", "motion"), np.array(seen)))
-
-    @property
-    def treatment(self) -> Treatment | None:
-        """What is done about the error of meshes: there are none."""
-        return None
-
-
-class SelectSpecimens(MeshTreatment, Select):
-    """Bayesian model selection among models of a specimen.
-
-    Parameters
-    ----------
-    mesh_error
-        What the error of each candidate's mesh does to the data, to the evidence and to the unknowns, by solves on
-        finer meshes with thinner cells at the faces that are held: "correct" the candidate by it where it exceeds a
-        fifth of the noise or of an unknown's deviation; "report" it only; false: not at all, and no evidence is said to
-        be trusted.
-    mesh_check
-        An older name: false is mesh_error = false.
-    """
-
-    mesh_error: Literal["correct", "report", False] = "correct"
-    mesh_check: bool = True
 
 
 def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, evaluate: Evaluate) -> Posterior:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
+from inverse.data.measurements import Measurements
 from inverse.data.reader import AnyReader, table_of
 from inverse.data.table import DataError, Table, needed
 from workflows.config.mistakes import StudyError, lines
@@ -246,10 +249,22 @@ class MeasuredTests(Settings):
         """Return the tests of a group."""
         return [test for test in self.tests if test.group == group]
 
+    def measurements(self, group: str, predicted: Sequence[MaterialTest]) -> Measurements:
+        """Return what was measured in a group, and then what is only predicted."""
+        measured, unknown = self.of(group), [(math.nan,) * len(test.at) for test in predicted]
+        sigma, tests = [test.sigma or (math.nan,) * len(test.at) for test in measured], [*measured, *predicted]
+        return Measurements.of_tests(
+            np.concatenate([*(test.measured for test in measured), *unknown]),
+            np.concatenate([*sigma, *unknown]),
+            [test.label for test in tests for _ in test.at],
+            np.concatenate([test.at for test in tests]),
+            np.array([(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]),
+        )
+
 
 def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return a document whose table of tests, if it names one, has been read; a StudyError if that cannot be done."""
-    if at(document, "data", "file") is None:
+    if "model" in document or at(document, "data", "file") is None:
         return dict(document)
     try:
         return {**document, "data": DataFile.model_validate(dict(document["data"])).read(folder)}

@@ -131,7 +131,7 @@ class Left:
         chosen = self.blocks.get("model", {})
         if "candidates" in self.blocks:
             candidate = self.blocks["candidates"].get(self.candidate(model), {})
-            chosen = {**chosen, **candidate.get("model", candidate)}
+            chosen = {**chosen, **candidate, **candidate.get("model", {})}
         block = chosen.get("material", {})
         return dict(block) if isinstance(block, dict) else {}
 

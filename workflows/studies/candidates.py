@@ -1,18 +1,15 @@
-"""Candidates of comparisons and designs: materials, or what each changes of one model, with their priors."""
+"""Candidates of comparisons and designs: what each changes of one model, or materials, with their priors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError
 
-from forward.material_tests import TestedMaterial
-from forward.materials.admissible import Materials
-from forward.materials.material import units
-from forward.materials.material_point import HomogeneousModel, MaterialTest
+from forward.material_tests import Constants
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MEASURED, ModelSpec
@@ -27,84 +24,46 @@ if TYPE_CHECKING:
 _SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
 
 
-class CandidateBlock(Settings):
-    """What is known of a candidate before the data."""
-
-    parameters: dict[str, Distribution] = Field(
-        min_length=1, description="Priors of the numbers that vary: constants of a material by name, others by path."
-    )
-    correlations: tuple[Correlation, ...] = Field(default=(), description="Correlations between them.")
-    weight: float = Field(default=1.0, gt=0, description="Its probability before the data, up to a common factor.")
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random parameters."""
-        return inputs_of(self.parameters, self.correlations)
-
-    def restricted(self, spec: ModelSpec | None) -> Inputs:
-        """The random parameters, restricted to those that make materials of a model, where there are some."""
-        materials = None if spec is None else spec.materials(self.inputs.names)
-        return self.inputs if materials is None else self.inputs.within(materials)
-
-    def units(self, spec: ModelSpec | None) -> dict[str, str]:
-        """SI units of the numbers of its model, of which some are parameters."""
-        return {} if spec is None else {path: number.unit for path, number in spec.scalars.items()}
-
-
-class CandidateModel(TestedMaterial, CandidateBlock):
-    """A candidate material with its prior.
-
-    Parameters
-    ----------
-    material
-        Its kind, and the constants that do not vary; without those of the volume (D1) an energy is
-        incompressible. Fibres, where it has them, by their components along the first stretch, along the second one and
-        across both.
-    """
-
-    @property
-    def inputs(self) -> Inputs:
-        """The random constants."""
-        return inputs_of(self.parameters, self.correlations, materials=self.materials)
-
-    @property
-    def materials(self) -> Materials:
-        """The material as a function of the random constants."""
-        return Materials(self.energy, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
-
-    def units(self, spec: ModelSpec | None) -> dict[str, str]:
-        """SI units of the constants."""
-        return units(self.energy)
-
-    def tested(self, tests: Sequence[MaterialTest]) -> HomogeneousModel:
-        """Make the model of the stresses of tests."""
-        return HomogeneousModel(self.energy, self.fixed, tests, tuple(self.parameters), self.fibres)
-
-    @model_validator(mode="after")
-    def _check(self) -> CandidateModel:
-        wrong = next(self.mistakes_of_material(self.parameters), None)
-        if wrong is not None:
-            raise ValueError(wrong)
-        try:
-            unfit = next(mistakes_of_materials(self.inputs, self.materials), None)
-        except ValueError:  # correlations, which are reported elsewhere
-            return self
-        if unfit is not None:
-            raise ValueError(f"parameters {', '.join(unfit[2])}: {unfit[1]}")
-        return self
-
-
-class ModelCandidate(CandidateBlock):
-    """A candidate model, with its prior.
+class CandidateModel(Settings):
+    """A candidate model, with what is known of it before the data.
 
     Parameters
     ----------
     model
         What it changes of the model: blocks and values that replace those there; a block with a kind replaces the whole
         block.
+    material
+        Short for a model's material, for comparisons of materials in tests, which have no model beside: its kind, and
+        the constants that do not vary; without those of the volume (D1) an energy is incompressible. Fibres, where it
+        has them, by their components along the first stretch, along the second one and across both.
+    parameters
+        Priors of the numbers that vary: constants of a material by name, others by path.
+    correlations
+        Correlations between them.
+    weight
+        Its probability before the data, up to a common factor.
     """
 
+    parameters: dict[str, Distribution] = Field(min_length=1)
+    correlations: tuple[Correlation, ...] = ()
+    weight: float = Field(default=1.0, gt=0)
     model: dict[str, Any] = Field(default={})
+    material: Constants | None = None
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """What it changes of the model."""
+        return self.model if self.material is None else changed({"material": self.material}, self.model)
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random parameters."""
+        return inputs_of(self.parameters, self.correlations)
+
+    def restricted(self, spec: ModelSpec) -> Inputs:
+        """The random parameters, restricted to those that make materials of a model, where there are some."""
+        materials = spec.materials(self.inputs.names)
+        return self.inputs if materials is None else self.inputs.within(materials)
 
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what of the priors does not fit the model."""
@@ -116,7 +75,7 @@ class ModelCandidate(CandidateBlock):
 
 
 class OfCandidates(Settings):
-    """A study of candidates that each change one model, or are materials without one.
+    """A study of candidates that each change one model.
 
     Parameters
     ----------
@@ -129,23 +88,19 @@ class OfCandidates(Settings):
     model: Any = None
     candidates: Any
 
-    @property
-    def changes(self) -> Mapping[str, dict[str, Any]]:
-        """The block of the model of each candidate; none of materials."""
-        if self.model is None:
-            return {}
-        return {name: changed(self.model, one.model) for name, one in (self.candidates or {}).items()}
+    def whole(self, name: str) -> ModelSpec:
+        """Return the model of a candidate; a ValidationError for mistakes in its block."""
+        return _SPEC.validate_python(changed(self.model, self.candidates[name].changes))
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """The model of each candidate, in the form that suits all values of its parameters; none of materials."""
-        given = {name: spec_of(block) for name, block in self.changes.items()}
-        return {name: spec.over(ranges(self.candidates[name].parameters)) for name, spec in given.items()}
+        """The model of each candidate, in the form that suits all values of its parameters."""
+        return {name: self.whole(name).over(ranges(one.parameters)) for name, one in self.candidates.items()}
 
     @property
     def priors(self) -> dict[str, Inputs]:
         """The unknowns of each candidate, restricted to those for which there is a material."""
-        return {name: one.restricted(self.of_candidates.get(name)) for name, one in self.candidates.items()}
+        return {name: self.candidates[name].restricted(spec) for name, spec in self.of_candidates.items()}
 
     @property
     def findings_of_models(self) -> Iterator[Finding]:
@@ -160,30 +115,25 @@ class OfCandidates(Settings):
 
     def units_of(self, label: str) -> dict[str, str]:
         """SI units of the numbers of a candidate's model."""
-        name, _, _ = label.partition("/")
-        found: dict[str, str] = self.candidates[name].units(self.of_candidates.get(name))
-        return found
+        spec = self.of_candidates[label.partition("/")[0]]
+        return {path: number.unit for path, number in spec.scalars.items()}
 
     def models_and_mistakes(self) -> Iterator[tuple[ModelSpec | None, list[Mistake]]]:
         """Find the model of each candidate (None if it is none), and what is wrong with it."""
-        for name, block in self.changes.items():
-            place, candidate = ("candidates", name), self.candidates[name]
+        for name, candidate in self.candidates.items():
+            place = ("candidates", name)
             try:
-                spec = spec_of(block)
+                spec = self.whole(name)
             except ValidationError as error:
+                where = place if self.model is None else (*place, "model")
                 lines = error.errors(include_url=False)
-                yield None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
+                yield None, [((*where, *line["loc"]), line["msg"], line["input"]) for line in lines]
                 continue
             wrong = [*candidate.mistakes(spec), *spec.mistakes_of_mesh()]
             if spec.coefficients:
                 message = "random fields, expected numbers only: candidates have few parameters"
                 wrong.append((("model", "fields"), message, len(spec.coefficients)))
             yield spec, [((*place, *where), message, given) for where, message, given in wrong]
-
-
-def spec_of(block: Mapping[str, Any]) -> ModelSpec:
-    """Return the model that a block describes; a ValidationError for mistakes in it."""
-    return _SPEC.validate_python(dict(block))
 
 
 def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

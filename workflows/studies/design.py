@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Iterator, Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -28,7 +28,7 @@ from workflows.config.priors import findings_of_materials, ranges
 from workflows.config.tables import at
 from workflows.data.designs import files
 from workflows.run.from_python import FromPython
-from workflows.studies.candidates import ModelCandidate, OfCandidates
+from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
 from workflows.studies.study import StudyKind
@@ -76,7 +76,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
     restricted: ClassVar[bool] = True
 
     model: Annotated[SerializeAsAny[ModelSpec] | dict[str, Any], AS_DECIDED, PartOrKind(ANY_MODEL)]
-    candidates: Annotated[dict[str, ModelCandidate], Field(min_length=2)] | None = None
+    candidates: Annotated[dict[str, CandidateModel], Field(min_length=2)] | None = None
     method: Design
 
     @model_validator(mode="before")
@@ -86,15 +86,20 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         whole = at(blocks, "candidates") is None
         return decided(blocks, model=Annotated[ModelSpec, ANY_MODEL]) if whole else blocks
 
+    @cached_property
+    def of_candidates(self) -> Mapping[str, ModelSpec]:
+        """The model of each candidate, or the one model."""
+        return {"/": self.spec} if self.candidates is None else super().of_candidates
+
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The model, or those of all candidates."""
-        return tuple(self.of_candidates.values()) or (self.spec,)
+        return tuple(self.of_candidates.values())
 
     @property
     def planned(self) -> int:
         """Number of solves: one for each draw, of each candidate."""
-        return self.method.draws * len(self.candidates or "1")
+        return self.method.draws * len(self.of_candidates)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -136,7 +141,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, or those of all candidates, which are all observed at the places of the first; collective."""
         method, nodal = self.method, self.candidates is None and self.field
-        specs = self.of_candidates or {"/": self.spec}
+        specs = self.of_candidates
         first, *others = specs
         model: Any = specs[first].build(
             ensemble.group, specs[first].coefficients if nodal else self.parameters_of(first)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from forward.findings import Finding
-from forward.materials.material_point import unfit
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
 from forward.spec import ModelSpec
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import MethodJob
 
-SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 SECONDS = 1e-3  # of a solve about which nothing is known
 # What data of a quantity are called, and what they are of.
 DATA = {
@@ -46,7 +44,8 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
     Parameters
     ----------
     model
-        The model, as far as the candidates have it in common; without one, the stresses of materials are compared.
+        The model, as far as the candidates have it in common; without one, it is the tests of which there are data, and
+        each candidate a material.
     data
         What was measured: a file, or tests of materials.
     candidates
@@ -63,14 +62,10 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
         """Check the blocks of a comparison, and read its data: those of a model by that of the first candidate."""
-        match blocks:
-            case {"model": {}}:
-                pass
-            case {"model": other}:
-                raise StudyError(f"model: expected a table, {{ key = value }}; given {shown(other)}")
-            case _:
-                blocks = expanded(blocks, folder)
-        return cls.model_validate(blocks).with_data(folder)
+        model = blocks.get("model", {})
+        if not isinstance(model, Mapping):
+            raise StudyError(f"model: expected a table, {{ key = value }}; given {shown(model)}")
+        return cls.model_validate(expanded(blocks, folder)).with_data(folder)
 
     @property
     def recorded(self) -> bool:
@@ -118,9 +113,13 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
     def planned(self) -> int:
         """Approximate number of solves: the searches for the modes are not predictable."""
         searches = sum(self.searches(name) for name, _ in self.pairs)
-        noise = self.method.noise.factor is not None
-        chains = sum(self.method.chain_solves(len(self.candidates[name].parameters) + noise) for name, _ in self.pairs)
+        chains = sum(self.chain_solves(name) for name, _ in self.pairs)
         return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs) + chains
+
+    def chain_solves(self, name: str) -> int:
+        """Most solves of the chains of a candidate in a group of data."""
+        noise = self.method.noise.factor is not None
+        return self.method.chain_solves(len(self.candidates[name].parameters) + noise)
 
     def searches(self, name: str) -> int:
         """Number of solves that the searches for the mode of a candidate take, roughly."""
@@ -129,18 +128,17 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
     @property
     def seconds_of_solves(self) -> float:
         """Processor time of all solves and their derivatives, roughly: searches for modes have no reference."""
-        if self.model is None:
-            return SECONDS_PER_STRESS * self.planned
-        seconds = 0.0
+        seconds = chains = 0.0
         for name, spec in self.of_candidates.items():
             cost, solves = spec.cost(), self.searches(name) + self.method.samples
             if cost is None:
                 seconds += SECONDS * solves
+                chains += SECONDS * self.chain_solves(name) * len(self.data_groups)
                 continue
             derivatives = cost.tangents_of_sample(len(self.candidates[name].parameters))
             seconds += self.searches(name) * (cost.textbook if spec.placed else cost.sample)
             seconds += self.method.samples * cost.sample + solves * derivatives
-        return seconds * self.evidences / len(self.of_candidates)
+        return seconds * self.evidences / len(self.of_candidates) + chains
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""
@@ -196,28 +194,10 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
-        yield from self._of_tests() if self.model is None else self._of_models()
-
-    def _of_tests(self) -> Iterator[Mistake]:
-        data: Any = self.data
-        for group in data.data_groups:
-            labels = [test.label for test in self.tests_in(group)]
-            twice = next((label for label in labels if labels.count(label) > 1), None)
-            if twice is not None:
-                yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
-                return
-        candidate: Any
-        for name, candidate in self.candidates.items():
-            tests = (*data.tests, *self.predict)
-            objections = (unfit(candidate.energy, test.mode, candidate.fibres) for test in tests)
-            objection = next(filter(None, objections), None)
-            if objection is not None:
-                yield ("candidates", name, "material"), objection, candidate.material
-        yield from self._of_method()
-        yield from self.mistakes_of_data()
-
-    def _of_models(self) -> Iterator[Mistake]:
-        if self.predict:
+        if self.model is None:
+            yield from self._of_tests()
+            yield from self.mistakes_of_data()
+        elif self.predict:
             yield ("predict",), "tests of materials are predicted, expected none with a model", list(self.predict)
         if self.data.quantity == DisplacementFile.quantity and self.method.check is not None:
             message = "nested sampling takes ten thousand solves for each candidate, expected none of finite elements"
@@ -227,6 +207,18 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             if spec is not None:
                 yield from self.mistakes_of_ranks(spec)
         yield from self._of_method()
+
+    def _of_tests(self) -> Iterator[Mistake]:
+        """Find several tests of one name in a group, and candidates that are no materials."""
+        data: Any = self.data
+        for group in data.data_groups:
+            labels = [test.label for test in self.tests_in(group)]
+            twice = next((label for label in labels if labels.count(label) > 1), None)
+            if twice is not None:
+                yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
+        for name, one in self.candidates.items():
+            if one.model:
+                yield ("candidates", name, "model"), "there is no model that it changes, expected a material", one.model
 
     def _of_method(self) -> Iterator[Mistake]:
         """Find what of the method does not fit the candidates."""

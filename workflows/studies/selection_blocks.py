@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.finer_meshes import finer
+from forward.material_tests import CandidateTests
 from forward.materials.material_point import MaterialTest
 from forward.model import ForwardModel
 from forward.readable import named
@@ -20,14 +19,14 @@ from forward.spec import SPECIMEN, ModelSpec, usual_kind
 from inverse.criticism.comparison import Candidate
 from inverse.data.measurements import Measurements
 from inverse.methods.invert import derivable
-from inverse.methods.selection import Select, SelectSpecimens
+from inverse.methods.selection import Select
 from workflows.config.blocks import AS_DECIDED, decided
 from workflows.config.priors import ranges
 from workflows.config.tables import at
 from workflows.data.material_tests import WHOLE, MeasuredTests
 from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
-from workflows.studies.candidates import CandidateModel, ModelCandidate, OfCandidates, spec_of
+from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.predictions import has_mesh, meshes_of
 
 if TYPE_CHECKING:
@@ -40,23 +39,22 @@ class SelectionBlocks(OfCandidates):
     """The blocks of a comparison, as `workflows.studies.selection.Selection` explains them."""
 
     data: Annotated[MeasuredTests | DisplacementFile | OutputFile, AS_DECIDED]
-    candidates: Annotated[dict[str, CandidateModel | ModelCandidate], Field(min_length=1), AS_DECIDED]
+    candidates: Annotated[dict[str, CandidateModel], Field(min_length=1)]
     predict: tuple[MaterialTest, ...] = ()
-    method: Annotated[SelectSpecimens | Select, AS_DECIDED]
+    method: Select
     measurements: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)
 
     @model_validator(mode="before")
     @classmethod
-    def _by_what_is_compared(cls, blocks: Any) -> Any:
-        """Choose the blocks by the model."""
+    def _data_of_model(cls, blocks: Any) -> Any:
+        """Choose the block of the data by the model."""
         model = at(blocks, "model")
         if model is None:
-            return decided(blocks, data=MeasuredTests, candidates=dict[str, CandidateModel], method=Select)
+            return decided(blocks, data=MeasuredTests)
         if at(blocks, "data", "measured") is not None:  # results of earlier versions hold all numbers
             source = blocks["data"].get("source", ())
             blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": source}}
-        data = DisplacementFile if usual_kind(model) == SPECIMEN else OutputFile
-        return decided(blocks, data=data, candidates=dict[str, ModelCandidate], method=SelectSpecimens)
+        return decided(blocks, data=DisplacementFile if usual_kind(model) == SPECIMEN else OutputFile)
 
     # --- the candidates ----------------------------------------------------------------------------------------------
 
@@ -65,13 +63,23 @@ class SelectionBlocks(OfCandidates):
         """The candidates as the method needs them."""
         return {name: Candidate(inputs, self.candidates[name].weight) for name, inputs in self.priors.items()}
 
+    def whole(self, name: str) -> ModelSpec:
+        """Return the model of a candidate; of a material with one test of each kind, as its tests are those of data."""
+        if self.model is not None:
+            return super().whole(name)
+        data: Any = self.data
+        one, tests = self.candidates[name], (*data.tests, *self.predict)
+        kinds = {(test.mode, test.component): test.model_copy(update={"name": ""}) for test in tests}
+        own = {"tests": tuple(kinds.values()), "parameters": tuple(one.parameters)}
+        return CandidateTests.model_validate(one.model_dump(include={"material"}, exclude_none=True) | own)
+
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """The model of each candidate, in a form that suits all values of its parameters; none of materials.
+        """The model of each candidate, in a form that suits all values of its parameters.
 
         Forms differ a little on a mesh: if one specimen needs pressures, all that can have them do.
         """
-        given: dict[str, Any] = {name: spec_of(block) for name, block in self.changes.items()}
+        given: dict[str, Any] = {name: self.whole(name) for name in self.candidates}
         of_inputs = {name: ranges(one.parameters) for name, one in self.candidates.items()}
         free = {name: one for name, one in given.items() if one.placed and one.formulation == "auto"}
         mixed = {name: one for name, one in free.items() if one.mixable}
@@ -84,55 +92,41 @@ class SelectionBlocks(OfCandidates):
 
     def described(self, name: str) -> str:
         """A candidate in words: its material, and the mesh of a specimen."""
-        candidate: Any = self.candidates[name]
-        spec: Any = self.of_candidates.get(name)
-        if spec is None or not spec.placed:
-            return str(candidate.energy if spec is None else spec.description)
+        spec: Any = self.of_candidates[name]
+        if not spec.placed:
+            return str(spec.description)
         body, loaded = spec.body, spec.loaded(spec.cases[0])
         mixed = ", mixed" if loaded.mixed else ""
         return f"{loaded.energy} on {body.cells_in_words} cells ({body.cell}, degree {body.degree}{mixed})"
 
     def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
         """Make the model of a candidate in a group of data on a communicator; collective."""
-        candidate: Any = self.candidates[name]
+        spec, parameters = self.of_candidates[name], tuple(self.candidates[name].parameters)
         if self.model is None:
-            tested: ForwardModel = candidate.tested(self.tests_in(group))
-            return tested
-        spec = self.of_candidates[name]
-        model = spec.build(comm, tuple(candidate.parameters))
+            return spec.model_copy(update={"tests": self.tests_in(group)}).build(comm, parameters)
+        model = spec.build(comm, parameters)
         derivable(model, spec.kind)
         return observing(model, self.data_as_in(spec))
 
     def shared(self, name: str, group: str) -> SharedMotion | None:
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
-        spec: Any = self.of_candidates.get(name)
-        return motion_of(self.data_as_in(spec), spec.body) if spec is not None and spec.placed else None
+        spec: Any = self.of_candidates[name]
+        return motion_of(self.data_as_in(spec), spec.body) if spec.placed else None
 
     # --- the data ----------------------------------------------------------------------------------------------------
 
     @cached_property
     def data_groups(self) -> dict[str, Measurements]:
-        """Data by group."""
+        """Data by group, with what is only predicted last."""
         if self.model is not None:
             return {WHOLE: self.measurements}
-        found, predicted = {}, [(math.nan,) * len(test.at) for test in self.predict]
         data: Any = self.data
-        for group in data.data_groups:
-            measured, tests = data.of(group), self.tests_in(group)
-            sigma = [test.sigma or (math.nan,) * len(test.at) for test in measured]
-            found[group] = Measurements.of_tests(
-                np.concatenate([*(test.measured for test in measured), *predicted]),
-                np.concatenate([*sigma, *predicted]),
-                [test.label for test in tests for _ in test.at],
-                np.concatenate([test.at for test in tests]),
-                np.array([(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]),
-            )
-        return found
+        return {group: data.measurements(group, self.predict) for group in data.data_groups}
 
-    def tests_in(self, group: str) -> list[MaterialTest]:
-        """Return the tests of a group, those that are only predicted last."""
+    def tests_in(self, group: str) -> tuple[MaterialTest, ...]:
+        """Return the tests of materials of a group, those that are only predicted last."""
         data: Any = self.data
-        return [*data.of(group), *self.predict]
+        return (*data.of(group), *self.predict)
 
     def data_as_in(self, spec: Any) -> Measurements:
         """Return the data as a candidate numbers what it has in its load cases."""

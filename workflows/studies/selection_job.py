@@ -70,9 +70,8 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
         if "mesh_checked" in found:
             of_files = [of_file(study.of_candidates[str(name)]) for name in found.model.values]
             found = found.assign(mesh_of_file=("model", of_files))
-        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
-        units = {name: study.units_of(name) for name in candidates}
-        doubts = comparison.doubts_of_selection(found, candidates, method.noise.factor, units)
+        units = {name: study.units_of(name) for name in study.candidates}
+        doubts = comparison.doubts_of_selection(found, study.priors, method.noise.factor, units)
         wrong = {name: _contradictions(study, name, make) for (name, _), make in makers.items()}
         of_wrong = [name for name, several in wrong.items() if several]
         judged = comparison.trusted_on_meshes(comparison.with_right_derivatives(found, of_wrong))
@@ -105,8 +104,7 @@ def build_finer(make: Make, start: FloatArray) -> ForwardModel:
 
 def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:
     """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
-    spec = study.of_candidates.get(name)
-    if spec is None or spec.shareable:
+    if study.of_candidates[name].shareable:
         return []
     return [one.of(f"Candidate '{name}'") for one in of_answers(make(), study.candidates[name].inputs)]
 

@@ -1,6 +1,7 @@
 """Models compared by measured outputs: linear ones with evidences in closed form, bodies on finer meshes, mistakes."""
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
@@ -173,6 +174,15 @@ samples = 32
 starts = 1
 noise = { relative = 0.05 }
 """
+
+
+def test_a_material_is_short_for_that_of_the_model():
+    material = 'material = { kind = "neo-hookean", C1 = 5e3, D1 = 2e4 }\nparameters."material.C1"'
+    text = BARS.replace('parameters."material.mu"', material, 1)
+    short, long = (parse(tomllib.loads(one)) for one in (text, text.replace(material, f"model.{material}")))
+    assert short.of_candidates == long.of_candidates
+    assert short.of_candidates["coarse"].energy == "neo-hookean"
+    assert parse(document(short)) == short
 
 
 def test_outputs_that_follow_single_cells_are_named(tmp_path):

@@ -304,10 +304,11 @@ def small(tmp_path):
         ("mean = 500", 'mean = "soft"', "candidates.neo-hookean.parameters.C1.mean"),
         ("C2 = 10", "C1 = 10", "is given in material and in parameters"),
         (", C2 = 10", "", "missing: C2"),
+        ("weight = 2", 'model.kind = "specimen"', "candidates.mooney-rivlin.model: there is no model that it changes"),
         (
             '"log-normal", mean = 500',
             '"normal", mean = -500',
-            "parameters C1: 95.2 % of the values are impossible; at the medians, .* μ = 2 C1 = -1000 Pa",
+            r"hookean.parameters: 95.2 % of the values are impossible; at the medians, .* μ = 2 C1 = -1000 Pa.*'C1'",
         ),
         ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
         ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
