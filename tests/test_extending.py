@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from forward.findings import CATALOGUE
-from tests.launch import ROOT, TISSUQ, run
+from tests.launch import ROOT, TISSUQ, in_process, run
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def schema():
-    done = run(None, TISSUQ, "schema")
+    done = in_process("schema")
     return jsonschema.Draft202012Validator(json.loads(done.stdout))
 
 
@@ -169,7 +169,7 @@ def test_a_reader_of_data(folder, schema):
     (folder / "same.csv").write_text("stretch,uniaxial\n" + "".join(f"{x},{y}\n" for x, y in rows))
     same = re.sub(r"reader = .*\n", "", STRIP).replace("strip.dat", "same.csv")
     (folder / "same.toml").write_text(same)
-    assert run(None, TISSUQ, "run", folder / "same.toml", "--out", folder / "same", "--no-report").returncode == 0
+    assert in_process("run", folder / "same.toml", "--out", folder / "same", "--no-report").returncode == 0
     found, other = (xr.load_dataset(folder / name / "results.nc") for name in ("strip", "same"))
     np.testing.assert_allclose(found["mode"], other["mode"], rtol=1e-12)
     np.testing.assert_allclose(found["measured"], other["measured"], rtol=1e-15)

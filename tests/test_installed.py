@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from tests import meshes
-from tests.launch import ROOT, TISSUQ, environment, run
+from tests.launch import ROOT, TISSUQ, environment, in_process, run
 
 PAGE = (ROOT / "docs" / "how-to" / "extending.md").read_text()
 DECLARED = dict(re.findall(r'^    "(\w+\.\w+)" = "([\w.:]+)"$', PAGE, re.M))
@@ -90,7 +90,7 @@ def test_a_body_of_installed_kinds_on_two_ranks(site, folder):
     tissue.write_text(before)
     assert other.returncode == 2
     assert "my_tissue.py has changed" in other.stderr
-    without = run(None, TISSUQ, "check", study)
+    without = in_process("check", study)
     assert without.returncode == 2
     assert "unknown kind" in without.stderr
     assert "Traceback" not in without.stderr
