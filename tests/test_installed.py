@@ -195,9 +195,11 @@ noise = {}
 """
 
 
-def test_a_candidate_of_material_tests(site, tmp_path):
+def test_a_candidate_of_material_tests(site, tmp_path, monkeypatch):
     (tmp_path / "points.toml").write_text(POINTS)
-    done(site, None, "run", tmp_path / "points.toml", "--out", tmp_path / "out")
+    monkeypatch.syspath_prepend(site)
+    found = in_process("run", tmp_path / "points.toml", "--out", tmp_path / "out")
+    assert found.returncode == 0, found.stderr
     rows = rows_of((tmp_path / "out" / "report.html").read_text())
     assert [row for row in rows if row[:3] == ["fung", "fung", "c"] and row[4] == "Pa"]
     assert "my_tissue" in json.loads((tmp_path / "out" / "sources.json").read_text())["files"]

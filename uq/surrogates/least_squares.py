@@ -260,11 +260,15 @@ def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> Float
     for number in np.unique(held):
         out = held == number
         part = blocks[out].reshape(-1, blocks.shape[2])
-        rest = np.eye(len(part)) - part @ part.T
+        found = residual[out].reshape(len(part), -1)
+        # Of these two the smaller, with the same least eigenvalue: (I − QQᵀ)⁻¹ = I + Q (I − QᵀQ)⁻¹ Qᵀ.
+        few = part.shape[1] < len(part)
+        rest = np.eye(min(part.shape)) - (part.T @ part if few else part @ part.T)
         if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
             errors[out] = np.inf
-        else:
-            errors[out] = np.linalg.solve(rest, residual[out].reshape(len(part), -1)).reshape(residual[out].shape)
+            continue
+        found = found + part @ np.linalg.solve(rest, part.T @ found) if few else np.linalg.solve(rest, found)
+        errors[out] = found.reshape(residual[out].shape)
     return errors
 
 
