@@ -245,6 +245,14 @@ def missing(error: BaseException) -> str | None:
     return None
 
 
+def modified(folder: str) -> int:
+    """Return when names in a folder, or in the current one for "", have changed (ns); zero if there is none."""
+    try:
+        return Path(folder).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file under another name and rename it into place, so that it exists completely or not at all.
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from operator import attrgetter
 from typing import Protocol, Self
 
 import numpy as np
@@ -56,7 +57,7 @@ class Work:
 
     def as_array(self) -> NDArray[np.int64]:
         """Return the counts in the order of `WORK`."""
-        return np.array(astuple(self), dtype=np.int64)
+        return np.array(_counts(self), dtype=np.int64)
 
     @classmethod
     def sum_of(cls, works: Iterable[Work]) -> Work:
@@ -65,6 +66,7 @@ class Work:
 
 
 WORK = tuple(one.name for one in fields(Work))
+_counts = attrgetter(*WORK)
 
 
 class Stability(IntEnum):

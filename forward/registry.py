@@ -15,12 +15,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
+from forward.machine import modified
 from forward.settings import UNKNOWN_KIND, Settings, nearest
 
 ENTRY_POINTS = "tissuq"
@@ -122,23 +122,16 @@ class Kinds:
 
 def _declared() -> tuple[EntryPoint, ...]:
     """Entry points of our group."""
-    return _read_again(tuple((folder, _modified(folder)) for folder in sys.path))
+    return _read_again(tuple((folder, modified(folder)) for folder in sys.path))
 
 
 @lru_cache(maxsize=1)
-def _read_again(_folders: tuple[tuple[str, float], ...]) -> tuple[EntryPoint, ...]:
+def _read_again(_folders: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
     """Read those of every installed package: hundreds of files, which shared file systems are slow to open.
 
     A solve asks for its energy many times. A package that is installed meanwhile changes a folder of the path.
     """
     return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
-
-
-def _modified(folder: str) -> float:
-    try:
-        return Path(folder).stat().st_mtime
-    except OSError:
-        return 0.0
 
 
 def named(text: str) -> Any:

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from forward.findings import CATALOGUE
-from tests.launch import ROOT, TISSUQ, run
+from tests.launch import ROOT, TISSUQ, in_process, run
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def schema():
-    done = run(None, TISSUQ, "schema")
+    done = in_process("schema")
     return jsonschema.Draft202012Validator(json.loads(done.stdout))
 
 
@@ -163,19 +163,19 @@ def test_a_reader_of_data(folder, schema):
     study.write_text(STRIP)
     schema.validate(tomllib.loads(STRIP))
     machine.write_text("elongation;force\n2,0;0,055\n4,0;0,101\n6,0;0,142\n")
-    done = run(None, TISSUQ, "run", study, "--out", folder / "strip", "--no-report")
+    done = in_process("run", study, "--out", folder / "strip", "--no-report")
     assert done.returncode == 0, done.stderr
     rows = zip((1.1, 1.2, 1.3), (5500, 10100, 14200), strict=True)
     (folder / "same.csv").write_text("stretch,uniaxial\n" + "".join(f"{x},{y}\n" for x, y in rows))
     same = re.sub(r"reader = .*\n", "", STRIP).replace("strip.dat", "same.csv")
     (folder / "same.toml").write_text(same)
-    assert run(None, TISSUQ, "run", folder / "same.toml", "--out", folder / "same", "--no-report").returncode == 0
+    assert in_process("run", folder / "same.toml", "--out", folder / "same", "--no-report").returncode == 0
     found, other = (xr.load_dataset(folder / name / "results.nc") for name in ("strip", "same"))
     np.testing.assert_allclose(found["mode"], other["mode"], rtol=1e-12)
     np.testing.assert_allclose(found["measured"], other["measured"], rtol=1e-15)
     assert "my_readers" in json.loads((folder / "strip" / "sources.json").read_text())["files"]
     machine.write_text("elongation;force\n2,0\n")
-    refused = run(None, TISSUQ, "check", study)
+    refused = in_process("check", study)
     assert refused.returncode == 2
     assert refused.stderr.startswith("data: strip.dat: cannot be read by Machine: ValueError: not enough values")
 
@@ -183,7 +183,7 @@ def test_a_reader_of_data(folder, schema):
 def test_a_kind_of_study(folder, schema):
     study, out = folder / "scan.toml", folder / "scan"
     schema.validate(tomllib.loads(study.read_text()))
-    checked = run(None, TISSUQ, "check", study)
+    checked = in_process("check", study)
     assert checked.returncode == 0, checked.stderr
     assert "3 values of length" in checked.stdout
     done = run(2, TISSUQ, "run", study, "--out", out)
@@ -207,7 +207,7 @@ def test_mistakes_have_their_places(folder, tmp_path, old, new, said):
     for path in folder.glob("*.py"):
         (tmp_path / path.name).write_text(path.read_text())
     (tmp_path / "bad.toml").write_text((folder / "wound.toml").read_text().replace(old, new))
-    done = run(None, TISSUQ, "check", tmp_path / "bad.toml")
+    done = in_process("check", tmp_path / "bad.toml")
     assert done.returncode == 2
     assert said in done.stderr
     assert "Traceback" not in done.stderr

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from tests import meshes
-from tests.launch import ROOT, TISSUQ, environment, run
+from tests.launch import ROOT, TISSUQ, environment, in_process, run
 
 PAGE = (ROOT / "docs" / "how-to" / "extending.md").read_text()
 DECLARED = dict(re.findall(r'^    "(\w+\.\w+)" = "([\w.:]+)"$', PAGE, re.M))
@@ -90,7 +90,7 @@ def test_a_body_of_installed_kinds_on_two_ranks(site, folder):
     tissue.write_text(before)
     assert other.returncode == 2
     assert "my_tissue.py has changed" in other.stderr
-    without = run(None, TISSUQ, "check", study)
+    without = in_process("check", study)
     assert without.returncode == 2
     assert "unknown kind" in without.stderr
     assert "Traceback" not in without.stderr
@@ -195,9 +195,11 @@ noise = {}
 """
 
 
-def test_a_candidate_of_material_tests(site, tmp_path):
+def test_a_candidate_of_material_tests(site, tmp_path, monkeypatch):
     (tmp_path / "points.toml").write_text(POINTS)
-    done(site, None, "run", tmp_path / "points.toml", "--out", tmp_path / "out")
+    monkeypatch.syspath_prepend(site)
+    found = in_process("run", tmp_path / "points.toml", "--out", tmp_path / "out")
+    assert found.returncode == 0, found.stderr
     rows = rows_of((tmp_path / "out" / "report.html").read_text())
     assert [row for row in rows if row[:3] == ["fung", "fung", "c"] and row[4] == "Pa"]
     assert "my_tissue" in json.loads((tmp_path / "out" / "sources.json").read_text())["files"]

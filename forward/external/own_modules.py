@@ -23,9 +23,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from forward.machine import modified
 from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
+_walked: dict[str, tuple[tuple[object, ...], dict[str, tuple[str, str]]]] = {}
 _TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
 _refused: ContextVar[list[str] | None] = ContextVar("refused", default=None)  # where not all may be imported
 
@@ -242,8 +244,7 @@ def imported(module: str) -> ModuleType:
     if refusals is not None and refused(module):
         refusals.append(module)
         raise OwnCodeError(f"'{module}' is not installed, and code from beside a study runs with --code alone")
-    importlib.invalidate_caches()
-    now = sources([module]).files
+    now = _files_of(module)
     for name, (file, _) in now.items():
         known = getattr(sys.modules.get(name), "__file__", None) or file
         if _texts.get(name, now[name]) != now[name] or (name not in _texts and Path(known).absolute() != Path(file)):
@@ -256,6 +257,27 @@ def imported(module: str) -> ModuleType:
         return importlib.import_module(module)
     finally:
         sys.dont_write_bytecode = kept
+
+
+def _files_of(module: str) -> dict[str, tuple[str, str]]:
+    """Return (path, SHA-256) by module of what a module is made of.
+
+    Its imports are followed again only if a text has changed, or a folder in which they are looked for: a solve asks
+    for its energy many times.
+    """
+    folders, files = _walked.get(module, (None, {}))
+    unchanged = folders == _folders(files) and all(hashed(Path(file)) == text for file, text in files.values())
+    if not (unchanged and module in sys.modules):
+        importlib.invalidate_caches()
+        files = sources([module]).files
+        _walked[module] = _folders(files), files
+    return files
+
+
+def _folders(files: Mapping[str, tuple[str, str]]) -> tuple[object, ...]:
+    """Where modules are looked for: finders, and folders with their times, which change with the names in them."""
+    around = (str(Path(file).parent) for file, _ in files.values())
+    return (*sys.meta_path, *((folder, modified(folder)) for folder in (*sys.path, *around)))
 
 
 def find(module: str) -> ModuleSpec | None:

@@ -188,6 +188,9 @@ class Scrambles(Sets):
         self.needed = 4 if coefficient == "optimal" else 2
         repeats = () if fitted is None else fitted.repeats
         self._repeats = [(expansion(one), held_expansion(inputs, one)) for one in repeats]
+        # Results ask for rounds again. By the numbers of scrambles and of their points:
+        self._known: dict[tuple[int, int], Estimates] = {}
+        self._held_known: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._sums: dict[int, FloatArray] = {}
         self._higher: FloatArray | None = None
 
@@ -208,6 +211,11 @@ class Scrambles(Sets):
 
     def scalars(self, each: int) -> Estimates:
         """Estimate the moments of the outputs from the first `each` points of every scramble that has answers there."""
+        if (self.scrambles, each) not in self._known:
+            self._known[self.scrambles, each] = self._scalars(each)
+        return self._known[self.scrambles, each]
+
+    def _scalars(self, each: int) -> Estimates:
         self.check(each)
         found, hidden = self._estimated(each, self._controls(each))
         if self._fitted is None:  # Taylor polynomials of a low order have little far out
@@ -333,6 +341,11 @@ class Scrambles(Sets):
         By samples that tell the two apart: one hardly beyond says nothing, and what is held wrongly errs where no
         sample is. And those that have most of their variance beyond all samples.
         """
+        if (self.scrambles, each) not in self._held_known:
+            self._held_known[self.scrambles, each] = self._found_held(each)
+        return self._held_known[self.scrambles, each]
+
+    def _found_held(self, each: int) -> NDArray[np.bool_]:
         if self._control is None or self._held is None:
             return np.zeros(self.outputs.shape[2], dtype=bool)
         ok = self.ok[:, :each]

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from uq.evaluation.request import Evaluations
@@ -97,11 +99,16 @@ class Data:
 
     def relative(self, errors: FloatArray) -> FloatArray:
         """The same over the standard deviation of the values; zero if that is rounding error."""
+        constant, std = self._spread
+        return np.where(constant, 0.0, self.size(errors) / np.where(constant, 1.0, std))
+
+    @cached_property
+    def _spread(self) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Which values (m,) are constant but for rounding, and standard deviations (m,): every step asks for them."""
         share = self.weights / self.weights.sum()
         mean = share @ self.values
         std = np.sqrt(share @ (self.values - mean) ** 2)
-        constant = std <= 1e-13 * np.abs(mean)
-        return np.where(constant, 0.0, self.size(errors) / np.where(constant, 1.0, std))
+        return std <= 1e-13 * np.abs(mean), std
 
 
 @dataclass(frozen=True)
@@ -253,11 +260,15 @@ def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> Float
     for number in np.unique(held):
         out = held == number
         part = blocks[out].reshape(-1, blocks.shape[2])
-        rest = np.eye(len(part)) - part @ part.T
+        found = residual[out].reshape(len(part), -1)
+        # Of these two the smaller, with the same least eigenvalue: (I − QQᵀ)⁻¹ = I + Q (I − QᵀQ)⁻¹ Qᵀ.
+        few = part.shape[1] < len(part)
+        rest = np.eye(min(part.shape)) - (part.T @ part if few else part @ part.T)
         if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
             errors[out] = np.inf
-        else:
-            errors[out] = np.linalg.solve(rest, residual[out].reshape(len(part), -1)).reshape(residual[out].shape)
+            continue
+        found = found + part @ np.linalg.solve(rest, part.T @ found) if few else np.linalg.solve(rest, found)
+        errors[out] = found.reshape(residual[out].shape)
     return errors
 
 
@@ -285,6 +296,7 @@ class _Products:
         ends = left.shape[1] * np.searchsorted(held, np.arange(held.max() + 2))
         return cls(left.reshape(-1, left.shape[2]), tuple(slice(*pair) for pair in pairwise(ends.tolist())))
 
+    @cached_property
     def lengths(self) -> FloatArray:
         """Squared lengths (F + 1, P) of the columns without the rows of each number; the last with all rows."""
         return _without_each(np.array([np.einsum("rp,rp->p", part, part) for part in self._within]))
@@ -344,7 +356,7 @@ def _select(
     explained = np.tile((products.columns.T @ rest)[which], (folds + 1, 1, 1))
     for k, part in enumerate(parts):
         explained[k] -= (products.columns[part].T @ rest[part])[which]
-    lengths = products.lengths()[:, which]
+    lengths = products.lengths[:, which]
     every = np.arange(folds + 1)
     left_over = lengths.copy()
     limit = min(most, which.size)

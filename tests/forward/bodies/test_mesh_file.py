@@ -23,6 +23,7 @@ from forward.specimen import Specimen
 from tests.bodies import loaded_body
 from tests.launch import ROOT, on_kept_ranks
 from tests.meshes import CELLS, NAMES, SIZE, box, numbered
+from tests.steps import STEPS
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, load, parse
 from workflows.results.directory import label, with_regions, write_fields
@@ -117,7 +118,7 @@ def regional(file):
 @pytest.mark.fem
 def test_derivatives_by_the_numbers_of_regions(file):
     point = np.array([1e4, 2e4, 3e4, 1e5, 1.5])
-    check_derivatives(built(regional(file), *NUMBERS), point, 0.1 * point, accuracy=1e-10).require()
+    check_derivatives(built(regional(file), *NUMBERS), point, 0.1 * point, accuracy=1e-10, steps=STEPS).require()
 
 
 @pytest.mark.fem
@@ -182,7 +183,7 @@ def test_specimens_have_regions(file):
     expected = built(regional(file), *NUMBERS).solve(point)
     solution = found.solve(point)
     np.testing.assert_allclose(solution.solutions[0].state, expected.state, rtol=1e-9, atol=1e-12)
-    check_derivatives(found, point, 0.1 * point, accuracy=1e-10).require()
+    check_derivatives(found, point, 0.1 * point, accuracy=1e-10, steps=STEPS).require()
     with pytest.raises(ValidationError, match="unknown region; did you mean 'right'") as caught:
         specimen(file, regions={"rigth": {"contrast": 2.0}})
     assert [error["loc"] for error in caught.value.errors()] == [("regions", "rigth")]
@@ -477,7 +478,7 @@ def test_the_organ(tmp_path):
 def test_derivatives_by_the_numbers_of_regions_in_the_mixed_form(file):
     model = spec(file, body={"degree": 2}, formulation="mixed", regions={"right": REGION}, outputs=FEW)
     point = np.array([1e4, 2e4, 3e4, 1e6, 1.5])
-    check_derivatives(built(model, *NUMBERS), point, 0.1 * point, accuracy=1e-10).require()
+    check_derivatives(built(model, *NUMBERS), point, 0.1 * point, accuracy=1e-10, steps=STEPS).require()
 
 
 @pytest.mark.parametrize("binary", [True, False])

@@ -354,10 +354,10 @@ def noisy():
 @pytest.mark.parametrize(
     "method",
     [
-        MonteCarlo(samples=32),
-        SensitivityMonteCarlo(samples=32),
-        QuasiMonteCarlo(samples=32, scrambles=4, control="tangent"),
-        QuasiMonteCarlo(samples=32, scrambles=4, control="quadratic"),
+        MonteCarlo(samples=16),
+        SensitivityMonteCarlo(samples=16),
+        QuasiMonteCarlo(samples=16, scrambles=4, control="tangent"),
+        QuasiMonteCarlo(samples=16, scrambles=4, control="quadratic"),
     ],
     ids=["plain", "sensitivity", "tangent", "quadratic"],
 )

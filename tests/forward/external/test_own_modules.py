@@ -155,6 +155,21 @@ def test_the_model_follows_its_helpers_in_one_process(tmp_path, monkeypatch):
         assert model.build(None, ("a",)).solve(np.array([1.0])).outputs == [factor]
 
 
+def test_modules_are_walked_through_again_once_a_text_or_a_folder_has_changed(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_kind.py").write_text("from own_part import size\n")
+    part, walks = tmp_path / "own_part.py", []
+    monkeypatch.setattr(own_modules, "sources", lambda modules: (walks.append(modules), sources(modules))[1])
+    for size in (1, 2):
+        part.write_text(f"size = {size}\n")
+        assert [own_modules.imported("own_kind").size for _ in range(3)] == [size] * 3
+        assert len(walks) == size
+    (tmp_path / "own_part").mkdir()  # a package is found before a file
+    (tmp_path / "own_part" / "__init__.py").write_text("size = 3\n")
+    assert [own_modules.imported("own_kind").size for _ in range(3)] == [3] * 3
+    assert len(walks) == 3
+
+
 @pytest.mark.parametrize("name", ["queue", "pyvista", "numpy", "inverse", "json", "h5py"])
 def test_what_stands_beside_a_study_is_not_run_in_place_of_others(tmp_path, name):
     """As a process, under a study of a Python model, which needs the folder, and of a body, which does not."""

@@ -586,6 +586,6 @@ def test_the_model_of_an_inversion_is_served_and_that_of_a_comparison_is_not(tmp
     (tmp_path / "inverse.toml").write_text(f'{blocks}{data}[method]\nkind = "invert"\n')
     with command(TISSUQ, "serve", tmp_path / "inverse.toml", "--port", 0) as (url, _):
         assert ask(url, "InputSizes", {"name": "forward"})[1] == {"inputSizes": [2]}
-    refused = launch.run(None, TISSUQ, "serve", "configs/treloar.toml", "--port", 0)
+    refused = launch.in_process("serve", ROOT / "configs" / "treloar.toml", "--port", 0)
     assert refused.returncode == 2
     assert "of kind 'select', expected a study of one model" in refused.stderr

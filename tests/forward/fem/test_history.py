@@ -11,6 +11,7 @@ from forward.hyperelastic import Path
 from forward.model import SolveError
 from tests.forward.terms.test_indenter import SIDE, body, only, tool
 from tests.launch import on_kept_ranks
+from tests.steps import STEPS
 
 FRICTION = 0.3
 ACCURATE = 1e-10
@@ -98,7 +99,7 @@ def test_a_rough_ball_is_stiffer():
     almost = point * [1, 1e-6, 1]
     assert model.solve(almost).outputs[0] == pytest.approx(without, rel=1e-6)
     along = np.array([[0.3, 1.0, 0.5]])
-    check_derivatives(model, point, 1e-3 * point, directions=along, accuracy=ACCURATE).require()
+    check_derivatives(model, point, 1e-3 * point, directions=along, accuracy=ACCURATE, steps=STEPS).require()
 
 
 SCRIPT = """

@@ -18,6 +18,7 @@ from forward.specimen import Specimen
 from forward.terms.acting import Entries
 from forward.terms.term import Item
 from tests.launch import UP_TO_RANKS, on_kept_ranks
+from tests.steps import STEPS
 
 MATERIAL = {"kind": "neo-hookean", "C1": 1e4, "D1": 3e4}
 ENDS = {"start": (0.0, 0.0, 0.0), "end": (1.0, 1.0, 1.0)}
@@ -99,7 +100,7 @@ def test_derivatives_with_a_cable(changes):
     if "formulation" in changes:
         changes = changes | {"body": {"size": (1.0, 1.0, 1.0), "cells": (2, 1, 1), "cell": "hexahedron", "degree": 2}}
     model, point, found = solved(cube(CABLE | {"slack": 0.9}, **changes), NAMES)
-    check_derivatives(model, point, 1e-2 * point).require()
+    check_derivatives(model, point, 1e-2 * point, steps=STEPS).require()
     near = 1.01 * point
     guess = Guess(found.state, ReferenceSolution(point, found.state))
     cheap, full = model.solve(near, guess), model.solve(near)
@@ -140,7 +141,7 @@ def test_derivatives_through_what_is_kept():
     model, point, found = solved(creeping(), OF_BRANCH)
     creep = found.outputs.reshape(-1, 3)[:, 0]
     assert (np.diff(creep) > 0.02 * creep[0]).all()
-    check_derivatives(model, point, 1e-2 * point).require()
+    check_derivatives(model, point, 1e-2 * point, steps=STEPS).require()
     with pytest.raises(SolveError, match="the error of the mesh is not estimated with 'branch'"):
         found.mesh_error()
 
@@ -170,7 +171,7 @@ def test_derivatives_where_the_stiffness_is_not_symmetric():
     stiffness = model.equations.sparse_stiffness().toarray()
     asymmetric = stiffness - stiffness.T
     assert np.count_nonzero(np.abs(asymmetric) > 1e-6) == 6  # three entries and their reflections
-    check_derivatives(model, point, 1e-2 * point).require()
+    check_derivatives(model, point, 1e-2 * point, steps=STEPS).require()
 
 
 SCRIPT = """

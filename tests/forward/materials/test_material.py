@@ -14,6 +14,7 @@ from forward.materials.material import MATERIALS, constants, measures, units
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from tests.bodies import loaded_body
 from tests.launch import report_of_own
+from tests.steps import STEPS
 
 OUTSIDE = '''
 from typing import Annotated, Any
@@ -245,7 +246,7 @@ def test_a_mixed_form_that_is_stated_is_exact_where_the_strain_is_the_same_every
 def test_derivatives_of_a_mixed_form_that_is_stated():
     names = ("material.C1", "material.kappa")
     model = mixed("my_tissue.of_log", 1e6, 1).build(MPI.COMM_SELF, names)
-    check_derivatives(model, (1e4, 1e6), (2e3, 3e5)).require()
+    check_derivatives(model, (1e4, 1e6), (2e3, 3e5), steps=STEPS).require()
 
 
 STUDY = """

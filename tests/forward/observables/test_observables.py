@@ -10,6 +10,7 @@ from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import loaded_body
 from tests.launch import report_of_own
+from tests.steps import STEPS
 
 pytestmark = pytest.mark.fem
 
@@ -81,7 +82,7 @@ def test_values_and_derivatives():
     model = spec.build(MPI.COMM_SELF, names)
     flux, _, mean = model.solve(values).outputs
     assert flux == pytest.approx(0.7 * 0.8 * mean, rel=1e-12)
-    check_derivatives(model, values, 0.1 * values).require()
+    check_derivatives(model, values, 0.1 * values, steps=STEPS).require()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from forward.reduced.outputs import NEAR_PEAK
 from forward.reduced.reduction import Reduction, Sizes, enriched
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from forward.reduced.spec import mistakes
+from tests.steps import STEPS
 
 pytestmark = pytest.mark.fem
 
@@ -114,7 +115,7 @@ def test_where_modes_hold_state_and_tangents_everything_is_that_of_the_body(full
 
 def test_its_derivatives_are_its_own(full, small):
     model = ReducedModel(small, full.parameters)
-    check_derivatives(model, NOMINAL, 0.2 * SPREAD).require()
+    check_derivatives(model, NOMINAL, 0.2 * SPREAD, steps=STEPS).require()
 
 
 def test_some_parameters_keep_their_means(full, small):
@@ -287,7 +288,7 @@ def test_what_the_full_model_was_asked_enriches_it(full, snapshots, small, tmp_p
     for point in snapshots.parameters[:2]:
         old, new = errors(point)
         assert new < 1.5 * old, (old, new)
-    check_derivatives(after, NOMINAL, 0.2 * SPREAD).require()
+    check_derivatives(after, NOMINAL, 0.2 * SPREAD, steps=STEPS).require()
 
 
 def test_it_is_loaded_and_solved_without_fenicsx(small, tmp_path):

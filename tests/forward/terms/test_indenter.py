@@ -15,6 +15,7 @@ from forward.terms import tools
 from forward.terms.indenter import Indenter
 from tests.bodies import energy_density
 from tests.launch import UP_TO_RANKS, on_kept_ranks
+from tests.steps import STEPS
 
 SIDE = 20e-3
 C1, D1 = 1e3, 2e3
@@ -182,7 +183,7 @@ def test_derivatives(shape):
     directions = np.array([[1.0, 0, 0, 0, 0], [0, 0.5, 0.5, 0, 0.5], [0, 0, 0, 1, 0]])
     # That of the direction of a punch has too small a range: points pass its edge (differences: below).
     count = 3 if shape == "sphere" else 2
-    check_derivatives(model, values, scale, directions=directions[:count]).require()
+    check_derivatives(model, values, scale, directions=directions[:count], steps=STEPS).require()
     slopes = model.solve(values).tangent(np.eye(len(names)))
     for k in (0, 3, 4) if shape == "sphere" else (0, 4):  # the depth, the direction and the stiffness
         step = np.eye(len(names))[k] * scale[k]

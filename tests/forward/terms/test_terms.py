@@ -10,6 +10,7 @@ from forward.conformance import check_derivatives
 from forward.terms.term import Term
 from tests.bodies import loaded_body
 from tests.launch import report_of_own
+from tests.steps import STEPS
 
 pytestmark = pytest.mark.fem
 
@@ -88,7 +89,7 @@ def test_derivatives_of_loads_from_outside():
     names = ("loads.Springs.k", "loads.Suction.size", "loads.Suction.length", "material.C1")
     values = np.array([spec.scalars[name].value for name in names])
     model = spec.build(MPI.COMM_SELF, names)
-    check_derivatives(model, values, 0.1 * values).require()
+    check_derivatives(model, values, 0.1 * values, steps=STEPS).require()
 
 
 def test_words():

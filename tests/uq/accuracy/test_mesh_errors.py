@@ -8,6 +8,7 @@ import xarray as xr
 
 from forward.model import MeshError, Saturation, SolveError, Work
 from forward.pointwise import FunctionModel, FunctionSolution
+from tests.functions import AtOnce
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
 from uq.accuracy.doubts import Told
 from uq.accuracy.effects import CHANGED, DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors
@@ -78,7 +79,7 @@ def on_mesh(error, names=("a", "b")):
 
 
 def studied(method, model, count=FEWEST, inputs=INPUTS, told=TOLD):
-    recorder = Recorder(SerialEvaluate(model))
+    recorder = Recorder(AtOnce(model))
     dataset = method.run(inputs, recorder)
     centre = linearised(inputs, recorder, recorder.first)
     found = estimate(inputs, SerialEvaluate(model), centre, count, 0, fields=True)
@@ -359,8 +360,8 @@ def test_what_is_zero_by_symmetry_is_of_no_interest():
     model = on_mesh(lambda p: [0.01 * p[0], 1e-17 * p[1]])
     coarse = model.function
     small = np.array([1.0, 1e-16])
-    exact = replace(model.exact, function=lambda p: small * (coarse(p) + np.array([0.2 * p[0], 3 * p[1]])))
-    zero = replace(model, function=lambda p: small * coarse(p), jacobian=None, exact=exact)
+    exact = replace(model.exact, function=lambda p: (small * (coarse(p) + np.array([0.2 * p[0], 3 * p[1]])).T).T)
+    zero = replace(model, function=lambda p: (small * coarse(p).T).T, jacobian=None, exact=exact)
     _, found = studied(MonteCarlo(samples=64), zero, told=Told({"u": "m", "v": "m"}))
     assert abs(found["mesh_error"][1]) > 0.1 * abs(found["mean"][1])
     said = [one.text for one in findings(found) if "mesh" in one.text]

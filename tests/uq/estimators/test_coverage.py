@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from forward.pointwise import FunctionModel
+from tests.functions import AtOnce
 from uq.estimators.moments import estimate, monomials
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
@@ -32,7 +33,7 @@ def repeats(method, count=REPEATS):
     """Deviations of mean and variance from the exact ones, and claimed errors of mean and variance, (4, count)."""
     rows = []
     for seed in range(count):
-        data = method.model_copy(update={"seed": seed}).run(INPUTS, SerialEvaluate(MODEL))
+        data = method.model_copy(update={"seed": seed}).run(INPUTS, AtOnce(MODEL))
         std = data["std"].item()
         errors = data["mean_error"].item(), 2 * std * data["std_error"].item()
         rows.append((data["mean"].item() - MEAN, std**2 - STD**2, *errors))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from forward.pointwise import FunctionModel
+from tests.functions import AtOnce
 from uq.estimators.input_sample_error import with_errors_of_draws
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal, Uniform
@@ -45,7 +46,7 @@ def jacobian(p):
 
 def problem(draws):
     inputs = Inputs({"own": Normal(mean=0.0, std=1.0)}, draws=draws)
-    return inputs, SerialEvaluate(FunctionModel(value, inputs.names, ("linear", "other"), jacobian))
+    return inputs, AtOnce(FunctionModel(value, inputs.names, ("linear", "other"), jacobian))
 
 
 def exact(draws):

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
+from tests import functions
 from tests.launch import ROOT, assert_same_bits, in_process, tissuq_on_two_ranks
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
@@ -91,7 +92,8 @@ def test_unbiased_with_honest_errors_and_gain(reuse):
     for seed in range(100):
         # Without the pilot, few samples of the model are left, and claims are wider by Student's factor.
         samples = 60 if reuse else 120
-        method = Multifidelity(samples=samples, cheap=cheap(0.05), control="none", reuse=reuse, seed=seed)
+        settings = {"cheap": cheap(0.05), "control": "none", "quantiles": (), "seed": seed}
+        method = Multifidelity(samples=samples, reuse=reuse, **settings)
         data = method.run(INPUTS, evaluate)
         rows.append([data[n].values[0] for n in ("mean", "mean_error", "std", "std_error", "gain")])
         assert float(data["spent"]) <= samples
@@ -304,18 +306,17 @@ def test_where_a_model_fails_the_others_cause_no_bias(fails, bends):
         without(own, stiff) if fails == "own" else own,
         {f"c{i}": AtOnce(without(one, stiff) if fails == "cheap" else one) for i, one in enumerate(cheaper, 1)},
     )
+    levels = (0.5, 0.95)
     top = 0.85 if fails == "own" else 1.0
     x = (np.arange(400) + 0.5) / 400
     every = own(np.stack(np.meshgrid(top * x, x), axis=-1).reshape(-1, 2))
-    truth = every.mean(), every.std(), *np.quantile(every, [0.5, 0.95])
+    truth = every.mean(), every.std(), *np.quantile(every, levels)
     held, errors = [], []
-    full = "differences" if bends == 2 else "evenly"
+    settings = {"control": "none", "full_solves": "differences" if bends == 2 else "evenly", "quantiles": levels}
     for seed in range(30):
-        method = Multifidelity(
-            samples=80, cheap=cheap(*[0.1, 0.05][:bends]), control="none", full_solves=full, seed=seed
-        )
+        method = Multifidelity(samples=80, cheap=cheap(*[0.1, 0.05][:bends]), seed=seed, **settings)
         data = method.run(INPUTS, evaluate)
-        quantiles = [data[name].sel(quantile=[0.5, 0.95]).values[:, 0] for name in ("quantiles", "quantiles_error")]
+        quantiles = [data[name].values[:, 0] for name in ("quantiles", "quantiles_error")]
         found = np.array([*(data[n].values[0] for n in ("mean", "std")), *quantiles[0]])
         claimed = np.array([*(data[n].values[0] for n in ("mean_error", "std_error")), *quantiles[1]])
         errors.append(found - truth)
@@ -338,7 +339,7 @@ def test_a_comparison_takes_it():
     )
     known = {"f": {"mean": MEAN, "std": np.sqrt(VARIANCE)}, "g": {"mean": 10 * MEAN + 1, "std": 10 * np.sqrt(VARIANCE)}}
     method = Compare(methods=entries, reference={"kind": "given", "values": known}, repeats=12, textbook=0)
-    data = method.run(INPUTS, Recorder(team(wave(0.29, 0.1))))
+    data = method.run(INPUTS, functions.AtOnce(wave(0.3), others={"c1": wave(0.29, 0.1)}))
     errors = data["mean_rmse"].sel(output="f").values
     assert errors[1] < 0.6 * errors[0]
     assert method.models(parse(blocks()).spec).keys() >= {"tight", "c1"}

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
+from tests.functions import AtOnce
 from tests.launch import ROOT, assert_same_bits, in_process, run_script, tissuq_on_two_ranks
 from uq.estimators.blue import Problem, alone
 from uq.estimators.moments import combine, estimate, monomials, term
@@ -56,7 +57,7 @@ def meshes(*finer):
 
 def hierarchy(count, alpha=ALPHA):
     first, *others = (on_mesh(level, alpha) for level in range(count))
-    return SerialEvaluate(first, others=meshes(*others))
+    return AtOnce(first, others=meshes(*others))
 
 
 def exact(level):

@@ -18,7 +18,7 @@ def test_what_is_beyond_a_box_is_exact():
     basis = orthonormal(inputs, hyperbolic(3, 4, 1.0))
     random = np.random.default_rng(0)
     coefficients = random.standard_normal((len(basis.indices), 2))
-    points, drawn = (inputs.points(random.random((n, 3))) for n in (40, 400_000))
+    points, drawn = (inputs.points(random.random((n, 3))) for n in (40, 200_000))
     tails = np.array([True, True, False])
     found = beyond(inputs, basis, coefficients, points, tails)
     outside = (((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails).any(axis=1)

@@ -59,7 +59,7 @@ def sampled(beam, method, monkeypatch=None):
 @pytest.mark.fem
 @pytest.mark.parametrize("kind", [MonteCarlo, SensitivityMonteCarlo, QuasiMonteCarlo])
 def test_later_samples_begin_closer_and_end_at_the_same_states(beam, kind, monkeypatch):
-    method = kind(samples=256, **({"scrambles": 4} if kind is QuasiMonteCarlo else {}))
+    method = kind(samples=128, **({"scrambles": 4} if kind is QuasiMonteCarlo else {}))
     dataset, asked = sampled(beam, method)
     plain, before = sampled(beam, method, monkeypatch)
     kinds = [type(request.start) for request, _ in asked]
