@@ -28,7 +28,7 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
-from uq.methods.chaos import LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
+from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
 from uq.methods.method import UNASKED, Method
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
 from uq.surrogates.field_regression import Deviations, deviations
@@ -133,13 +133,13 @@ class Automatic(Method):
         other: _Outlook | None = None
 
         def wanted() -> float:
-            return trail[-1][0] + ENOUGH * _further(trail)
+            return trail[-1][0] + ENOUGH * _further(trail) if len(trail) >= AGAIN else np.inf
 
         try:
             for one in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT, wanted):
                 found, reached = one.held_to(goal)
                 trail.append((found.count, reached))
-                if trail[-1][1] <= 1:
+                if reached <= 1 and len(trail) >= AGAIN:
                     break
                 other = _Outlook.of(found, goal, gradients=gradients)
                 weight = WITH_DERIVATIVES if gradients else 1.0

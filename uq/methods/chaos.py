@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up by default
 GROWTH, LEAST_GROWTH = 1.5, 1.1  # growth of the design between checks of the tolerance
+AGAIN = 2  # rounds: the first samples are explained by what was chosen by them, until others show more
 DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
 QUARTERS = 4
 BINS = 80
@@ -152,9 +153,9 @@ class Chaos(Amount):
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
         """Solve until the claimed errors are those of a goal, or there are no more solves; errors as in `run`."""
-        for one in self.rounds(inputs, evaluate, self.most(goal)):
+        for number, one in enumerate(self.rounds(inputs, evaluate, self.most(goal)), 1):
             found, reached = one.held_to(goal)
-            if reached <= 1:
+            if reached <= 1 and number >= AGAIN:
                 break
         return self.reported(evaluate, found)
 

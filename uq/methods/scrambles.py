@@ -303,7 +303,12 @@ class Scrambles(Sets):
         others = [means(self._mixed(*one, each)) for one in self._repeats]
         first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
         middle = found.mean - self._centre.outputs
-        return wrong(first), ratio(wrong(second - 2 * middle * first), 2 * found.std)
+        tails = bool(tails_of(self._inputs).any())
+        of_std = ratio(wrong(second - 2 * middle * first, tails=tails), 2 * found.std)
+        # In tails what no sample shows is in other claims, and has no limit.
+        points = self._all_points(each)
+        norm = np.zeros_like(found.std) if tails else self._fitted.trial.unshown(points)
+        return np.hypot(wrong(first, tails=tails), norm / np.sqrt(len(points))), np.hypot(of_std, norm)
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""

@@ -7,6 +7,7 @@ samples in turn (`repeated`), and an expansion c counts
 - by what these fits c_k miss at the samples that they have not seen (`Trial.relative`), where c is to be chosen;
 - by how well samples integrate c_k − c, which is like f − c, and whose moments are known (`wrong`): where they are
   further off than their scatter says, they do not see the places that matter, and that is claimed;
+- by how much of the norm of c_k − c they do not show in bounded ranges, as next to a corner (`Trial.unshown`);
 - where there are no samples but those of the fit, by the moments of the c_k (`Trial.spread`);
 - with what it has beyond all samples (`uq.surrogates.outside_samples`): there it is a guess;
 - only if its mean and standard deviation are those of the plain samples, within their errors (`agree`).
@@ -49,6 +50,8 @@ class Trial:
         What the fits miss at the samples that they have not seen: root mean square (m,) over the standard deviation.
     fits
         Functions and coefficients (P, m) of each.
+    basis, apart
+        Functions, and the coefficients (K, P, m) of what each of them differs from the fit to all samples.
     whole
         Moments (2, m) by the fit to all samples: mean and standard deviation.
     gained
@@ -58,6 +61,8 @@ class Trial:
     points: FloatArray
     relative: FloatArray
     fits: tuple[tuple[Basis, FloatArray], ...]
+    basis: Basis
+    apart: FloatArray
     whole: FloatArray
     gained: FloatArray
 
@@ -75,12 +80,21 @@ class Trial:
         q = np.minimum(self.gained, 1 - 1 / K)
         return np.asarray(np.hypot(np.maximum(q / (1 - q), 1) * apart.mean(axis=0), np.sqrt(K - 1) * apart.std(axis=0)))
 
+    def unshown(self, points: FloatArray) -> FloatArray:
+        """Norms (m,) of what points (n, d) do not show of these differences, where of most it is more than half."""
+        if not self.fits:
+            return np.full(self.gained.shape, np.inf)
+        shown = ((self.basis.values(points) @ self.apart) ** 2).mean(axis=1)
+        return np.asarray(np.sqrt(np.maximum(np.median((self.apart**2).sum(axis=1) - 2 * shown, axis=0), 0.0)))
+
 
 def repeated(of: Regression) -> Trial:
     """Repeat a fit without each part of its samples in turn; where the others do not determine any, there is none."""
     data = of.data
     part = np.arange(len(data.points)) % min(PARTS, len(data.points))
-    errors, fits = np.empty_like(data.values), []
+    errors = np.empty_like(data.values)
+    fits: list[tuple[Basis, FloatArray]] = []
+    apart = np.zeros((PARTS, len(of.largest.indices), data.values.shape[1]))
     for k in np.unique(part):
         rest, own = np.flatnonzero(part != k), np.flatnonzero(part == k)
         try:
@@ -90,10 +104,15 @@ def repeated(of: Regression) -> Trial:
         else:
             basis = of.largest.subset(fit.chosen.which)
             errors[own] = data.values[own] - basis.values(data.points[own]) @ fit.coefficients
+            apart[len(fits), fit.chosen.which] = fit.coefficients
+            apart[len(fits), of.fit.chosen.which] -= of.fit.coefficients
             fits.append((basis, fit.coefficients))
     relative = np.sqrt(shares((errors**2).mean(axis=0), data.values.var(axis=0)))
     gained = shares(of.fit.relative, relative)
-    return Trial(data.points, relative, tuple(fits), _moments(of.basis, of.fit.coefficients), gained)
+    used = np.flatnonzero(apart.any(axis=(0, 2)))
+    differences = of.largest.subset(used), apart[: len(fits)][:, used]
+    whole = _moments(of.basis, of.fit.coefficients)
+    return Trial(data.points, relative, tuple(fits), *differences, whole, gained)
 
 
 def _moments(basis: Basis, coefficients: FloatArray) -> FloatArray:
@@ -101,7 +120,7 @@ def _moments(basis: Basis, coefficients: FloatArray) -> FloatArray:
     return np.array([found["mean"], found["std"]])
 
 
-def wrong(differences: FloatArray) -> FloatArray:
+def wrong(differences: FloatArray, *, tails: bool = False) -> FloatArray:
     """Return errors (…) of means over scrambles, as those of functions show whose expectations are zero.
 
     Infinite where there are fewer than two functions: then nothing is known.
@@ -110,15 +129,18 @@ def wrong(differences: FloatArray) -> FloatArray:
     ----------
     differences
         Means (K, R, …) over each of R scrambles of K such functions.
+    tails
+        Whether a parameter has one: there a single difference may be large without limit.
     """
     K = len(differences)
     if K < LEAST:
         return np.asarray(np.inf)
     R = differences.shape[1]
     off, scatter = differences.mean(axis=1), differences.var(axis=1, ddof=1) / R
-    # Medians, since a fit may have lost just the sample that decided.
-    size, common = np.median(off**2, axis=0), (K - 1) * np.median(off, axis=0)
-    return np.where(size <= EXPLAINED * np.median(scatter, axis=0), 0.0, np.hypot(np.sqrt(size), common))
+    # Most of them decide, each by its own scatter, since a fit may have lost just the sample that decided.
+    explained = np.median(off**2 - EXPLAINED * scatter, axis=0) <= 0
+    size, common = (np.median(one, axis=0) if tails else one.mean(axis=0) for one in (off**2, off))
+    return np.where(explained, 0.0, np.hypot(np.sqrt(size), (K - 1) * common))
 
 
 def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:

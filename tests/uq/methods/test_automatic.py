@@ -91,6 +91,24 @@ def test_a_kink_takes_quasi_monte_carlo(seed):
     assert f"{solves:,} solves" in last
 
 
+@pytest.mark.unit
+@pytest.mark.parametrize("method", [Automatic(seed=4), Chaos(samples=300, seed=4)], ids=["automatic", "chaos"])
+def test_first_samples_that_are_explained_are_not_believed(method):
+    """The first of them may all lie on one side of a jump, where the function is linear."""
+    seen = []
+
+    def function(p):
+        seen.append(p)
+        return np.array([p[0] + (len(seen) > FEW)])
+
+    FEW = 1 + 4  # the mean parameters and the first samples
+    evaluate = model(function, lambda p: np.array([[1.0, 0.0]]))
+    goal = Goal.of(1e-2, ["1"], 40)
+    found, _ = solved(method, two(), evaluate, goal)
+    assert len(seen) > FEW
+    assert goal.reached({name: found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error")}) > 1
+
+
 def test_without_derivatives_and_with_correlations():
     goal = Goal.of(1e-2, ["1"], 10_000)
     plain, solves = solved(Automatic(), two(), model(exponential), goal)
