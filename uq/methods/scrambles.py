@@ -244,7 +244,7 @@ class Scrambles(Sets):
             return tails, np.zeros_like(tails.std)
         first, moved = controlled[0] - controlled[0].mean(axis=0), influences(*controlled)
         assert known is not None
-        wrong_mean, wrong_std = self._wrong(each, known, found)
+        wrong_mean, wrong_std = self._wrong(each, known, found, first)
         of_mean, of_std = self._unseen(each, first)
         of_mean = np.hypot(of_mean, wrong_mean)
         further = np.hypot(np.maximum(of_std, of_influences(found, self._inputs, moved)), wrong_std)
@@ -288,8 +288,11 @@ class Scrambles(Sets):
         points = self.points[:, :each][self.ok[:, :each]]
         return points if self._fitted is None else np.concatenate([points, self._fitted.trial.points])
 
-    def _wrong(self, each: int, known: tuple[Pair, Pair], found: Estimates) -> Pair:
-        """Errors (m,) of mean and standard deviation, as differences of the control and its repeated fits show."""
+    def _wrong(self, each: int, known: tuple[Pair, Pair], found: Estimates, left: FloatArray) -> Pair:
+        """Errors (m,) of mean and standard deviation, as differences of the control and its repeated fits show.
+
+        The control leaves `left` (n, m) of samples.
+        """
         ok = self.ok[:, :each, None]
         some, count = ok.any(axis=(1, 2)), np.maximum(ok.sum(axis=1), 1)
 
@@ -299,16 +302,19 @@ class Scrambles(Sets):
 
         if self._fitted is None:
             return np.zeros_like(found.mean), np.zeros_like(found.std)
+        if not self._repeats:  # nothing is known
+            return np.full_like(found.mean, np.inf), np.full_like(found.std, np.inf)
         C, D = means(known)
         others = [means(self._mixed(*one, each)) for one in self._repeats]
         first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
         middle = found.mean - self._centre.outputs
         tails = bool(tails_of(self._inputs).any())
+        norm = np.zeros_like(found.std)
+        if not tails:  # in tails what no sample shows is in other claims, and has no limit
+            sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
+            first, second = first * sizes[:, None], second * sizes[:, None]
         of_std = ratio(wrong(second - 2 * middle * first, tails=tails), 2 * found.std)
-        # In tails what no sample shows is in other claims, and has no limit.
-        points = self._all_points(each)
-        norm = np.zeros_like(found.std) if tails else self._fitted.trial.unshown(points)
-        return np.hypot(wrong(first, tails=tails), norm / np.sqrt(len(points))), np.hypot(of_std, norm)
+        return np.hypot(wrong(first, tails=tails), norm / np.sqrt(len(left))), np.hypot(of_std, norm)
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""

@@ -7,7 +7,7 @@ samples in turn (`repeated`), and an expansion c counts
 - by what these fits c_k miss at the samples that they have not seen (`Trial.relative`), where c is to be chosen;
 - by how well samples integrate c_k − c, which is like f − c, and whose moments are known (`wrong`): where they are
   further off than their scatter says, they do not see the places that matter, and that is claimed;
-- by how much of the norm of c_k − c they do not show in bounded ranges, as next to a corner (`Trial.unshown`);
+- by how much of the norm of c_k − c they do not show in bounded ranges, as next to a corner (`Trial.scaled`);
 - where there are no samples but those of the fit, by the moments of the c_k (`Trial.spread`);
 - with what it has beyond all samples (`uq.surrogates.outside_samples`): there it is a guess;
 - only if its mean and standard deviation are those of the plain samples, within their errors (`agree`).
@@ -80,12 +80,16 @@ class Trial:
         q = np.minimum(self.gained, 1 - 1 / K)
         return np.asarray(np.hypot(np.maximum(q / (1 - q), 1) * apart.mean(axis=0), np.sqrt(K - 1) * apart.std(axis=0)))
 
-    def unshown(self, points: FloatArray) -> FloatArray:
-        """Norms (m,) of what points (n, d) do not show of these differences, where of most it is more than half."""
-        if not self.fits:
-            return np.full(self.gained.shape, np.inf)
+    def scaled(self, points: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scale these differences to what the fit leaves (n, m) of values at points (n, d).
+
+        Returns the factors (K, m), and the norms (m,) of what the points do not show, where of most differences it is
+        more than half.
+        """
         shown = ((self.basis.values(points) @ self.apart) ** 2).mean(axis=1)
-        return np.asarray(np.sqrt(np.maximum(np.median((self.apart**2).sum(axis=1) - 2 * shown, axis=0), 0.0)))
+        size = np.sqrt((left**2).mean(axis=0))
+        beyond = np.median(shares((self.apart**2).sum(axis=1), shown), axis=0) - 2
+        return shares(size, np.sqrt(shown)), size * np.sqrt(np.maximum(beyond, 0.0))
 
 
 def repeated(of: Regression) -> Trial:

@@ -1,7 +1,5 @@
 """Expansions that stand for samples: waves and poles that they miss, against quadrature."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -51,12 +49,12 @@ def test_most_differences_decide_and_all_are_claimed():
 def test_what_points_do_not_show_is_claimed():
     """Of √3 (2u − 1), whose norm is 1, points at a distance h from the middle show 12 h²."""
     basis = orthonormal(Inputs({"u": Uniform(lower=0.0, upper=1.0)}), np.array([[1]]))
-    one, h = np.ones((1, 1)), 0.1
-    some = np.array([1.0, 1.0, 1.0, 0.0, 0.0])[:, None, None]
-    trial = Trial(one, one[0], ((basis, one),) * 5, basis, some, np.ones((2, 1)), one[0])
-    assert trial.unshown(np.array([[0.5 - h], [0.5 + h]])) == pytest.approx(np.sqrt(1 - 2 * 12 * h**2))
-    assert trial.unshown(np.linspace(0, 1, 101)[:, None]) == 0
-    assert replace(trial, apart=some[::-1] * (some < 1)).unshown(one / 2) == 0  # two of five
+    one, h, left = np.ones((1, 1)), 0.1, 0.02
+    trial = Trial(one, one[0], ((basis, one),) * 5, basis, np.full((5, 1, 1), 3.0), np.ones((2, 1)), one[0])
+    sizes, norm = trial.scaled(np.array([[0.5 - h], [0.5 + h]]), np.full((2, 1), left))
+    np.testing.assert_allclose(sizes, left / (3 * np.sqrt(12) * h))
+    assert norm == pytest.approx(left * np.sqrt(1 / (12 * h**2) - 2))
+    assert trial.scaled(np.linspace(0, 1, 101)[:, None], np.full((101, 1), left))[1] == 0
 
 
 @pytest.mark.parametrize("name", ["sin(2.3 z + 0.3)", "sin(2 g), skewed", "waves between normals", "1/(1.03 - abc)"])
