@@ -69,7 +69,7 @@ def test_an_oscillation_that_no_expansion_knows(run):
 @pytest.mark.parametrize(
     ("method", "samples"),
     [
-        ("{kind='automatic'}", 6),
+        ("{kind='automatic'}", 9),
         ("{kind='monte-carlo', samples=12}", 12),
         ("{kind='quasi-monte-carlo', samples=16, scrambles=4, control='none', seed=2}", 16),
     ],
