@@ -308,13 +308,11 @@ class Scrambles(Sets):
         others = [means(self._mixed(*one, each)) for one in self._repeats]
         first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
         middle = found.mean - self._centre.outputs
-        tails = bool(tails_of(self._inputs).any())
-        norm = np.zeros_like(found.std)
-        if not tails:  # in tails what no sample shows is in other claims, and has no limit
+        sizes, norm = None, np.zeros_like(found.std)
+        if not tails_of(self._inputs).any():  # in tails what no sample shows is in other claims, and has no limit
             sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
-            first, second = first * sizes[:, None], second * sizes[:, None]
-        of_std = ratio(wrong(second - 2 * middle * first, tails=tails), 2 * found.std)
-        return np.hypot(wrong(first, tails=tails), norm / np.sqrt(len(left))), np.hypot(of_std, norm)
+        of_std = ratio(wrong(second - 2 * middle * first, sizes), 2 * found.std)
+        return np.hypot(wrong(first, sizes), norm / np.sqrt(len(left))), np.hypot(of_std, norm)
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""

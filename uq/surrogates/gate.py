@@ -124,7 +124,7 @@ def _moments(basis: Basis, coefficients: FloatArray) -> FloatArray:
     return np.array([found["mean"], found["std"]])
 
 
-def wrong(differences: FloatArray, *, tails: bool = False) -> FloatArray:
+def wrong(differences: FloatArray, sizes: FloatArray | None = None) -> FloatArray:
     """Return errors (…) of means over scrambles, as those of functions show whose expectations are zero.
 
     Infinite where there are fewer than two functions: then nothing is known.
@@ -133,18 +133,23 @@ def wrong(differences: FloatArray, *, tails: bool = False) -> FloatArray:
     ----------
     differences
         Means (K, R, …) over each of R scrambles of K such functions.
-    tails
-        Whether a parameter has one: there a single difference may be large without limit.
+    sizes
+        Factors (K, …) that make each as large as what is in question: then all count, as large as they are.
     """
     K = len(differences)
     if K < LEAST:
         return np.asarray(np.inf)
     R = differences.shape[1]
     off, scatter = differences.mean(axis=1), differences.var(axis=1, ddof=1) / R
-    # Most of them decide, each by its own scatter, since a fit may have lost just the sample that decided.
-    explained = np.median(off**2 - EXPLAINED * scatter, axis=0) <= 0
-    size, common = (np.median(one, axis=0) if tails else one.mean(axis=0) for one in (off**2, off))
-    return np.where(explained, 0.0, np.hypot(np.sqrt(size), (K - 1) * common))
+    # Medians, since a fit may have lost just the sample that decided: of each by its own scatter, and of all.
+    size = np.median(off**2, axis=0)
+    apart = np.median(off**2 - EXPLAINED * scatter, axis=0)
+    explained = np.maximum(apart, size - EXPLAINED * np.median(scatter, axis=0)) <= 0
+    found = np.hypot(np.sqrt(size), (K - 1) * np.median(off, axis=0))
+    if sizes is not None:
+        off = sizes * off
+        found = np.maximum(found, np.hypot(np.sqrt((off**2).mean(axis=0)), (K - 1) * off.mean(axis=0)))
+    return np.where(explained, 0.0, found)
 
 
 def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:

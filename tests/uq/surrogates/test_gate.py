@@ -35,13 +35,16 @@ def test_differences_that_scatter_explains_claim_nothing():
 
 
 @pytest.mark.unit
-def test_most_differences_decide_and_all_are_claimed():
-    """One that scatters, since a fit has lost a sample that decides, explains no others; alone it claims nothing."""
+def test_most_differences_decide():
+    """One that scatters, since its fit has lost a sample that decides, explains no others; alone it claims nothing."""
     agreeing = np.random.default_rng(0).standard_normal((5, 16, 1))
     agreeing -= agreeing.mean(axis=1, keepdims=True)
     offsets = np.array([0.0, 0.2, 1.5, 1.0, 4.0])[:, None, None]
-    scales = np.array([6.0, 2.5, 1.0, 0.1, 1.0])[:, None, None]
-    assert wrong(scales * agreeing + offsets) > 4 * offsets.mean()
+    scales = np.array([6.0, 9.0, 1.0, 0.1, 4.0])[:, None, None]
+    found = wrong(scales * agreeing + offsets)
+    assert found == pytest.approx(np.hypot(1.0, 4 * 1.0))
+    assert wrong(scales * agreeing + offsets, np.full((5, 1), 0.1)) == found
+    assert wrong(scales * agreeing + offsets, np.ones((5, 1))) > 4 * offsets.mean()
     assert wrong(agreeing + np.array([0.0, 0.0, 0.0, 0.0, 9.0])[:, None, None]) == 0
 
 
