@@ -10,7 +10,6 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from operator import attrgetter
 from typing import Protocol, Self
 
 import numpy as np
@@ -57,7 +56,7 @@ class Work:
 
     def as_array(self) -> NDArray[np.int64]:
         """Return the counts in the order of `WORK`."""
-        return np.array(_counts(self), dtype=np.int64)
+        return np.array([getattr(self, name) for name in WORK], dtype=np.int64)
 
     @classmethod
     def sum_of(cls, works: Iterable[Work]) -> Work:
@@ -66,7 +65,6 @@ class Work:
 
 
 WORK = tuple(one.name for one in fields(Work))
-_counts = attrgetter(*WORK)
 
 
 class Stability(IntEnum):
