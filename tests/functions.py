@@ -24,8 +24,8 @@ class AtOnce(SerialEvaluate):
             return super().__call__(request)
         n = len(request.points)
         values = np.array(self.model.function(request.points.T), dtype=float).reshape(-1, n).T
-        assert np.isfinite(values).all()
-        steady = np.full(n, 1e-4), np.zeros((n, len(WORK)), dtype=np.int64), np.zeros(n), np.ones(n, dtype=bool)
+        ok = np.isfinite(values).all(axis=1)
+        steady = np.full(n, 1e-4), np.zeros((n, len(WORK)), dtype=np.int64), np.zeros(n), ok
         return Evaluations(request.points, values, None, (), *steady, np.zeros(n, dtype=np.int8), np.zeros((0, 0)))
 
 

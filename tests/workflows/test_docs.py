@@ -272,13 +272,12 @@ def reference():
 
 
 @pytest.fixture(scope="module")
-def generated(reference):
+def pages(reference):
     """Pages that are made of the code, by name."""
     return dict(reference.pages())
 
 
-def test_generated_pages_tell_what_is_there(generated):
-    pages = generated
+def test_generated_pages_tell_what_is_there(pages):
     assert "| `max_order` | whole number ≥ 1 ≤ 20 | `6` | Largest order that is tried" in pages["reference/settings.md"]
     assert "usage: tissuq run" in pages["reference/commands.md"]
     assert "## treloar" in pages["studies.md"]
@@ -299,11 +298,9 @@ def test_quotations_are_found(reference):
     assert "- `x, y`: Some \\*number\\* below 1." in text
 
 
-def test_pages_are_in_the_menu_or_linked(generated):
+def test_pages_are_in_the_menu_or_linked(pages):
     named = set(re.findall(r"[\w/.-]+\.md", (ROOT / "mkdocs.yml").read_text()))
     written = {str(page.relative_to(ROOT / "docs")) for page in PAGES[1:]}
-    linked = set(
-        re.findall(r"\]\((?:\.\./)?([\w/.-]+\.md)", "".join([*generated.values(), *map(Path.read_text, PAGES)]))
-    )
-    assert named <= set(generated) | written
+    linked = set(re.findall(r"\]\((?:\.\./)?([\w/.-]+\.md)", "".join([*pages.values(), *map(Path.read_text, PAGES)])))
+    assert named <= set(pages) | written
     assert written <= named | linked

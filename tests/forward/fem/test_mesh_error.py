@@ -246,7 +246,7 @@ def test_data_of_a_specimen_have_errors():
     )
     model = spec.build(MPI.COMM_SELF, ())
     solution = model.solve(np.zeros(0))
-    finest = spec.model_copy(update={"body": spec.body.model_copy(update={"cells": (6, 6, 6), "degree": 2})})
+    finest = spec.model_copy(update={"body": spec.body.model_copy(update={"cells": (8, 8, 8), "degree": 2})})
     exact = solved(finest).outputs
     error = solution.mesh_error()
     assert error.outputs.shape == (12,)

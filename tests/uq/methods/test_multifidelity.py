@@ -2,7 +2,6 @@
 
 import json
 import tomllib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +9,9 @@ from pydantic import ValidationError
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from tests import functions
+from tests.functions import AtOnce
 from tests.launch import ROOT, assert_same_bits, in_process, tissuq_on_two_ranks
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -57,37 +56,19 @@ def texts(data):
 # --- estimates -----------------------------------------------------------------------------------------------------
 
 
-class AtOnce(Recorder):
-    """A function of all points at once, which takes no time."""
+def waves(amplitude, tilt, missing=lambda a: False):
+    """The first output of `wave`, without an answer where something is missing."""
 
-    def __init__(self, function, others=()):
-        super().__init__(SerialEvaluate(FunctionModel(lambda p: function(p[None])[0], ("a", "b"), ("f",))))
-        self._function, self._others = function, dict(others)
+    def value(p):
+        return np.where(missing(p[0]), np.nan, wave(amplitude, tilt).function(p)[0])
 
-    def __call__(self, request):
-        if len(request.points) == 1:
-            return super().__call__(request)
-        values, n = self._function(request.points), len(request.points)
-        some = int(np.isfinite(values).all(axis=1).argmax())
-        one = super().__call__(replace(request, points=request.points[some, None]))
-        many = {name: np.repeat(getattr(one, name), n, axis=0) for name in ("seconds", "work", "residuals")}
-        many |= {name: np.repeat(getattr(one, name), n, axis=0) for name in ("converged", "stability")}
-        return replace(one, points=request.points, outputs=values, **many)
-
-    def on(self, model):
-        return self._others.get(model, self)
-
-
-def waves(amplitude, tilt):
-    return lambda x: (np.exp(x[:, 0] + tilt) + amplitude * np.sin(10 * np.pi * x[:, 0]) * np.cos(6 * np.pi * x[:, 1]))[
-        :, None
-    ]
+    return FunctionModel(value, ("a", "b"), ("f",))
 
 
 @pytest.mark.parametrize("reuse", [True, False])
 def test_unbiased_with_honest_errors_and_gain(reuse):
     """Of 300 seeds 92 to 97 % of the intervals hold the truth (`python -m benchmarks multifidelity --only closed`)."""
-    evaluate = AtOnce(waves(0.3, 0.0), {"c1": AtOnce(waves(0.27, 0.1))})
+    evaluate = AtOnce(waves(0.3, 0.0), others={"c1": waves(0.27, 0.1)})
     rows = []
     for seed in range(100):
         # Without the pilot, few samples of the model are left, and claims are wider by Student's factor.
@@ -290,26 +271,22 @@ def test_failures_of_any_model_are_recorded():
         Multifidelity(samples=60, cheap=cheap(0.05)).run(INPUTS, team(FunctionModel(never, ("a", "b"), ("f", "g"))))
 
 
-def without(function, missing):
-    return lambda x: np.where(missing(x)[:, None], np.nan, function(x))
-
-
 @pytest.mark.parametrize(("fails", "bends"), [("cheap", 1), ("own", 1), ("own", 2)])
 def test_where_a_model_fails_the_others_cause_no_bias(fails, bends):
     """A cheap model may fail anywhere; where the study's does, estimates are those of the points where it does not."""
 
-    def stiff(x):
-        return x[:, 0] > 0.85
+    def stiff(a):
+        return a > 0.85
 
-    own, cheaper = waves(0.3, 0.0), [waves(0.27, 0.1), waves(0.2, 0.05)][:bends]
+    own = waves(0.3, 0.0)
+    cheaper = [waves(*wrong, *([stiff] if fails == "cheap" else [])) for wrong in ((0.27, 0.1), (0.2, 0.05))][:bends]
     evaluate = AtOnce(
-        without(own, stiff) if fails == "own" else own,
-        {f"c{i}": AtOnce(without(one, stiff) if fails == "cheap" else one) for i, one in enumerate(cheaper, 1)},
+        waves(0.3, 0.0, stiff) if fails == "own" else own, others={f"c{i}": one for i, one in enumerate(cheaper, 1)}
     )
     levels = (0.5, 0.95)
     top = 0.85 if fails == "own" else 1.0
     x = (np.arange(400) + 0.5) / 400
-    every = own(np.stack(np.meshgrid(top * x, x), axis=-1).reshape(-1, 2))
+    every = own.function(np.stack(np.meshgrid(top * x, x)).reshape(2, -1))
     truth = every.mean(), every.std(), *np.quantile(every, levels)
     held, errors = [], []
     settings = {"control": "none", "full_solves": "differences" if bends == 2 else "evenly", "quantiles": levels}
@@ -339,7 +316,7 @@ def test_a_comparison_takes_it():
     )
     known = {"f": {"mean": MEAN, "std": np.sqrt(VARIANCE)}, "g": {"mean": 10 * MEAN + 1, "std": 10 * np.sqrt(VARIANCE)}}
     method = Compare(methods=entries, reference={"kind": "given", "values": known}, repeats=12, textbook=0)
-    data = method.run(INPUTS, functions.AtOnce(wave(0.3), others={"c1": wave(0.29, 0.1)}))
+    data = method.run(INPUTS, AtOnce(wave(0.3), others={"c1": wave(0.29, 0.1)}))
     errors = data["mean_rmse"].sel(output="f").values
     assert errors[1] < 0.6 * errors[0]
     assert method.models(parse(blocks()).spec).keys() >= {"tight", "c1"}
