@@ -63,9 +63,9 @@ class MaterialTests(ModelSpec):
         return {name: f"material.{name}" for name in self.fixed}
 
     @property
-    def varied(self) -> list[str]:
-        """Constants that are parameters of the same name, and have no value."""
-        return [name for name, path in self.paths.items() if name == path]
+    def varied(self) -> tuple[str, ...]:
+        """Constants that are parameters without a value: only a candidate has some."""
+        return ()
 
     @property
     def fibres(self) -> tuple[Vector, ...]:
@@ -181,3 +181,8 @@ class CandidateTests(MaterialTests):
     def paths(self) -> dict[str, str]:
         """Names of the parameters, by themselves."""
         return {name: name for name in self.parameters}
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The parameters."""
+        return self.parameters

@@ -27,7 +27,7 @@ from forward.machine import modified
 from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
-_walked: dict[str, tuple[tuple[object, ...], dict[str, tuple[str, str]]]] = {}
+_walked: dict[str, tuple[tuple[object, ...], dict[str, tuple[str, str]]]] = {}  # folders and files of modules, as found
 _TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
 _refused: ContextVar[list[str] | None] = ContextVar("refused", default=None)  # where not all may be imported
 

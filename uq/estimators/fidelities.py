@@ -97,9 +97,10 @@ class Fitted:
         """Fit deviations w and w² (n, K) of all models, with the control T (n,) and its variance V."""
         n, K = w.shape
         slopes, parts = np.zeros((K, 3)), np.empty((2, n, K))
-        for k in range(K if T.any() else 0):  # without a control there is nothing to fit
-            slopes[k, 0] = _slopes(w[:, k], T[:, None])[0]
-            slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T, T**2 - V]))
+        if T.any():  # without a control there is nothing to fit
+            for k in range(K):
+                slopes[k, 0] = _slopes(w[:, k], T[:, None])[0]
+                slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T, T**2 - V]))
         first, second = remainders(w, squares, T, V, slopes)
         means = first.mean(axis=0)
         parts = np.array([first, second - 2 * means * first])

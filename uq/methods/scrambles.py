@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from uq.surrogates.outside_samples import Beyond, beyond, drawn_beyond
 from uq.surrogates.regression import tails_of
 from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 
+Found = TypeVar("Found")
 Pair = tuple[FloatArray, FloatArray]
 MOSTLY = 0.5  # of the variance of an expansion: beyond all samples it is a guess
 LITTLE = 1e-3  # of the standard deviation: errors of means that may be claimed too large
@@ -158,6 +160,20 @@ class Sets:
             raise SolveError(f"{found} of {self.scrambles} scrambles have an answer, expected more: {reasons}")
 
 
+def _once(method: Callable[[Scrambles, int], Found]) -> Callable[[Scrambles, int], Found]:
+    """Remember what is found of so many scrambles and their first points: results ask for rounds again."""
+
+    @wraps(method)
+    def known(scrambles: Scrambles, each: int) -> Found:
+        key = method.__name__, scrambles.scrambles, each
+        if key not in scrambles._known:
+            scrambles._known[key] = method(scrambles, each)
+        found: Found = scrambles._known[key]
+        return found
+
+    return known
+
+
 class Scrambles(Sets):
     """Scrambles with the controls of their moments, and the sums of the fields over each of them.
 
@@ -188,9 +204,7 @@ class Scrambles(Sets):
         self.needed = 4 if coefficient == "optimal" else 2
         repeats = () if fitted is None else fitted.repeats
         self._repeats = [(expansion(one), held_expansion(inputs, one)) for one in repeats]
-        # Results ask for rounds again. By the numbers of scrambles and of their points:
-        self._known: dict[tuple[int, int], Estimates] = {}
-        self._held_known: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._known: dict[tuple[str, int, int], Any] = {}  # what `_once` remembers
         self._sums: dict[int, FloatArray] = {}
         self._higher: FloatArray | None = None
 
@@ -209,13 +223,9 @@ class Scrambles(Sets):
         self._sums[number] = products if kept is None else kept + products
         self._higher = higher if self._higher is None else self._higher + higher
 
+    @_once
     def scalars(self, each: int) -> Estimates:
         """Estimate the moments of the outputs from the first `each` points of every scramble that has answers there."""
-        if (self.scrambles, each) not in self._known:
-            self._known[self.scrambles, each] = self._scalars(each)
-        return self._known[self.scrambles, each]
-
-    def _scalars(self, each: int) -> Estimates:
         self.check(each)
         found, hidden = self._estimated(each, self._controls(each))
         if self._fitted is None:  # Taylor polynomials of a low order have little far out
@@ -344,17 +354,13 @@ class Scrambles(Sets):
         controls = control.predict(control.features(self.points[:, :each]), control.outputs)
         return controls, control.expected(control.outputs)
 
+    @_once
     def _which_held(self, each: int) -> NDArray[np.bool_]:
         """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own.
 
         By samples that tell the two apart: one hardly beyond says nothing, and what is held wrongly errs where no
         sample is. And those that have most of their variance beyond all samples.
         """
-        if (self.scrambles, each) not in self._held_known:
-            self._held_known[self.scrambles, each] = self._found_held(each)
-        return self._held_known[self.scrambles, each]
-
-    def _found_held(self, each: int) -> NDArray[np.bool_]:
         if self._control is None or self._held is None:
             return np.zeros(self.outputs.shape[2], dtype=bool)
         ok = self.ok[:, :each]

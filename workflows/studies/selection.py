@@ -209,13 +209,16 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         yield from self._of_method()
 
     def _of_tests(self) -> Iterator[Mistake]:
-        """Find several tests of one name in a group, and candidates that are no materials."""
+        """Find several tests of one name in a group, words about meshes, and candidates that are no materials."""
         data: Any = self.data
         for group in data.data_groups:
             labels = [test.label for test in self.tests_in(group)]
             twice = next((label for label in labels if labels.count(label) > 1), None)
             if twice is not None:
                 yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
+        if self.method.treatment != "correct":
+            message = "tests of materials have no mesh, expected nothing said of it"
+            yield ("method", "mesh_error"), message, self.method.mesh_error
         for name, one in self.candidates.items():
             if one.model:
                 yield ("candidates", name, "model"), "there is no model that it changes, expected a material", one.model

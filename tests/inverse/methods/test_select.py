@@ -310,6 +310,7 @@ def small(tmp_path):
             '"normal", mean = -500',
             r"hookean.parameters: 95.2 % of the values are impossible; at the medians, .* μ = 2 C1 = -1000 Pa.*'C1'",
         ),
+        ("samples = 32", "samples = 32\nmesh_error = false", "method.mesh_error: tests of materials have no mesh"),
         ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
         ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
         ("weight = 2", "weight = 0", "candidates.mooney-rivlin.weight"),
