@@ -30,11 +30,20 @@ FLAGS = (
     "--no-first-run",
 )
 SECONDS = 120.0  # until an answer is given up
+PAGE_HAS_GONE = -32000  # what a call is answered whose page, or its script, has gone meanwhile
 
 
 def executable() -> str | None:
     """Return where a Chromium is installed, if it is."""
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+class ProtocolError(RuntimeError):
+    """The browser has refused a call of its protocol."""
+
+    def __init__(self, error: dict[str, Any]) -> None:
+        super().__init__(str(error))
+        self.code = error["code"]
 
 
 @dataclass
@@ -75,7 +84,7 @@ class Page:
                     self._heard(message["method"], message["params"])
             if answer is not None:
                 if "error" in answer:
-                    raise RuntimeError(str(answer["error"]))
+                    raise ProtocolError(answer["error"])
                 return answer["result"]
             more = os.read(self.from_browser, 1 << 20)
             if not more:
@@ -118,12 +127,23 @@ class Page:
         return result["result"].get("value")
 
     def wait(self, condition: str) -> None:
-        """Wait until a condition in JavaScript holds."""
+        """Wait until a condition in JavaScript holds.
+
+        Where the page loads anew meanwhile, the script that asks goes with the old page: it is asked again.
+        """
         ends = time.monotonic() + SECONDS
-        while not self.run(f"Boolean({condition})"):
+        while not self._holds(condition):
             if time.monotonic() > ends:
                 raise TimeoutError(condition)
             time.sleep(0.05)
+
+    def _holds(self, condition: str) -> bool:
+        try:
+            return bool(self.run(f"Boolean({condition})"))
+        except ProtocolError as error:
+            if error.code != PAGE_HAS_GONE:
+                raise
+            return False
 
     def drag(self, x: float, y: float, dx: float, dy: float) -> None:
         """Press the left button at a place of the window, move, and release."""
