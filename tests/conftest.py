@@ -66,6 +66,21 @@ def paths(monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def first_numbers(request):
+    """State of the random numbers `RNG` of a file, before its first test."""
+    numbers = getattr(request.module, "RNG", None)
+    return numbers, None if numbers is None else numbers.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_numbers(first_numbers):
+    """Every test draws what it draws alone, whichever others ran before it."""
+    numbers, state = first_numbers
+    if numbers is not None:
+        numbers.bit_generator.state = state
+
+
 def pytest_ignore_collect(collection_path, config):
     """With `-m unit`, read only the files that have such tests: importing all others takes longer than these run."""
     only = config.option.markexpr == "unit" and collection_path.name.startswith("test_")

@@ -16,7 +16,7 @@ from forward.model import FloatArray
 Inverse = Callable[[FloatArray], FloatArray]  # applies P⁻¹ to (n,) or to rows (k, n)
 Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
 NEGLIGIBLE = 1e-13  # relative size of a direction, in least squares, that counts as rounding
-MARGIN = 2.0  # margin by which convergence may be slower than in the iterations before
+MARGIN = 2.0  # times more that a correction may miss than those before it
 
 
 class AndersonMixing:
@@ -104,8 +104,8 @@ def block_galerkin(
     Where A is symmetric these are block conjugate gradients, whose errors are the smallest in energy; with
     P ≈ A that says more about x than the size of a residual. Full orthogonalisation preserves this under rounding,
     and allows A without symmetry. All systems share their search spaces, so that k need fewer iterations than one.
-    Stops when the next correction, times the factor by which both of the last two iterations have shortened it and with
-    a margin, is below the tolerance; that correction is still added, since it costs no product.
+    Stops when the next correction, times the larger part of themselves that the last two have missed and with a margin,
+    is below the tolerance; that correction is still added, since it costs no product.
     Sources: D. P. O'Leary, Linear Algebra Appl. 29 (1980) 293–322; Y. Saad, Math. Comp. 37 (1981) 105–126.
 
     Parameters
@@ -154,7 +154,7 @@ def block_galerkin(
 
     if first is not None:
         search(first)
-    lengths, ratio = np.full(len(right), np.inf), np.zeros(len(right))
+    reached, lengths, missed = x, np.full(len(right), np.inf), np.ones(len(right))
     for _ in range(iterations):
         p = precondition(r)
         if searched:
@@ -163,13 +163,11 @@ def block_galerkin(
         before, lengths = lengths, size(p)
         if not np.isfinite(lengths).all():
             return None
-        factor = np.ones(len(right))
-        if np.isfinite(before).all():
-            earlier, ratio = ratio, np.minimum(1, lengths / np.maximum(before, np.finfo(float).tiny))
-            factor = MARGIN * np.maximum(ratio, earlier)
-        unfinished = lengths * factor > tolerance * size(x + p)
+        before_reached, reached = reached, x + p
+        earlier, missed = missed, size(reached - before_reached) / np.maximum(before, np.finfo(float).tiny)
+        unfinished = MARGIN * lengths * np.maximum(missed, earlier) > tolerance * size(reached)
         if not unfinished.any():
-            return np.asarray(x + p)
+            return np.asarray(reached)
         search(p[unfinished])
     return None
 

@@ -159,5 +159,6 @@ def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:
     """
     apart = np.abs(found.mean - plain.mean) <= AGREE * np.hypot(found.mean_error, plain.mean_error)
     sizes = [np.maximum(np.maximum(one.std, one.std_error), np.finfo(float).tiny) for one in (found, plain)]
-    error = np.hypot(*(one.std_error / size for one, size in zip((found, plain), sizes, strict=True)))
+    with np.errstate(invalid="ignore"):  # what is claimed to be unknown agrees with nothing
+        error = np.hypot(*(one.std_error / size for one, size in zip((found, plain), sizes, strict=True)))
     return np.asarray(apart & (np.abs(np.log(sizes[0] / sizes[1])) <= AGREE * error))

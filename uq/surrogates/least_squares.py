@@ -184,7 +184,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     # Samples that are left out together are next to each other.
     n = len(data.points)
     too_few = f"{n} samples have an answer, too few for an expansion of order 1" + (f": {data.why}" if data.why else "")
-    if not n:
+    if n < 2:  # nothing can be left out
         raise SolveError(too_few)
     held = np.arange(n) % min(n, FOLDS)
     order = np.argsort(held, kind="stable")

@@ -570,6 +570,23 @@ def test_many_parameters_are_selected_from():
     assert data["std"].item() ** 2 == pytest.approx(1 / 9 - 1 / 16 + 1 / 12, abs=1e-12)
 
 
+@pytest.mark.parametrize("fitted", [2, 3])
+def test_an_expansion_of_hardly_any_samples_stands_for_none(fitted):
+    """Of two, no fit can leave one out: plain estimates count, and claims hold."""
+    inputs = Inputs({"a": UNIT, "b": Normal(mean=0.5, std=1.0)})
+    model = FunctionModel(
+        lambda p: [np.sin(p.sum()), p[0] * p[1] ** 2],
+        inputs.names,
+        ("wave", "product"),
+        lambda p: [[np.cos(p.sum())] * 2, [p[1] ** 2, 2 * p[0] * p[1]]],
+    )
+    method = QuasiMonteCarlo(samples=256, control="chaos", control_samples=fitted, fields=False)
+    data = method.run(inputs, SerialEvaluate(model))
+    # E sin(a + b) is the imaginary part of E exp(ia) E exp(ib).
+    wave = float(((np.exp(1j) - 1) / 1j * np.exp(0.5j - 0.5)).imag)
+    np.testing.assert_array_less(np.abs(data["mean"] - [wave, 0.625]), 4 * data["mean_error"])
+
+
 def test_failures_are_left_out_and_counted():
     def fails_sometimes(p):
         if p[0] > 0.95:
