@@ -110,14 +110,18 @@ class Page:
         self.errors.clear()
         self.requests.clear()
         self.loaded = False
-        self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 600
-        )
+        self.resize(width)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", media="print" if printed else "", features=[scheme])
         self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         self.wait("document.readyState === 'complete'")
         self.wait("!document.querySelector('.viewer[data-state=loading]')")
+
+    def resize(self, width: int) -> None:
+        """Show it in a window of another width (CSS pixels)."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 600
+        )
 
     def run(self, script: str) -> Any:
         """Evaluate JavaScript, also a promise, and return its value."""
@@ -205,12 +209,13 @@ def browser() -> Iterator[Page]:
 
 
 def without_fault(page: Page, report: Path) -> None:
-    """Open a report on a screen and a telephone, light, dark and printed: what is wrong with it fails."""
+    """Open a report on a telephone, then on a screen, light, dark and printed: what is wrong with it fails."""
     viewers = "[...document.querySelectorAll('.viewer')]"
     # Whoever cannot see hears what each picture and control is.
     unnamed = "img:not([alt]), img[alt=''], button:not([aria-label]):empty, canvas:not([aria-label])"
-    for width in (1280, 390):
-        page.open(report, width)
+    page.open(report, 390)
+    for width in (390, 1280):
+        page.resize(width)
         for media, scheme in (("", "light"), ("", "dark"), ("print", "light")):
             page.call(
                 "Emulation.setEmulatedMedia", media=media, features=[{"name": "prefers-color-scheme", "value": scheme}]

@@ -67,6 +67,7 @@ def test_the_page_declares_every_family():
     assert {name.partition(".")[0] for name in DECLARED} == families
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_a_body_of_installed_kinds_on_two_ranks(site, folder):

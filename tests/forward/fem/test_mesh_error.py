@@ -228,6 +228,7 @@ def test_regions_inclusions_and_random_fields_are_those_of_the_body(tmp_path):
     assert np.abs(found[1] / found[0] - 1).max() > 0.01
 
 
+@pytest.mark.slow
 def test_data_of_a_specimen_have_errors():
     spec = Specimen.model_validate(
         {

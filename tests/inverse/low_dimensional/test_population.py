@@ -121,6 +121,7 @@ def test_the_mean_of_a_population_of_known_specimens_is_theirs():
     assert fit.std.mean() == pytest.approx(truth.std(ddof=1), rel=0.1)
 
 
+@pytest.mark.slow
 def test_covariates_move_the_mean_as_a_regression_says():
     """Known specimens around a line in a grade: slope, its error, what is left, and a new specimen of a grade."""
     rng = np.random.default_rng(4)

@@ -263,6 +263,7 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
     assert page.count("residual over its error") == 1
 
 
+@pytest.mark.slow
 def test_forces_alone_are_data_enough(folder):
     study = load(folder / "few.toml")
     data, forces = study.measurements[0], study.measurements[0].subset(study.measurements[0].axes >= 3)
@@ -316,6 +317,7 @@ def test_forces_lie_nowhere_in_comparisons_as_in_inversions(folder, monkeypatch)
     np.testing.assert_allclose(*rows)
 
 
+@pytest.mark.slow
 def test_forces_stand_beside_points_of_uncertain_registration(folder):
     """A motion of the scan moves points, not forces: these keep errors of their own."""
     uncertain = '["data"]\nregistration = { kind = "given", rotation_std = 2.0, translation_std = 1e-3 }'

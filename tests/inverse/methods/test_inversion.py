@@ -559,6 +559,7 @@ def whole_field(folder):
 IDLE = "{} groups of ranks were started for {} task"
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_an_interrupted_field_keeps_its_solves(folder, whole_field, monkeypatch):
     """States, products with the Hessian, finer meshes: nothing is computed twice, and the result is the same.
@@ -579,6 +580,7 @@ def test_an_interrupted_field_keeps_its_solves(folder, whole_field, monkeypatch)
     assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_fewer_data_sets_than_ranks(folder):
     done = run_script(3, WITHOUT_REPORT, "run", folder / "made.toml", "--out", folder / "made-three", "--quiet")

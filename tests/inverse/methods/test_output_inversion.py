@@ -331,6 +331,7 @@ def test_errors_of_data():
         MeasuredOutputs(**given, noise={"relative": 0.1}).with_errors(found)
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_chains_by_gradients_on_several_ranks(tmp_path):
     """The numbers of one rank; where a rank is killed within them all end, and the same command finds them again."""

@@ -312,6 +312,7 @@ def specimens(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_other_loads_and_places_of_a_specimen(specimens):
     """What is predicted is what the model gives at the posterior's points; the mesh is estimated."""
@@ -372,6 +373,7 @@ def asked(study, *changes):
     return [*words, *(word for change in changes for word in ("--set", change)), "--out"]
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_predictions_of_a_field_do_not_depend_on_groups_nor_kills(specimens, tmp_path):

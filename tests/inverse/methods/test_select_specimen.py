@@ -273,6 +273,7 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     assert any(text in one.text for one in doubts_of_selection(blind, inputs, None))
 
 
+@pytest.mark.slow
 def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatch):
     """And what they correct is said."""
     alive, made, before = weakref.WeakSet(), [], []

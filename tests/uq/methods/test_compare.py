@@ -92,6 +92,7 @@ def test_plain_monte_carlo_errs_as_theory_says(compared):
     assert (np.abs(plain_samples(plain, "std") / plain["budget"] - 1) < 0.6).all()
 
 
+@pytest.mark.slow
 def test_rates(compared):
     rates = {name: compared.sel(estimator=name, output="f") for name in compared["estimator"].to_numpy()}
     for estimated in ("mean", "std"):

@@ -271,7 +271,7 @@ def test_failures_of_any_model_are_recorded():
         Multifidelity(samples=60, cheap=cheap(0.05)).run(INPUTS, team(FunctionModel(never, ("a", "b"), ("f", "g"))))
 
 
-@pytest.mark.parametrize(("fails", "bends"), [("cheap", 1), ("own", 1), ("own", 2)])
+@pytest.mark.parametrize(("fails", "bends"), [("cheap", 1), pytest.param("own", 1, marks=pytest.mark.slow), ("own", 2)])
 def test_where_a_model_fails_the_others_cause_no_bias(fails, bends):
     """A cheap model may fail anywhere; where the study's does, estimates are those of the points where it does not."""
 

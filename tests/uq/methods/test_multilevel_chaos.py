@@ -271,6 +271,7 @@ def test_a_chaos_prediction_saves_corrections(beam):
     assert corrections[1] < 0.8 * corrections[0]
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_ranks_and_restarts_change_no_bit(tmp_path):

@@ -268,6 +268,7 @@ def test_what_depends_on_a_fixed_parameter_follows_it(page, tmp_path):
     assert page.run(outside.replace("3.5e4", "4.5e4")) == 0
 
 
+@pytest.mark.slow
 def test_many_parameters_have_sliders_the_most_important_first(page, tmp_path):
     d = 40
     inputs = Inputs({f"material.c{i}": Normal(mean=1.0, std=0.1) for i in range(d)})

@@ -357,6 +357,7 @@ number = 3
 """
 
 
+@pytest.mark.slow
 def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch, looked_at):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "curves", raising=False)

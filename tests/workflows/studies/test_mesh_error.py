@@ -134,6 +134,7 @@ def test_comparisons_with_one_finer_mesh_end_in_words(tmp_path, capsys):
     assert re.search(r"[+−]\d\S* +– +–", line), line
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_the_same_bits_on_any_number_of_ranks_and_after_a_kill(tmp_path):

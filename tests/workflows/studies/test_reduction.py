@@ -288,6 +288,7 @@ def test_on_ranks_it_is_the_same_model(folder):
     assert (folder / "model.npz").read_bytes() == (out / "reduced.npz").read_bytes(), (one.about, other.about)
 
 
+@pytest.mark.slow
 def test_after_a_kill_it_is_the_same_model(folder, tmp_path):
     """Ended while the snapshots of a later round are solved."""
     command = [

@@ -289,6 +289,7 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
     assert "The mesh was refined" in page
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_tetrahedra_are_refined_where_errors_arise(tmp_path):
     settings = [*COARSE, "accuracy.tolerance=0.02", "model.body.cell=tetrahedron", "model.body.size=[0.2, 0.1, 0.1]"]
@@ -309,6 +310,7 @@ def test_tetrahedra_are_refined_where_errors_arise(tmp_path):
     assert_same_bits(tmp_path / "whole" / "out", other)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_the_same_bits_on_any_number_of_ranks_and_after_kills(tmp_path):
