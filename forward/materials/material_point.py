@@ -328,14 +328,14 @@ def reading(
             if free:
                 y = _lateral(lambda y: forms.balance([x, z, y, *constants_]), y)
             here = [x, z, y, *constants_]
-            W, by_x, by_z = forms.first(here)
+            W, by_x, by_z, *rest = (forms.whole if derivatives else forms.first)(here)
             a, b, slope = shares(x, z, y)
             stress = a * by_x + b * by_z
             # Beyond the limit of an energy, its derivatives may still be finite.
             stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
             if not derivatives:
                 return stress, np.zeros((0, *shape))
-            mixed = np.array([np.broadcast_to(one, shape) for one in forms.mixed(here)])
+            mixed = np.array([np.broadcast_to(one, shape) for one in rest])
             (*of_x, by_xy), (*of_z, by_zy), (*of_y, by_yy) = np.split(mixed, 3)
             found = [a * one + b * other for one, other in zip(of_x, of_z, strict=True)]
             if free:
@@ -352,7 +352,7 @@ class _Forms(NamedTuple):
 
     first: Tape  # W, ∂W/∂x and ∂W/∂z
     balance: Tape  # ∂W/∂y and ∂²W/∂y²
-    mixed: Tape  # derivatives of ∂W/∂x by all θ and y, then of ∂W/∂z and of ∂W/∂y
+    whole: Tape  # the first, then the derivatives of ∂W/∂x by all θ and y, then of ∂W/∂z and of ∂W/∂y
 
 
 @cache
@@ -373,7 +373,8 @@ def _forms(energy: Energy, mode: Mode, names: tuple[str, ...], fibres: tuple[Fib
     slopes = [graph.tangent([W], way)[0] for way in range(3)]
     along = [graph.tangent(slopes, way) for way in (*range(3, graph.inputs), 2)]
     mixed = [row[way] for way in range(3) for row in along]
-    return _Forms(graph.tape([W, *slopes[:2]]), graph.tape([slopes[2], mixed[-1]]), graph.tape(mixed))
+    first = [W, *slopes[:2]]
+    return _Forms(graph.tape(first), graph.tape([slopes[2], mixed[-1]]), graph.tape([*first, *mixed]))
 
 
 def _operators(graph: Graph) -> SimpleNamespace:
