@@ -32,6 +32,9 @@ from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 Found = TypeVar("Found")
 Pair = tuple[FloatArray, FloatArray]
 MOSTLY = 0.5  # of the variance of an expansion: beyond all samples it is a guess
+FALL = (
+    2**-1.5
+)  # of errors with twice the points, of even ones and smooth functions: A. B. Owen, Ann. Stat. 25 (1997) 1541
 LITTLE = 1e-3  # of the standard deviation: errors of means that may be claimed too large
 
 
@@ -239,22 +242,15 @@ class Scrambles(Sets):
 
         Also what a control hides (m,): the part of the errors that is in no scatter.
         """
-        centre, ok = self._centre, self.ok[:, :each]
-        controls, expected = known or (None, None)
-        some = ok.any(axis=1)
-        deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
-        products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
-        means = products[:, some] / ok.sum(axis=1)[some, None]
-        found = estimate_from_replicates(means, centre.outputs, expected, self._coefficient)
-        values, controlled = self.outputs[:, :each][ok], self._left(found, each, controls)
+        found, ok = self._by_scatter(each, known), self.ok[:, :each]
+        values, controlled = self.outputs[:, :each][ok], self._left(found, each, known and known[0])
         plain = values - values.mean(axis=0)
-        found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(some.sum()))
+        found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(ok.any(axis=1).sum()))
         tails = counted(found, self._inputs, values, controlled)
         if controlled is None or (self._control is not None and self._control.linear):
             return tails, np.zeros_like(tails.std)
         first, moved = controlled[0] - controlled[0].mean(axis=0), influences(*controlled)
-        assert known is not None
-        wrong_mean, wrong_std = self._wrong(each, known, found, first)
+        wrong_mean, wrong_std = self._wrong(each)
         of_mean, of_std = self._unseen(each, first)
         of_mean = np.hypot(of_mean, wrong_mean)
         further = np.hypot(np.maximum(of_std, of_influences(found, self._inputs, moved)), wrong_std)
@@ -269,6 +265,16 @@ class Scrambles(Sets):
             std_error=np.where(found.second_coefficient == 0, tails.std_error, known_error),
         )
         return claimed, hidden
+
+    def _by_scatter(self, each: int, known: tuple[Pair, Pair] | None) -> Estimates:
+        """Estimate the moments of the outputs with the errors that the scatter of the scrambles shows."""
+        centre, ok = self._centre, self.ok[:, :each]
+        controls, expected = known or (None, None)
+        some = ok.any(axis=1)
+        deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
+        products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
+        means = products[:, some] / ok.sum(axis=1)[some, None]
+        return estimate_from_replicates(means, centre.outputs, expected, self._coefficient)
 
     def _unseen(self, each: int, left: FloatArray) -> Pair:
         """Errors (m,) of mean and standard deviation from regions without samples, where a polynomial is the control.
@@ -298,12 +304,15 @@ class Scrambles(Sets):
         points = self.points[:, :each][self.ok[:, :each]]
         return points if self._fitted is None else np.concatenate([points, self._fitted.trial.points])
 
-    def _wrong(self, each: int, known: tuple[Pair, Pair], found: Estimates, left: FloatArray) -> Pair:
+    @_once
+    def _wrong(self, each: int) -> Pair:
         """Errors (m,) of mean and standard deviation, as differences of the control and its repeated fits show.
 
-        The control leaves `left` (n, m) of samples.
+        What half of the points have shown of them falls no faster than errors of even points at their best.
         """
-        ok = self.ok[:, :each, None]
+        known, ok = self._controls(each), self.ok[:, :each, None]
+        assert known is not None
+        found = self._by_scatter(each, known)
         some, count = ok.any(axis=(1, 2)), np.maximum(ok.sum(axis=1), 1)
 
         def means(of: tuple[Pair, Pair]) -> tuple[FloatArray, FloatArray]:
@@ -320,9 +329,16 @@ class Scrambles(Sets):
         middle = found.mean - self._centre.outputs
         sizes, norm = None, np.zeros_like(found.std)
         if not tails_of(self._inputs).any():  # in tails what no sample shows is in other claims, and has no limit
+            controlled = self._left(found, each, known[0])
+            assert controlled is not None
+            left = controlled[0] - controlled[0].mean(axis=0)
             sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
         of_std = ratio(wrong(second - 2 * middle * first, sizes), 2 * found.std)
-        return np.hypot(wrong(first, sizes), norm / np.sqrt(len(left))), np.hypot(of_std, norm)
+        of_mean, of_std = np.hypot(wrong(first, sizes), norm / np.sqrt(ok.sum())), np.hypot(of_std, norm)
+        if self.answered(each // 2) < self.needed:
+            return of_mean, of_std
+        before = self._wrong(each // 2)
+        return np.maximum(of_mean, FALL * before[0]), np.maximum(of_std, FALL * before[1])
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""

@@ -60,11 +60,20 @@ def test_what_points_do_not_show_is_claimed():
     assert trial.scaled(np.linspace(0, 1, 101)[:, None], np.full((101, 1), left))[1] == 0
 
 
-@pytest.mark.parametrize("name", ["sin(2.3 z + 0.3)", "sin(2 g), skewed", "waves between normals", "1/(1.03 - abc)"])
-def test_what_is_said_to_be_kept_is(name):
-    """With the first seeds errors of all of these were 3 to 2,000 times the tolerance, and "kept"."""
-    case = next(case for case in promises.ONES if case.name == name)
-    found = promises.run(case, 0, 1e-2, gradients=False)
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("sin(2.3 z + 0.3)", 0),
+        ("sin(2 g), skewed", 0),
+        ("waves between normals", 0),
+        ("1/(1.03 - abc)", 0),
+        ("1/(1.05 - abcd)", 2),  # what 16 samples of the corner had shown, 32 and 64 did not
+    ],
+)
+def test_what_is_said_to_be_kept_is(name, seed):
+    """Errors of all of these were 3 to 2,000 times the tolerance, and "kept"."""
+    case = next(case for case in (*promises.ONES, *promises.OTHERS) if case.name == name)
+    found = promises.run(case, seed, 1e-2, gradients=False)
     assert found.right or not found.kept
 
 
