@@ -47,6 +47,9 @@ def done(name, *changes):
 brain = done("brain", "method.samples=32", "method.starts=1", "method.other_noises={}", "method.subsets={}")
 brain[["probability", "stacking"]].to_dataframe().round(3)
 
+# %%
+plots.selection.probability_bars(brain).figure
+
 # %% [markdown]
 # ## What is a region like that was not tested?
 
@@ -73,7 +76,7 @@ body = done(
 body[["mean", "std", "within", "between"]].to_dataframe()
 
 # %%
-plots.selection.parts_of_variance(body)
+plots.selection.parts_of_variance(body).figure
 
 # %% [markdown]
 # ## Which test next?
