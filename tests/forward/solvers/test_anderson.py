@@ -36,11 +36,11 @@ def by(A):
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("spread", [0.1, 0.2, 0.3])
 def test_block_galerkin_solves_to_its_tolerance(k, spread):
-    for _ in range(8):
+    for _ in range(4):
         A, inverse = matrices(spread)
         right = RNG.standard_normal((k, N)) * np.logspace(0, 6, k)[:, None]
         exact = np.linalg.solve(A, right.T).T
-        for tolerance in (1e-4, 1e-8, 1e-11):
+        for tolerance in (1e-4, 1e-9):
             x = block_galerkin(by(A), by(inverse), right, same, sizes, tolerance, 30)
             assert (sizes(x - exact) <= tolerance * sizes(exact)).all()
 
