@@ -160,12 +160,12 @@ def block_galerkin(
         if searched:
             overlap = total(images[:searched] @ p.T)
             p -= (inverse @ overlap).T @ directions[:searched]
-        before, lengths = lengths, size(p)
+        last, reached, before = reached, x + p, lengths
+        lengths, moved, whole = size(np.concatenate([p, reached - last, reached])).reshape(3, -1)
         if not np.isfinite(lengths).all():
             return None
-        before_reached, reached = reached, x + p
-        earlier, missed = missed, size(reached - before_reached) / np.maximum(before, np.finfo(float).tiny)
-        unfinished = MARGIN * lengths * np.maximum(missed, earlier) > tolerance * size(reached)
+        earlier, missed = missed, moved / np.maximum(before, np.finfo(float).tiny)
+        unfinished = MARGIN * lengths * np.maximum(missed, earlier) > tolerance * whole
         if not unfinished.any():
             return np.asarray(reached)
         search(p[unfinished])

@@ -32,9 +32,7 @@ from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 Found = TypeVar("Found")
 Pair = tuple[FloatArray, FloatArray]
 MOSTLY = 0.5  # of the variance of an expansion: beyond all samples it is a guess
-FALL = (
-    2**-1.5
-)  # of errors with twice the points, of even ones and smooth functions: A. B. Owen, Ann. Stat. 25 (1997) 1541
+FALL = 2**-1.5  # what errors of even points fall by at best where these are twice as many
 LITTLE = 1e-3  # of the standard deviation: errors of means that may be claimed too large
 
 
@@ -308,11 +306,14 @@ class Scrambles(Sets):
     def _wrong(self, each: int) -> Pair:
         """Errors (m,) of mean and standard deviation, as differences of the control and its repeated fits show.
 
-        What half of the points have shown of them falls no faster than errors of even points at their best.
+        What half of the points have shown of them falls no faster than errors of even points of smooth functions, in
+        proportion to n^(−3/2): A. B. Owen, Ann. Stat. 25 (1997) 1541–1562.
         """
         known, ok = self._controls(each), self.ok[:, :each, None]
-        assert known is not None
         found = self._by_scatter(each, known)
+        controlled = self.controlled(found, each)
+        assert known is not None
+        assert controlled is not None
         some, count = ok.any(axis=(1, 2)), np.maximum(ok.sum(axis=1), 1)
 
         def means(of: tuple[Pair, Pair]) -> tuple[FloatArray, FloatArray]:
@@ -329,8 +330,6 @@ class Scrambles(Sets):
         middle = found.mean - self._centre.outputs
         sizes, norm = None, np.zeros_like(found.std)
         if not tails_of(self._inputs).any():  # in tails what no sample shows is in other claims, and has no limit
-            controlled = self._left(found, each, known[0])
-            assert controlled is not None
             left = controlled[0] - controlled[0].mean(axis=0)
             sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
         of_std = ratio(wrong(second - 2 * middle * first, sizes), 2 * found.std)
@@ -351,6 +350,7 @@ class Scrambles(Sets):
             case polynomials:
                 return drawn_beyond(self._inputs, polynomials.values, control.outputs, points, tails)
 
+    @_once
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
         return None if self._control is None else self._mixed(self._control, self._held, each)

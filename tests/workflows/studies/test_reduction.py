@@ -70,7 +70,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def direct(folder):
+def body(folder):
     """Results of the body itself."""
     (folder / "direct.toml").write_text(BODY + '[method]\nkind = "quasi-monte-carlo"\nsamples = 32\nscrambles = 4\n')
     assert main(["run", str(folder / "direct.toml"), "--out", str(folder / "direct"), "--quiet", "--no-report"]) == 0
@@ -117,10 +117,10 @@ def test_the_command_makes_a_model_with_known_errors(folder, looked_at, chromium
     assert np.abs(found.reduced_error - found.reduced_estimate).max() < np.abs(found.reduced_error).max()
 
 
-def test_a_study_of_it_gives_what_the_body_gives(folder, direct, looked_at, chromium):
+def test_a_study_of_it_gives_what_the_body_gives(folder, body, looked_at, chromium):
     (folder / "used.toml").write_text(USED.format(upper=1200, more=""))
     assert main(["run", str(folder / "used.toml"), "--out", str(folder / "used"), "--quiet"]) == 0
-    found, body = xr.load_dataset(folder / "used" / "results.nc"), direct
+    found = xr.load_dataset(folder / "used" / "results.nc")
     for name in ("mean", "std"):
         np.testing.assert_allclose(found[name], body[name], rtol=5e-3)
     np.testing.assert_allclose(found.field_mean, body.field_mean, atol=5e-3 * float(np.abs(body.field_mean).max()))
@@ -190,7 +190,7 @@ def test_the_full_model_is_asked_above_a_tolerance(folder):
     assert json.loads((folder / "checked" / "summary.json").read_text())["work"]["factorisations"] > 0
 
 
-def test_it_is_a_cheap_model_beside_the_body(folder, direct):
+def test_it_is_a_cheap_model_beside_the_body(folder, body):
     method = """
 [method]
 kind = "multifidelity"
@@ -206,11 +206,11 @@ cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "re
     assert [text.split(" failed")[0] for text in errors] == [
         "2 of 3 estimates of the error of the mesh"
     ]  # of two cells
-    found, body = xr.load_dataset(folder / "several" / "results.nc"), direct
+    found = xr.load_dataset(folder / "several" / "results.nc")
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 
 
-def test_the_model_and_its_nested_larger_one_are_cheap_models(folder, direct):
+def test_the_model_and_its_nested_larger_one_are_cheap_models(folder, body):
     few = [*SIZES[:2], *(part for one in ("unseen=0", "rounds=0", "modes=2") for part in ("--set", f"method.{one}"))]
     reduced = ["reduce", folder / "body.toml", *few, "--out", folder / "few", "--output", folder / "few.npz"]
     assert main([*map(str, reduced), "--quiet", "--no-report"]) == 0
@@ -225,7 +225,7 @@ cheap = [{ kind = "reduced", file = "few.npz" }, { kind = "reduced", file = "few
 """
     (folder / "both.toml").write_text(BODY + method)
     assert main(["run", str(folder / "both.toml"), "--out", str(folder / "both"), "--quiet", "--no-report"]) == 0
-    found, body = xr.load_dataset(folder / "both" / "results.nc"), direct
+    found = xr.load_dataset(folder / "both" / "results.nc")
     assert list(found["fidelity"].values) == ["model", "reduced", "larger reduced"]
     assert 0 < float(found["fidelity_cost"][1]) < float(found["fidelity_cost"][2]) == 0.5
     left = 1 - found["fidelity_correlation"].values[:, 1:] ** 2
