@@ -108,12 +108,14 @@ system:
 	fi
 
 # What runs studies, and what tests, documentation and notebooks need besides. A constraint file given by environment
-# holds for build environments too. Files of packages are compiled when they are first used, which most never are.
+# holds for build environments too. Of files of packages those are compiled that a study imports, which most are not:
+# where the environment forbids it later (PYTHONDONTWRITEBYTECODE), each start would take two to three times as long.
 $(RUNS): pyproject.toml constraints.txt | system
 	@echo "installing Python packages into .venv"
 	@$(SYSTEM_PYTHON) -m venv --system-site-packages .venv
 	@$(INSTALL) .
-	@$(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
+	@PYTHONDONTWRITEBYTECODE= $(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, matplotlib.pyplot, numpy, scipy.stats, xarray'
+	@$(PYTHON) -m compileall -q forward inverse tissuq uq workflows
 	@touch $@
 
 $(READY): pyproject.toml constraints.txt | $(if $(wildcard $(READY)),,$(RUNS)) graphics

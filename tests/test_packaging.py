@@ -131,7 +131,7 @@ def test_containers_take_the_packages_and_versions_of_the_makefile():
         assert taken == variable("PACKAGES")
         pip = next(line for line in joined.replace("&&", "\n").splitlines() if "pip install" in line).split()
         assert pip[0] == f"PIP_CONSTRAINT=/src/{install[0].partition('=')[2]}"
-        assert "--no-compile" in pip
+        assert "--no-compile" not in pip  # whoever runs it may not write there, and each start would compile all again
     assert set(re.search(r"apt-get install (.*)", PAGE)[1].split()) == set(variable("PACKAGES"))
 
 
