@@ -55,6 +55,7 @@ NAMES = (
     "gains",
     "blocks",
     "meshes_of_fields",
+    "facets",
     "oddities",
     "held_out",
     "others",

@@ -362,7 +362,8 @@ class CombinedSolution:
             factors[some] = after[some] / before[some]
         shifts = None if found.shifts is None else times(self.S, found.shifts)
         doubts = None if found.doubts is None else times(abs(self.S), found.doubts)
-        return replace(found, outputs=factors, shifts=shifts, doubts=doubts)
+        hidden = None if found.hidden is None else times(self.S, found.hidden)
+        return replace(found, outputs=factors, shifts=shifts, doubts=doubts, hidden=hidden)
 
     def saturations(self, spare: float) -> list[Saturation | None]:
         """Calibrate each."""
@@ -386,6 +387,7 @@ class CombinedSolution:
             all(one.measured for one in known),
             all_of([0.0 if one is None else one.shifts for one in parts], 0.0),
             all_of([0.0 if one is None else one.doubts for one in parts], math.nan),
+            all_of([None if one is None else one.hidden for one in parts], 0.0),
         )
 
 

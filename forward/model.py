@@ -213,6 +213,9 @@ class Saturation:
     doubts
         How far the calibrated errors (m,) may be wrong at the solution where this was found; None where that is not
         known.
+    hidden
+        What flat facets hide of a curved surface, in the outputs (m,) there, which richer elements do not see; None
+        where that is nothing, NaN where it is not known.
     """
 
     outputs: FloatArray
@@ -221,6 +224,7 @@ class Saturation:
     measured: bool = True
     shifts: FloatArray | None = None
     doubts: FloatArray | None = None
+    hidden: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,9 @@ class Calibrating(Protocol[S_contra]):
     def calibrated(self, solution: S_contra) -> Saturation | None:
         """Calibrate those at a solution; None where that takes too much."""
 
+    def hidden(self, solution: S_contra) -> FloatArray | None:
+        """Return what flat facets hide of a curved surface in the outputs (m,); None where they hide nothing."""
+
 
 def not_estimated(what: str) -> SolveError:
     """Return the refusal of an estimate of the error of the mesh."""

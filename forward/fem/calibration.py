@@ -24,15 +24,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from forward.bodies.facets import lifted
+from forward.bodies.mesh import contents
+from forward.bodies.tetrahedra import MeshInMemory
 from forward.fem.body import DiscreteBody
 from forward.fem.dolfinx import spaces
+from forward.fem.dolfinx.meshes import on_first
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.layout import sorted_by_place
 from forward.fem.mesh_error_cost import Finer, finer
 from forward.fem.solution import FiniteElementSolution
 from forward.loaded import LoadedBody
-from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
+from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, Saturation, SolveError
+from forward.observables.observable import Functional
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders
 USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
@@ -116,6 +121,14 @@ def saturation(seen: FloatArray, found: Limit, of_state: float) -> Saturation:
 Body = DiscreteBody[FiniteElementSolution]
 
 
+def _once(model: Body, spec: LoadedBody, parameters: tuple[str, ...]) -> Body:
+    """Return a body for one solution: not tested for stability, which is one factorisation less, nor is its factor."""
+    formulation = "mixed" if spec.mixed else "displacement"
+    solver = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
+    changes = {"solver": spec.solver.model_copy(update=solver), "formulation": formulation, "adapt": None}
+    return type(model)(spec.model_copy(update=changes), model.equations.comm, parameters)
+
+
 class FinerMesh:
     """A body on a finer mesh, made when it is first solved on.
 
@@ -134,19 +147,55 @@ class FinerMesh:
     def _tested(self) -> Body:
         """The body there."""
         assert self._finer is not None
-        return self._built(self._finer.spec)
+        return type(self._model)(self._finer.spec, self._model.equations.comm, self._names)
 
     @cached_property
     def _untested(self) -> Body:
-        """The same for one solution: not tested for stability, which is one factorisation less, nor is its factor."""
+        """The same for one solution."""
         assert self._finer is not None
-        spec = self._finer.spec
-        once = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
-        return self._built(spec.model_copy(update={"solver": spec.solver.model_copy(update=once)}))
+        return _once(self._model, self._finer.spec, self._names)
 
-    def _built(self, spec: LoadedBody) -> Body:
-        names = tuple(self._model.parameters[i] for i in self._scalars)
-        return type(self._model)(spec, self._model.equations.comm, names)
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return tuple(self._model.parameters[i] for i in self._scalars)
+
+    @cached_property
+    def _lifted(self) -> tuple[Body, list[Functional]] | None:
+        """The body with its surface moved by what its facets hide; None where they hide nothing.
+
+        Outputs at points that do not lie in it are those at the nearest places, which lie in both.
+        """
+        model, spec, comm = self._model, self._model.spec, self._model.equations.comm
+        file = spec.body
+        if file.kind != "mesh":
+            return None
+        mesh = on_first(comm, lambda: lifted(file.load()))
+        held = comm.bcast(None if mesh is None else contents(mesh, ""))
+        if held is None:
+            return None
+        body = MeshInMemory.of(mesh, held, file)
+        outputs = comm.bcast(None if mesh is None else tuple(output.within(body) for output in spec.outputs))
+        there = _once(model, spec.model_copy(update={"body": body, "outputs": outputs}), self._names)
+        return there, [output.functional(model.equations) for output in outputs]
+
+    def hidden(self, solution: FiniteElementSolution) -> FloatArray | None:
+        """Return what flat facets hide of a curved surface in the outputs (m,); collective.
+
+        By one solution of the body with its surface moved (`forward.bodies.facets`). None where facets hide nothing;
+        NaN where there is no such solution, or where coefficients of random fields are not zero.
+        """
+        unknown = np.full(len(solution.outputs), np.nan)
+        try:
+            if self._lifted is None:
+                return None
+            if np.delete(solution.parameters, self._scalars).any():
+                return unknown
+            other, here = self._lifted
+            moved = other.solve(solution.parameters[self._scalars], Guess(solution.state))
+        except (ModelError, SolveError):
+            return unknown
+        solution.visit()
+        return np.asarray(moved.outputs - [output.value() for output in here])
 
     def calibrated(self, solution: FiniteElementSolution) -> Saturation | None:
         """Calibrate estimates by the finer mesh at the parameters of a solution; collective.

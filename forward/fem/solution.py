@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -296,11 +297,15 @@ class FiniteElementSolution:
         """
         if self._model.rows is not None:
             return self._by_degrees()
+        if self._model.spec.unestimated_with:
+            raise not_estimated(self._model.spec.unestimated_with)
+        finer = finer or self._model.finer_mesh(spare)
+        return replace(self._calibrated(spare, finer), hidden=finer.hidden(self))
+
+    def _calibrated(self, spare: float, finer: Calibrating[Self]) -> Saturation:
         spec = self._model.spec
-        if spec.unestimated_with:
-            raise not_estimated(spec.unestimated_with)
         with suppress(SolveError):
-            found: Saturation | None = (finer or self._model.finer_mesh(spare)).calibrated(self)
+            found = finer.calibrated(self)
             if found is not None:
                 return found
         if richer(spec) > allowance(spec, spare):

@@ -28,8 +28,8 @@ class PointDisplacement(Observable):
 
         (mine,), (nodes,), (weights,), (distance,) = spaces.point_rows(equations.space, np.array([self.at]))
         spec = equations.spec.body
-        # Points outside boxes and blocks were refused before; the mesh may cut their curved faces.
-        most = tolerance(spec) if spec.kind == "mesh" else max(tolerance(spec), spec.longest_edge)
+        # Elsewhere points outside were refused before; the mesh may cut curved faces.
+        most = tolerance(spec) if spec.kind == "mesh" and spec.file else max(tolerance(spec), spec.longest_edge)
         if distance > most:
             where = ", ".join(f"{x:g}" for x in self.at)
             raise ModelError(

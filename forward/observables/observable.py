@@ -19,10 +19,12 @@ body. UFL and FEniCSx are imported inside the methods, so that a study can be ch
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
+import numpy as np
 from pydantic import Field
 
+from forward.bodies.geometry import Body
 from forward.model import FloatArray
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
@@ -78,6 +80,11 @@ class Observable(Settings):
         there.
         """
         return self.functional(equations)
+
+    def within(self, body: Body) -> Self:
+        """Return the same output in a body whose surface lies a little elsewhere: at a point, at the nearest place."""
+        at = vars(self).get("at")
+        return self if at is None else self.model_copy(update={"at": tuple(body.nearest(np.array([at]))[0].tolist())})
 
 
 OUTPUTS = Kinds(

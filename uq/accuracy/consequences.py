@@ -46,12 +46,15 @@ class Consequence:
     missed
         The variable (…), the part ρ of an output's standard deviation that nothing tells, that deviation → the error
         (…) that is open.
+    in_units
+        Whether it is a value that the output may have.
     """
 
     name: str
     by_output: int
     of: Callable[[FloatArray, int], FloatArray]
     missed: Callable[[FloatArray, float, float], FloatArray]
+    in_units: bool = False
 
 
 def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Iterator[Consequence]:
@@ -64,7 +67,11 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
     """
     if has(dataset, "quantiles", "quantile", "output"):
         probabilities = dataset["quantile"].to_numpy()
-        yield Consequence("quantiles", 1, lambda of, _: np.quantile(of, probabilities, axis=0).T, _in_units)
+
+        def quantiles(of: FloatArray, _: int) -> FloatArray:
+            return np.asarray(np.quantile(of, probabilities, axis=0).T)
+
+        yield Consequence("quantiles", 1, quantiles, _in_units, in_units=True)
     if has(dataset, "density_edge", "output", "edge"):
         edges = dataset["density_edge"].to_numpy()
 
@@ -77,7 +84,7 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
             fitted = np.linalg.lstsq(weights * powers, weights * shifts, rcond=None)[0]
             return np.asarray(edges[i] + (powers @ fitted).T)
 
-        yield Consequence("density_edge", 0, moved, _in_units)
+        yield Consequence("density_edge", 0, moved, _in_units, in_units=True)
     if not inputs.independent:
         return
     last = {**dict.fromkeys(GROUPED, ("group",)), PAIRED: ("parameter", "partner")}

@@ -25,6 +25,7 @@ ROUGH = 0.5  # of the error of the mesh: its doubt, above which its sign is all 
 EXACT = 1e-9  # of a value: errors that are no more than that are rounding
 LOOSE = 1e-8  # tolerance of the solver from which its error may be as large as one of a mesh
 VISIBLE = 1e-3  # of a mean: doubts below do no harm
+OF_FACETS = 1.25  # times what facets are estimated to hide, which it may be
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 TINY = 1e-300
 Names = NDArray[Any]  # of the outputs (m,)
@@ -80,6 +81,20 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[
         yield Finding("mesh-decides", "note", about=tuple(listed))
 
 
+def of_facets(names: Names, outputs: FloatArray, hidden: FloatArray) -> Iterator[Finding]:
+    """Say what flat facets of a curved surface hide in outputs (m,), where anything does."""
+    size = np.maximum(np.abs(outputs), TINY)
+    if np.isnan(hidden).any():
+        yield Finding("facets-unknown", "warning")
+    some = np.abs(hidden) > VISIBLE * size
+    if some.any():
+        listed = [
+            Entry(str(name), f" {min(share, MANY):.1%}", share)
+            for name, share in zip(names[some], np.abs(hidden)[some] / size[some], strict=True)
+        ]
+        yield Finding("facets", "warning", about=tuple(listed))
+
+
 def failed(why: str) -> Finding:
     """Say that the error of the mesh was to be estimated and is not known."""
     return Finding("mesh-unknown", "error", {"why": why})
@@ -88,7 +103,8 @@ def failed(why: str) -> Finding:
 def _unexplained(names: Names, dataset: xr.Dataset, counts: NDArray[np.bool_]) -> Iterator[Finding]:
     """Find errors of the mesh that vary with the parameters as no expansion says."""
     mean = estimate_of(dataset, "mean")
-    rough = mean.doubt > ROUGH * np.abs(mean.mesh)
+    hidden = OF_FACETS * np.abs(np.nan_to_num(dataset["mesh_error_facets"].to_numpy()))
+    rough = mean.doubt - hidden > ROUGH * np.abs(mean.mesh)
     visible = mean.doubt > np.maximum(mean.error, VISIBLE * np.abs(mean.value))
     contradicted = dataset["mesh_error_unknown"].to_numpy() > ROUGH
     unclear = rough & visible & counts & ~contradicted

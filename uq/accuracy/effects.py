@@ -18,7 +18,7 @@ import numpy as np
 from forward.findings import Finding
 from forward.model import FloatArray
 from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
-from uq.accuracy.doubts import FEWEST_ANSWERS, Told, doubts
+from uq.accuracy.doubts import FEWEST_ANSWERS, OF_FACETS, Told, doubts, of_facets
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
 from uq.estimators.estimate import OF_MESH, PARTS, Variables, holds, part, parts_of, with_mesh
 from uq.estimators.moments import ESTIMATES
@@ -96,11 +96,14 @@ def with_mesh_errors(
         "mesh_error_saturation": (("output",), found.saturation),
         "mesh_error_shift": (("output",), found.shifts),
         "mesh_error_unknown": (("output",), unknown),
+        "mesh_error_facets": (("output",), found.hidden),
     }
     if found.fields is not None and len(found.points) >= FEWEST_ANSWERS:
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
     dataset = dataset.assign(variables)
     add(dataset, *doubts(dataset, found.evaluations, told), first=True)
+    if len(found.points):
+        add(dataset, *of_facets(dataset["output"].to_numpy(), found.outputs[0], found.hidden), first=True)
     left_out = [words for name, words in WITHOUT.items() if name in dataset]
     if holds(dataset, "mean", "mesh") and left_out:
         add(dataset, Finding("mesh-error-left-out", "note", {"what": " and of ".join(left_out)}))
@@ -151,6 +154,10 @@ class _Effect:
         What these multiply at the points of the sketch (n, q).
     outputs
         The output there (n,).
+    hidden
+        What flat facets of a curved surface hide at the mean, at most.
+    share
+        The same over the size of the output.
     """
 
     way: Between
@@ -159,6 +166,8 @@ class _Effect:
     unseen: float
     functions: FloatArray
     outputs: FloatArray
+    hidden: float
+    share: float
 
     @classmethod
     def of(cls, inputs: Inputs, centre: Linearisation, found: MeshErrors, drawn: Sketch, output: int) -> _Effect | None:
@@ -172,7 +181,10 @@ class _Effect:
         functions = way.functions(drawn.points, drawn.outputs)
         unseen = float(np.linalg.norm(way.unseen @ errors)) / len(errors)
         covariance = way.scale(errors) * way.covariance
-        return cls(way, way.weights @ errors, covariance, unseen, functions, drawn.outputs[:, output])
+        outputs, hidden = drawn.outputs[:, output], OF_FACETS * abs(float(np.nan_to_num(found.hidden[output])))
+        size = max(abs(float(found.outputs[0, output])), float(outputs.std()))
+        share = hidden / size if size else 0.0
+        return cls(way, way.weights @ errors, covariance, unseen, functions, outputs, hidden, share)
 
     @property
     def errors(self) -> FloatArray:
@@ -225,11 +237,13 @@ def _of_outputs(
     if not all(has(dataset, name, "output") for name in ESTIMATES):
         return variables
     for estimated in ("mean", "std"):
-        error, rest = np.full((2, len(effects)), np.nan)
+        error, rest, hidden = np.full((3, len(effects)), np.nan)
         for i, one in enumerate(effects):
             if one is not None:
-                error[i], rest[i] = one.mean if estimated == "mean" else one.std(float(dataset["std"][i]))
-        variables |= _corrected(dataset, estimated, error, np.hypot(unknown * error, rest), "total")
+                std = float(dataset["std"][i])
+                error[i], rest[i] = one.mean if estimated == "mean" else one.std(std)
+                hidden[i] = one.hidden if estimated == "mean" else one.share * std
+        variables |= _corrected(dataset, estimated, error, np.hypot(unknown * error, rest) + hidden, "total")
     for consequence in consequences(dataset, inputs, drawn.points):
         variables |= _of_consequence(dataset, consequence, effects, unknown)
     return variables
@@ -246,10 +260,11 @@ def _at_centre(
             continue
         at = one.way.functions(centre.point[None, :], centre.outputs[None, :])[0]
         nominal[i] = at @ one.coefficients
-        doubt[i] = np.hypot(unknown[i] * nominal[i], max(one.left(at), one.unseen))
+        doubt[i] = np.hypot(unknown[i] * nominal[i], max(one.left(at), one.unseen)) + one.hidden
         along = one.way.slopes(centre.point, centre.outputs, centre.tangents)
         slopes[i] = along @ one.coefficients
         open_slopes[i] = np.hypot(unknown[i] * slopes[i], [one.left(row) for row in along])
+        open_slopes[i] += one.share * np.abs(centre.tangents[i])
     at_mean = with_mesh(centre.outputs, 0.0, nominal, doubt)
     variables = parts_of(at_mean, "nominal", ("output",), ("mesh", "doubt", "corrected"))
     if has(dataset, "derivative", "output", "parameter"):
@@ -269,6 +284,8 @@ def _of_consequence(
             std = float(one.outputs.std())
             missed = of.missed(stated[i], one.unseen / std if std else 0.0, std)
             doubt[i] = np.hypot(unknown[i] * error[i], np.maximum(rest, missed))
+            if of.in_units:  # shares of a variance stay what they are if all values are so many times as large
+                doubt[i] += np.maximum(one.hidden, one.share * np.abs(stated[i]))
     known = np.isfinite(stated)  # an expansion that explains nothing has no indices
     error, doubt = (np.moveaxis(np.where(known, values, np.nan), 0, of.by_output) for values in (error, doubt))
     return _corrected(dataset, of.name, error, doubt)

@@ -117,6 +117,8 @@ class MeshErrors:
         What is added to the errors (m,) then, at the mean; elsewhere in proportion to the outputs.
     doubts
         How far the errors (m,) may be wrong at the mean; NaN where that is not known.
+    hidden
+        What flat facets hide of a curved surface at the mean (m,), which no estimate sees; NaN where it is not known.
     """
 
     evaluations: Evaluations
@@ -125,6 +127,7 @@ class MeshErrors:
     measured: bool
     shifts: FloatArray
     doubts: FloatArray
+    hidden: FloatArray
 
     @property
     def points(self) -> FloatArray:
@@ -177,7 +180,9 @@ def estimate(
             known = found.saturations[0]
     displaced = float(_factors(known["state"])) * np.vstack(states) if states else None
     measured = bool(known["measured"] == 1)
-    return MeshErrors(merge(parts), displaced, known["factors"], measured, known["shifts"], known["doubts"])
+    of_outputs = (known[name] for name in ("factors", "shifts", "doubts", "hidden"))
+    factors, shifts, doubts, hidden = of_outputs
+    return MeshErrors(merge(parts), displaced, factors, measured, shifts, doubts, hidden)
 
 
 def _factors(saturation: FloatArray) -> FloatArray:

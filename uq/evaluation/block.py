@@ -147,6 +147,7 @@ class _MeshErrors:
             self.errors[i] = found.outputs
         if self.saturations is None or self._spare is None:
             return
+        self.saturations[i]["hidden"] = 0.0
         try:
             factors = solution.saturation(self._spare)
         except SolveError:
@@ -156,6 +157,8 @@ class _MeshErrors:
             row["factors"], row["state"], row["measured"] = factors.outputs, factors.state, factors.measured
             row["shifts"] = 0.0 if factors.shifts is None else factors.shifts
             row["doubts"] = np.nan if factors.doubts is None else factors.doubts
+            if factors.hidden is not None:
+                row["hidden"] = factors.hidden
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:

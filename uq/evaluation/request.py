@@ -48,10 +48,11 @@ ROWS = (
 def calibration(outputs: int) -> np.dtype[Any]:
     """Names and sizes of what calibrates errors of the mesh.
 
-    `factors` of the errors of outputs (m,); `shifts`, what is added then; `doubts`, how far that may be wrong; the
-    factor of the `state`; and whether they were `measured` here (1) or are typical ones (0).
+    `factors` of the errors of outputs (m,); `shifts`, what is added then; `doubts`, how far that may be wrong; what is
+    `hidden` by the facets of a curved surface; the factor of the `state`; and whether they were `measured` here (1) or
+    are typical ones (0).
     """
-    whole = [(name, float, (outputs,)) for name in ("factors", "shifts", "doubts")]
+    whole = [(name, float, (outputs,)) for name in ("factors", "shifts", "doubts", "hidden")]
     return np.dtype([*whole, ("state", float), ("measured", float)])
 
 

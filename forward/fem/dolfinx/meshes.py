@@ -35,7 +35,7 @@ def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]
 
 def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Distribute a mesh that the first rank reads."""
-    loaded = _on_first(comm, body.load)
+    loaded = on_first(comm, body.load)
     corners = 4 if body.cell == "tetrahedron" else 8
     points, cells, boundaries = np.zeros((0, 3)), np.zeros((0, corners), dtype=np.int64), None
     if loaded is not None:
@@ -58,7 +58,7 @@ def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int3
     return msh, facets
 
 
-def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
+def on_first(comm: Any, load: Callable[[], Any]) -> Any:
     """Call on the first rank; exceptions raised there are raised on all ranks."""
     found, problem = None, None
     if comm.rank == 0:
@@ -74,7 +74,7 @@ def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
 
 def region_numbers(comm: Any, body: MeshFile, msh: Any) -> NDArray[np.int32]:
     """Return the number of the region of each of this rank's cells, ghosts included; collective."""
-    loaded = _on_first(comm, body.load)
+    loaded = on_first(comm, body.load)
     region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))
     return np.asarray(region[_as_given(msh)])
 

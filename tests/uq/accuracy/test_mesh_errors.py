@@ -39,6 +39,7 @@ class OnMesh(FunctionModel):
     missed: float = 0.0  # part of the output that estimates of its error do not see
     doubt: float | None = None  # of calibrated errors
     measured: bool = True
+    hidden: float | None = None  # part of the output that lies between facets and surface
 
     def solve(self, parameters, guess=None):
         found = super().solve(parameters, guess)
@@ -58,7 +59,8 @@ class SolvedOnMesh(FunctionSolution):
         m = len(self.outputs)
         if self.model.doubt is not None:
             shifts, doubts = self.model.missed * self.outputs, np.full(m, self.model.doubt)
-            return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts)
+            hidden = None if self.model.hidden is None else self.model.hidden * self.outputs
+            return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts, hidden=hidden)
         if self.model.seen == 1.0:
             return None
         return Saturation(np.full(m, 1 / self.model.seen), 1.0, 1.0, self.model.measured)
@@ -379,6 +381,25 @@ def test_a_tolerance_that_hides_the_mesh_is_told():
     (said,) = (one for one in findings(found) if "The solver's tolerance" in one.text)
     assert said.severity == "warning"
     assert "mesh in u:" in said.text
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: f"{m.kind}-{getattr(m, 'design', '')}")
+def test_what_facets_hide_is_doubted_in_all_that_has_units(method):
+    """As if each output were so many per cent larger: no share of a variance changes by that."""
+    whole = replace(on_mesh(affine), doubt=1e-3)
+    (_, without), (_, found) = (studied(method, replace(whole, hidden=part)) for part in (None, -0.04))
+    sizes = {"mesh_error_doubt": "mean", "std_mesh_error_doubt": "std", "quantiles_mesh_error_doubt": "quantiles"}
+    for name, value in sizes.items():
+        more = (found[name] - without[name]) / abs(found[value])
+        assert ((more > 0.04) & (more < 0.1)).all(), (name, more)  # low quantiles are two thirds of the values there
+    for name in ("mean", "mesh_error", "mean_corrected"):
+        np.testing.assert_array_equal(found[name], without[name])
+    if "sobol_first" in found:
+        np.testing.assert_array_equal(found["sobol_first_mesh_error_doubt"], without["sobol_first_mesh_error_doubt"])
+    (said,) = (one for one in findings(found) if one.code == "facets")
+    assert "u 4.0%, v 4.0%" in said.text
+    _, unknown = studied(method, replace(whole, hidden=np.nan))
+    assert "facets-unknown" in [one.code for one in findings(unknown)]
 
 
 def test_where_the_mesh_decides_and_where_it_is_coarse():
