@@ -8,7 +8,7 @@ import pytest
 
 from forward.machine import Headroom
 from tests import meshes
-from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script, tissuq_on_two_ranks
+from tests.launch import ROOT, assert_same_bits, run_script, tissuq_on_two_ranks
 from workflows.__main__ import main
 from workflows.accuracy.levers import Assessed, MeshLever, rate_of
 from workflows.accuracy.tolerance_words import contradictions, taken
@@ -359,7 +359,7 @@ def test_a_body_without_an_answer_is_one_line_on_all_ranks(tmp_path):
     heavy = "parameters={'loads.gravity.density'={kind='uniform', lower=1e9, upper=2e9}}"
     settings = [*COARSE, "accuracy.tolerance=0.1", "model.solver.minimum_load_step=0.5", heavy]
     study = ["run", TINY, *(word for one in settings for word in ("--set", one)), "--out", tmp_path / "out"]
-    done = run(2, TISSUQ, *study)
+    done = tissuq_on_two_ranks(*study)
     assert done.returncode == 1
     assert done.stderr.count("no answer at the mean parameters") == 1
     assert not (tmp_path / "out").exists()
