@@ -90,7 +90,7 @@ def test_methods_of_derivatives(kind):
         case.method.run(case.inputs, SerialEvaluate(bare))
 
 
-def test_a_run_leaves_results_and_a_report_without_a_body(tmp_path):
+def test_a_run_leaves_results_and_a_report_without_a_body(tmp_path, undrawn):
     assert run(study("method={kind='chaos', samples=12}"), "beam", tmp_path / "out", quiet=True) == 0
     data = xr.load_dataset(tmp_path / "out" / "results.nc")
     assert dict(zip(data.output.values, data.unit.values, strict=True)) == {"tip": "m", "weight": "1"}

@@ -120,7 +120,7 @@ def test_a_study_that_was_interrupted_keeps_its_mesh(study, finished):
     assert_same_bits(directory, finished)
 
 
-def test_results_that_were_moved_are_reported(study, finished):
+def test_results_that_were_moved_are_reported(study, finished, undrawn):
     directory = study.parent / "elsewhere" / "moved"
     shutil.copytree(finished, directory)
     (directory / "mesh.npz").unlink()

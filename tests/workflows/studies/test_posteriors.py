@@ -492,7 +492,7 @@ def population(folder, source, more=""):
     return path
 
 
-def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
+def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch, undrawn):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
     folder, _ = selected
@@ -517,7 +517,7 @@ def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
     assert files[0] == files[1]
 
 
-def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch):
+def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch, undrawn):
     """Five specimens, whose grade moves one of their numbers; mistakes in covariates are one line each."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
@@ -614,7 +614,7 @@ def test_a_source_may_be_named_by_its_file(selected, tmp_path):
 
 
 @pytest.mark.fem
-def test_predictions_are_averaged_over_candidates(selected, tmp_path):
+def test_predictions_are_averaged_over_candidates(selected, tmp_path, undrawn):
     folder, _ = selected
     source = {"file": str(folder / "results"), "group": "one", "model": "averaged"}
     blocks = BODY | {"parameters": {"from": source}, "method": {"kind": "monte-carlo", "samples": 8}}

@@ -363,7 +363,7 @@ def test_a_column_that_buckles(tmp_path):
 
 
 @pytest.mark.fem
-def test_without_unseen_samples_there_is_a_report(tmp_path):
+def test_without_unseen_samples_there_is_a_report(tmp_path, undrawn):
     few = ("snapshots=4", "modes=3", "rounds=0", "derivatives=false", "unseen=0")
     sets = [word for one in few for word in ("--set", f"method.{one}")]
     tiny = ROOT / "configs" / "tiny.toml"
