@@ -101,10 +101,10 @@ def test_what_was_there_is_the_same_to_the_bit_without_estimates():
     "method",
     [
         "{kind='monte-carlo', samples=8}",
-        "{kind='quasi-monte-carlo', samples=32, scrambles=4}",
+        "{kind='quasi-monte-carlo', samples=16, scrambles=4}",
         "{kind='multilevel-chaos', samples=16, order=2}",
-        "{kind='sobol', design='saltelli', samples=32, scrambles=4}",
-        "{kind='derivative-based', samples=32, scrambles=4}",
+        "{kind='sobol', design='saltelli', samples=16, scrambles=4}",
+        "{kind='derivative-based', samples=16, scrambles=4}",
         "{kind='local-sensitivity'}",
         "{kind='compare', repeats=2, textbook=0, methods=[{kind='monte-carlo', budgets=[4]}],"
         " reference={kind='chaos', samples=8, max_order=2}}",

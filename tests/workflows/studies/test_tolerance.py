@@ -269,7 +269,7 @@ def test_a_function_of_two_parameters(tmp_path):
 
 @pytest.mark.fem
 def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path, undrawn):
-    load(TINY, [*COARSE, "accuracy.tolerance=0.1"]).run(tmp_path / "out", report=True)
+    load(TINY, [*COARSE, "accuracy.tolerance=0.05"]).run(tmp_path / "out", report=True)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     told = summary["accuracy"]
     assert told["kept"]
@@ -281,8 +281,8 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path, u
     for output, estimates in told["outputs"].items():
         for name, of in estimates.items():
             right = exact[f"{name}_corrected"].sel(output=output).item()
-            assert abs(of["value"] - right) < 0.1 * right
-            assert of["error"] <= 0.1 * of["relative_to"]
+            assert abs(of["value"] - right) < 0.05 * right
+            assert of["error"] <= 0.05 * of["relative_to"]
     assert set(summary["accuracy_seconds"]) == {"sampling", "mesh"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "value ± 95 %" in page
