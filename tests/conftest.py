@@ -60,6 +60,14 @@ def looked_at(chromium):
     return look
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures in reports that cost nothing, where only their words are looked at."""
+    from workflows.report import plots
+
+    monkeypatch.setattr(plots, "svg", lambda ax: b"<svg/>")
+
+
 @pytest.fixture(autouse=True)
 def paths(monkeypatch):
     """Its own search path: studies of Python models that are read in this process add their folders to it."""

@@ -21,13 +21,23 @@ from mpi4py import MPI
 
 import forward.fem.dolfinx  # noqa: F401  (all ranks initialise PETSc, or none)
 
+ROOT = Path(__file__).parent.parent
 FAILED = -1
 WAIT = 0.01  # s
 
 
+def forget(known):
+    """Modules from beside studies, in folders of tests: others may have the same names."""
+    kept = (str(ROOT), sys.prefix, sys.base_prefix)
+    for name in sys.modules.keys() - known:
+        file = getattr(sys.modules[name], "__file__", None)
+        if file and not file.startswith(kept):
+            del sys.modules[name]
+
+
 def ran(script):
     """Return the exit code of a script, and what it printed."""
-    code, out, err, path = 0, io.StringIO(), io.StringIO(), [*sys.path]
+    code, out, err, path, known = 0, io.StringIO(), io.StringIO(), [*sys.path], {*sys.modules}
     with redirect_stdout(out), redirect_stderr(err):
         try:
             exec(compile(script, "script", "exec"), {"__name__": "__main__"})
@@ -37,6 +47,7 @@ def ran(script):
             traceback.print_exc()
             code = FAILED
     sys.path[:] = path
+    forget(known)
     return code, out.getvalue(), err.getvalue()
 
 

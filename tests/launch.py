@@ -141,27 +141,12 @@ def tissuq_on_two_ranks(*arguments):
     return _two_ranks.run(_COMMAND, *arguments)
 
 
-_CHECKED_AND_RUN = """
-import sys
-from tissuq.__main__ import main
-for words in (("check", "study.toml"), ("run", "study.toml", "--out", "out")):
-    if main(words):
-        sys.exit(1)
-"""
-
-
 def report_of_own(folder, study):
-    """Check and run a study with own parts, in the folder of their module, as a user does; return its report."""
+    """Check and run a study with own parts, of a module in its folder; return its report."""
     (folder / "study.toml").write_text(study)
-    done = subprocess.run(
-        [sys.executable, "-c", _CHECKED_AND_RUN],  # one program, since to start another takes as long as the study
-        cwd=folder,
-        env=environment() | {"PYTHONPATH": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    for words in (("check", folder / "study.toml"), ("run", folder / "study.toml", "--out", folder / "out")):
+        done = in_process(*words)
+        assert done.returncode == 0, done.stderr
     return (folder / "out" / "report.html").read_text()
 
 

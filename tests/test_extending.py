@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from forward.findings import CATALOGUE
-from tests.launch import ROOT, TISSUQ, in_process, run
+from tests.launch import ROOT, TISSUQ, in_process, run, tissuq_on_two_ranks
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -127,7 +127,7 @@ def test_an_item_that_is_no_form(folder, tmp_path):
 def test_a_model_with_numbers_of_its_own(folder, schema):
     study = folder / "beam.toml"
     schema.validate(tomllib.loads(study.read_text()))
-    done = run(2, TISSUQ, "run", study, "--out", folder / "beam", "--no-report")
+    done = tissuq_on_two_ranks("run", study, "--out", folder / "beam", "--no-report")
     assert done.returncode == 0, done.stderr
     data = xr.load_dataset(folder / "beam" / "results.nc")
     cube = (0.12**4 - 0.08**4) / (4 * 0.04)
@@ -186,7 +186,7 @@ def test_a_kind_of_study(folder, schema):
     checked = in_process("check", study)
     assert checked.returncode == 0, checked.stderr
     assert "3 values of length" in checked.stdout
-    done = run(2, TISSUQ, "run", study, "--out", out)
+    done = tissuq_on_two_ranks("run", study, "--out", out)
     assert done.returncode == 0, done.stderr
     found = xr.load_dataset(out / "results.nc")
     assert found["scanned"].to_numpy().ravel() == pytest.approx(0.5 * np.array([0.08, 0.1, 0.12]) ** 3 / 3 / 2.0)

@@ -196,7 +196,7 @@ noise = {}
 """
 
 
-def test_a_candidate_of_material_tests(site, tmp_path, monkeypatch):
+def test_a_candidate_of_material_tests(site, tmp_path, monkeypatch, undrawn):
     (tmp_path / "points.toml").write_text(POINTS)
     monkeypatch.syspath_prepend(site)
     found = in_process("run", tmp_path / "points.toml", "--out", tmp_path / "out")

@@ -66,7 +66,9 @@ def test_another_package_of_that_name_is_not_taken_for_it(site, tmp_path):
     assert "a module called 'forward'" in done.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize("absent", ["dolfinx", "petsc4py", "mpi4py", "h5py"])
+@pytest.mark.parametrize(
+    "absent", ["dolfinx", "mpi4py", *(pytest.param(name, marks=pytest.mark.slow) for name in ("petsc4py", "h5py"))]
+)
 def test_a_run_without_fenicsx_says_in_a_line_how_to_get_it(site, tmp_path, absent):
     words = ["run", str(ROOT / "configs" / "tiny.toml"), "--out", str(tmp_path / "out")]
     script = f"import sys; sys.modules['{absent}'] = None; from tissuq.__main__ import main; sys.exit(main({words}))"

@@ -6,7 +6,7 @@ import pytest
 from forward.bodies.geometry import Block, Box, holds, tolerance
 from forward.bodies.location import locate, shapes
 from forward.bodies.mesh import FACES
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 UNIT = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 SIX = [[0, 1, 3, 7], [0, 1, 7, 5], [0, 5, 7, 4], [0, 3, 2, 7], [0, 6, 4, 7], [0, 2, 6, 7]]
@@ -100,7 +100,7 @@ print("fine")
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("ranks", [1, 3])
+@pytest.mark.parametrize("ranks", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_every_point_of_a_scan_has_one_rank(tmp_path, ranks):
     """Nodes of boxes and of meshes from files, written with five digits."""
     meshio = pytest.importorskip("meshio")
@@ -120,6 +120,6 @@ def test_every_point_of_a_scan_has_one_rank(tmp_path, ranks):
         blocks = [(name, numbers), ("quad" if kind == "hexahedron" else "triangle", faces[first[count == 1]])]
         meshio.Mesh(points, blocks).write(tmp_path / f"{kind}.vtu")
         files.append(str(tmp_path / f"{kind}.vtu"))
-    done = run_script(ranks, SCRIPT, *files)
+    done = on_kept_ranks(ranks, SCRIPT, *files)
     assert done.returncode == 0, done.stderr
     assert "fine" in done.stdout

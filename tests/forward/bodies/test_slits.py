@@ -109,7 +109,7 @@ if found is not None:
 
 @pytest.mark.fem
 @pytest.mark.mpi
-@pytest.mark.parametrize(("ranks", "degree"), [(3, 1), (2, 2)])
+@pytest.mark.parametrize(("ranks", "degree"), [(2, 1), pytest.param(3, 1, marks=pytest.mark.slow), (2, 2)])
 def test_ranks_agree(folder, ranks, degree):
     expected = answers(MPI.COMM_SELF, folder / "small.vtu", degree)
     done = on_kept_ranks(ranks, RANKS, folder / "small.vtu", degree)

@@ -522,7 +522,7 @@ def test_the_server_of_a_function(function):
         model([[1.0, 1.0]], {"level": 1})
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupt_ends_the_server(tmp_path, number, capsys):
     from workflows.__main__ import main
 
@@ -567,16 +567,15 @@ samples = 8
 
 
 @pytest.mark.fem
-def test_a_specimen_is_served(tmp_path):
+def test_a_specimen_is_served():
     """All load cases in one vector of outputs, with their gradient."""
-    (tmp_path / "specimen.toml").write_text(SPECIMEN)
     model = Model(parse(tomllib.loads(SPECIMEN)).spec, ["material.mu"])
     expected = model.solve({"material.mu": 900.0})
-    with command(TISSUQ, "serve", tmp_path / "specimen.toml", "--port", 0) as (url, _):
-        answer = ask(url, "Evaluate", {"name": "forward", "input": [[900.0]]})[1]["output"][0]
-        assert answer == pytest.approx([*expected.values()], rel=1e-7)
-        question = {"name": "forward", "outWrt": 0, "inWrt": 0, "input": [[900.0]], "sens": [0.0, 0.0, 0.0, 1.0]}
-        slope = ask(url, "Gradient", question)[1]["output"]
+    service = Service(parse(tomllib.loads(SPECIMEN)).sampled)
+    answer = service.answer("Evaluate", {"name": "forward", "input": [[900.0]]})["output"][0]
+    assert answer == pytest.approx([*expected.values()], rel=1e-7)
+    question = {"name": "forward", "outWrt": 0, "inWrt": 0, "input": [[900.0]], "sens": [0.0, 0.0, 0.0, 1.0]}
+    slope = service.answer("Gradient", question)["output"]
     assert slope == pytest.approx([expected.gradient("up.points.0.z")["material.mu"]], rel=1e-5)
 
 

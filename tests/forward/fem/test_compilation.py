@@ -55,8 +55,8 @@ def found(process):
 
 @pytest.mark.wheel
 def test_forms_are_compiled_once_by_many_processes(tmp_path):
-    lines = [line for process in [start(tmp_path, ranks) for ranks in (None, None, None, 2)] for line in found(process)]
-    assert [volume for volume, _ in lines] == ["6.0"] * 5
+    lines = [line for process in [start(tmp_path, ranks) for ranks in (None, 2)] for line in found(process)]
+    assert [volume for volume, _ in lines] == ["6.0"] * 3
     folders = [path for path in (tmp_path / "tissuq").glob("forms-*/*") if path.is_dir()]
     assert sum(int(made) for _, made in lines) == len(folders)
     assert all(len(list(folder.glob("*.so"))) == 1 for folder in folders)

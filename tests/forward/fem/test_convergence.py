@@ -98,10 +98,10 @@ class Forced(Discretisation):
 @pytest.mark.parametrize(
     ("cell", "degree", "cells", "bound"),
     [
-        ("hexahedron", 1, (4, 8, 16), (2e-4, 1.3e-2)),
-        ("hexahedron", 2, (2, 4, 8), (2.6e-5, 1.3e-3)),
-        ("tetrahedron", 1, (4, 8, 16), (1e-3, 2.9e-2)),
-        ("tetrahedron", 2, (2, 4, 8), (9.5e-5, 5.6e-3)),
+        ("hexahedron", 1, (6, 12), (2e-4 * (16 / 12) ** 2, 1.3e-2 * 16 / 12)),
+        ("hexahedron", 2, (3, 6), (2.6e-5 * (8 / 6) ** 3, 1.3e-3 * (8 / 6) ** 2)),
+        ("tetrahedron", 1, (7, 14), (1e-3 * (16 / 14) ** 2, 2.9e-2 * 16 / 14)),
+        ("tetrahedron", 2, (3, 6), (9.5e-5 * (8 / 6) ** 3, 5.6e-3 * (8 / 6) ** 2)),
     ],
 )
 def test_errors_fall_at_the_theoretical_rate(cell, degree, cells, bound):

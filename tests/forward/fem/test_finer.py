@@ -335,7 +335,7 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("basis", ["nodes", "modes"])
+@pytest.mark.parametrize("basis", ["nodes", pytest.param("modes", marks=pytest.mark.slow)])
 def test_fields_are_those_of_the_mesh_itself(basis):
     """A field that is linear in space is the same on both meshes."""
     field = {**FIELD, "basis": basis} | ({"modes": 2} if basis == "modes" else {})

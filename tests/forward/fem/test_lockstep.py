@@ -96,7 +96,7 @@ def test_the_factor_is_read_once_for_all(monkeypatch):
 
 def test_a_sample_that_fails_leaves_the_others_alone():
     """One is not admissible, one has no equilibrium, one needs Newton's method, one the path in two parts."""
-    model, inputs = beam()
+    model, inputs = beam("model.solver.minimum_load_step=0.05")
     points, guesses = predicted(model, inputs, 8)
     good = list(model.solve_many(points, guesses))
     bad, astray = points.copy(), list(guesses)

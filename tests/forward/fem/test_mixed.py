@@ -49,7 +49,7 @@ def bent(model, ratio):
 
 @pytest.mark.parametrize(
     ("cell", "coarse", "fine"),
-    [("tetrahedron", (15, 3, 3), (20, 4, 4)), ("hexahedron", (5, 1, 1), (10, 2, 2))],
+    [("tetrahedron", (10, 2, 2), (15, 3, 3)), ("hexahedron", (5, 1, 1), (10, 2, 2))],
 )
 def test_a_bent_block_does_not_lock(cell, coarse, fine):
     model, finer = cantilever(cell, coarse), cantilever(cell, fine)

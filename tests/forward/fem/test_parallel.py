@@ -31,9 +31,10 @@ def solve(material, comm):
     values = np.array([scalar.value for scalar in spec.scalars.values()])
     model = spec.build(comm, parameters)
 
-    if comm.size == 3:  # it takes hundreds of factorisations
+    if comm.size == 3 and material == "mooney-rivlin":
+        soon = spec.model_copy(update={"solver": spec.solver.model_copy(update={"minimum_load_step": 0.25})})
         try:
-            model.solve(np.where(np.array(parameters) == "loads.gravity.density", 1e9, values))
+            soon.build(comm, parameters).solve(np.where(np.array(parameters) == "loads.gravity.density", 1e9, values))
         except SolveError as error:
             reasons = comm.allgather(str(error))
         assert len(set(reasons)) == 1, reasons
@@ -52,7 +53,7 @@ def solve(material, comm):
     again = model.solve(values, Guess(model.space.scatter(whole)[0]))
     assert again.work.factorisations == 1  # that which counts eigenvalues
 
-    if comm.size == 2 and material == "mooney-rivlin":  # of the others they are those of one rank, as is compared
+    if comm.size == 2 and material == "neo-hookean":  # of the others they are those of one rank, as is compared
         steps, directions = (1 / 32, 1 / 64, 1 / 128), np.ones((1, len(values)))
         check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, accuracy=1e-12).require()
     cells, _ = model.space.cells()
@@ -74,6 +75,7 @@ for comm in groups(*map(int, sizes := json.loads(sys.argv[2]))):
 """
 SHAPES = ("mooney-rivlin", "neo-hookean", *MIXED)  # hexahedra and tetrahedra
 SOME = ("mooney-rivlin", "neo-hookean mixed")  # hexahedra and tetrahedra, displacements and pressures
+OTHERS = ("neo-hookean", "mooney-rivlin mixed")
 
 
 def solved(place, sizes):
@@ -84,7 +86,7 @@ def solved(place, sizes):
 
 
 @pytest.mark.parametrize(
-    "sizes", [{1: SHAPES, 2: SHAPES, 3: SOME}, pytest.param({1: SHAPES, 3: SHAPES}, marks=pytest.mark.slow)]
+    "sizes", [{1: SHAPES, 2: OTHERS, 3: SOME}, pytest.param({1: SHAPES, 2: SOME, 3: OTHERS}, marks=pytest.mark.slow)]
 )
 def test_ranks_agree_with_one(tmp_path, sizes):
     one, *shared = solved(tmp_path, sizes).values()

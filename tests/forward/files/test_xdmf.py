@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from forward.bodies.mesh_file import MeshFile
-from tests.launch import run_script
+from tests.launch import on_kept_ranks
 
 SCRIPT = """
 from mpi4py import MPI
@@ -38,7 +38,7 @@ for kind in ("tetrahedron", "hexahedron"):
 def folder(tmp_path_factory):
     found = tmp_path_factory.mktemp("xdmf")
     for ranks in (1, 2):
-        done = run_script(ranks, SCRIPT.replace("FOLDER", str(found)))
+        done = on_kept_ranks(ranks, SCRIPT.replace("FOLDER", str(found)))
         assert done.returncode == 0, done.stderr
     return found
 

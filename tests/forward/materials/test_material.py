@@ -269,5 +269,5 @@ seed = 1
 
 
 @pytest.mark.fem
-def test_a_study_is_checked_and_run(outside):
+def test_a_study_is_checked_and_run(outside, undrawn):
     assert "Isotropic Fung" in report_of_own(outside, STUDY)

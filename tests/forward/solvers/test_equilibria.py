@@ -348,7 +348,7 @@ def test_samples_get_what_is_known_of_them(inputs):
 
 
 @pytest.mark.fem
-def test_a_study_says_it_all(tmp_path):
+def test_a_study_says_it_all(tmp_path, undrawn):
     """The shared case of a column beyond buckling, coarser: exit 3, the error, counts, and a code for every sample."""
     import xarray as xr
 

@@ -172,7 +172,7 @@ def test_forces_balance_and_contact_is_from_one_side():
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("shape", ["sphere", "flat"])
+@pytest.mark.parametrize("shape", ["sphere", pytest.param("flat", marks=pytest.mark.slow)])
 def test_derivatives(shape):
     # Remainders are seen down to 1e-11 of the outputs: states are solved for further than that.
     spec = body(only(shape, at=(2e-3, 1e-3, SIDE)), solver={"tolerance": 1e-11})

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from forward.model import ModelError
-from tests.launch import environment
+from tests.launch import environment, in_process
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, schema
 from workflows.run.plan import plan
@@ -105,7 +105,7 @@ def beside(tmp_path, request):
     sys.modules.pop(name, None)
 
 
-def test_a_model_and_a_method_from_beside_the_study(beside):
+def test_a_model_and_a_method_from_beside_the_study(beside, undrawn):
     folder, name = beside
     study = load(folder / "study.toml")
     assert f"own code    {name} ({folder / name}.py)" in plan(study)
@@ -123,29 +123,31 @@ def test_a_model_and_a_method_from_beside_the_study(beside):
     assert float(xr.load_dataset(folder / "other" / "results.nc")["mean"][0]) != float(found["mean"][0])
 
 
-def test_the_command_line_finds_them_and_the_report_is_made_from_elsewhere(beside, tmp_path_factory):
+def test_the_command_line_finds_them_and_a_report_is_made_from_elsewhere(
+    beside, tmp_path_factory, monkeypatch, undrawn
+):
     folder, name = beside
     elsewhere = tmp_path_factory.mktemp("elsewhere")
-    command = [sys.executable, "-m", "workflows"]
-    for words in (["run", folder / "study.toml", "--out", folder / "out", "--no-report"], ["report", folder / "out"]):
-        done = subprocess.run(
-            [*command, *words], cwd=elsewhere, env=environment(), capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        assert (folder / "out" / "report.html").exists() == (words[0] == "report")
-    # Its model is code from beside the study, which no report runs unless it is told to.
-    assert f"code that is not installed ({name}): header; --code runs it" in done.stderr
-    plain = (folder / "out" / "report.html").read_text()
-    assert '<section id="answer">' in plain
-    assert '<section id="header">' not in plain
+    words = ["run", folder / "study.toml", "--out", folder / "out", "--no-report"]
     done = subprocess.run(
-        [*command, "report", "--code", folder / "out"],
+        [sys.executable, "-m", "workflows", *words],
         cwd=elsewhere,
         env=environment(),
         capture_output=True,
         text=True,
         check=False,
     )
+    assert done.returncode == 0, done.stderr
+    assert not (folder / "out" / "report.html").exists()
+    monkeypatch.chdir(elsewhere)
+    done = in_process("report", folder / "out")
+    assert done.returncode == 0, done.stderr
+    # Its model is code from beside the study, which no report runs unless it is told to.
+    assert f"code that is not installed ({name}): header; --code runs it" in done.stderr
+    plain = (folder / "out" / "report.html").read_text()
+    assert '<section id="answer">' in plain
+    assert '<section id="header">' not in plain
+    done = in_process("report", "--code", folder / "out")
     assert done.returncode == 0
     assert not done.stderr
     assert '<section id="header">' in (folder / "out" / "report.html").read_text()

@@ -8,7 +8,7 @@ import pytest
 
 from forward.pointwise import FunctionModel
 from tests.browser import executable, without_fault
-from tests.workflows.report.test_report import CUBE, HEXAHEDRON, solve, study, write
+from tests.workflows.report.test_report import CUBE, HEXAHEDRON, solve, study, study_of, write
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.draws import Draws
@@ -45,16 +45,20 @@ def expanded():
 
 @pytest.fixture(scope="module")
 def reports(tmp_path_factory, expanded):
+    """Reports by name, each made when it is first asked for."""
     folder = tmp_path_factory.mktemp("reports")
-    kinds = {"chaos": expanded, "sampled": solve(study()), "local": None}
-    case = study().model_dump(mode="json", exclude_none=True) | {"method": {"kind": "local-sensitivity"}}
-    from workflows.config.study import parse
+    local = {"kind": "local-sensitivity"}
+    kinds = {"chaos": lambda: expanded, "sampled": lambda: solve(study()), "local": lambda: solve(study_of(local))}
 
-    kinds["local"] = solve(parse(case))
-    return {name: write_report(write(folder / name, dataset)) for name, dataset in kinds.items()}
+    class Reports(dict):
+        def __missing__(self, name):
+            self[name] = write_report(write(folder / name, kinds[name]()))
+            return self[name]
+
+    return Reports()
 
 
-@pytest.mark.parametrize("name", ["chaos", "sampled", "local"])
+@pytest.mark.parametrize("name", ["chaos", "sampled", pytest.param("local", marks=pytest.mark.slow)])
 def test_reports_open_without_a_fault(page, reports, name):
     """Those of other kinds of studies are looked at where these are tested."""
     without_fault(page, reports[name])

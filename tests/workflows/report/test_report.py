@@ -142,12 +142,6 @@ def sampled():
     return solve(study())
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Pictures that cost nothing."""
-    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
-
-
 def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
     page = write_report(write(tmp_path / "out", sampled)).read_text()
     sag = sampled.sel(output="sag")

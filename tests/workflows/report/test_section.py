@@ -31,7 +31,7 @@ samples = 16
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, undrawn):
     """A study with the section that the documentation shows in a file beside it."""
     code, named = (re.search(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[1] for language in ("python", "toml"))
     (tmp_path / "my_sections.py").write_text(code, encoding="utf-8")

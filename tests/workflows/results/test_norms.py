@@ -55,6 +55,8 @@ def test_nodes_stand_for_shares_of_the_body(cell, degree):
 
 
 LOCAL = """
+mesh_error = false
+
 [model]
 body = { kind = "box", size = [1.0, 0.3, 0.3], cells = CELLS, degree = 2 }
 material = { kind = "neo-hookean", C1 = 1e5, D1 = 1e6 }
@@ -86,6 +88,8 @@ def test_norms_do_not_depend_on_the_mesh(tmp_path):
 
 
 SOBOL = """
+mesh_error = false
+
 [model]
 body = { kind = "box", size = [1.0, 0.3, 0.3], cells = [8, 1, 1], cell = "hexahedron", degree = 1, grading = GRADING }
 material = { kind = "neo-hookean", C1 = 1e5, D1 = 1e5 }
@@ -106,7 +110,7 @@ kind = "sobol"
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("design", ["samples = 8", 'samples = 32\ndesign = "saltelli"\nscrambles = 4'])
+@pytest.mark.parametrize("design", ["samples = 8", 'samples = 16\ndesign = "saltelli"\nscrambles = 4'])
 def test_indices_of_fields_do_not_depend_on_the_mesh(tmp_path, design):
     """Thin cells at the end that is held and moves as a whole, or at the one that is pulled."""
     found = []

@@ -36,7 +36,7 @@ def tissuq(*arguments, ranks=None):
 def finished(tmp_path_factory):
     """The tiny study, run in one process."""
     directory = tmp_path_factory.mktemp("run") / "tiny"
-    done = tissuq("run", TINY, "--out", directory)
+    done = in_process("run", TINY, "--out", directory)
     assert done.returncode == 0, done.stderr
     return directory
 
@@ -66,6 +66,7 @@ def test_a_run_imports_nothing_that_was_not_asked_for(tmp_path):
         "print(*sys.modules); sys.exit(code)"
     )
     chaos = ("--set", 'method.kind="chaos"', "--set", "method.samples=6", "--set", "method.max_order=2")
+    chaos += ("--set", "model.body.cells=[2, 1, 1]")
     done = run_script(None, script, TINY, *chaos, "--set", "mesh_error=false", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     names = set(done.stdout.splitlines()[-1].split())
@@ -193,13 +194,13 @@ def test_a_model_on_two_ranks_agrees(finished, tmp_path):
 @pytest.mark.mpi
 def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     # Kills while errors of the mesh are estimated are in tests/workflows/studies/test_mesh_error.py.
-    arguments = ("run", TINY, "--set", "method.samples=480", "--set", "mesh_error=false", "--no-report", "--out")
+    arguments = ("run", TINY, "--set", "method.samples=240", "--set", "mesh_error=false", "--no-report", "--out")
     whole = tmp_path / "whole"
     assert in_process(*arguments, whole).returncode == 0
     broken = tmp_path / "broken"
     chance = random.Random(1)
     kills = 0
-    for ranks in (2, 1, 3, 2):
+    for ranks in (1, 3):
         process = subprocess.Popen(
             on_ranks(ranks, TISSUQ, *arguments, broken),
             env=environment(),
@@ -210,7 +211,7 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
         # Wait until blocks are being finished, so that the kill falls into the work.
         begin, before = time.monotonic(), len(list(broken.glob("evaluations/*.h5")))
         while process.poll() is None and time.monotonic() - begin < 60:
-            if len(list(broken.glob("evaluations/*.h5"))) > before + chance.randint(1, 12):
+            if len(list(broken.glob("evaluations/*.h5"))) > before + chance.randint(1, 6):
                 break
             time.sleep(0.02)
         kills += process.poll() is None
@@ -218,8 +219,8 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
         process.wait()
         # The ranks are children of mpirun in sessions of their own.
         subprocess.run(["pkill", "-9", "-f", str(broken)], check=False)
-    assert kills >= 3
-    done = tissuq(*arguments, broken, ranks=3)
+    assert kills == 2
+    done = tissuq_on_two_ranks(*arguments, broken)
     assert done.returncode == 0, done.stderr
     assert_same_bits(whole, broken)
 
@@ -240,12 +241,13 @@ def test_more_ranks_than_work(tmp_path):
 
 
 @pytest.mark.fem
-def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
+def test_failed_solves_are_recorded_and_exit_with_3(tmp_path, undrawn):
     changes = (
         "parameters.loads.gravity.density={kind='gamma', shape=1, scale=800, shift=100}",  # a long tail
         "model.solver.minimum_load_step=1.0",
         "model.solver.iterations=10",
         "method.fields=false",
+        "mesh_error=false",
     )
     done = in_process("run", TINY, "--out", tmp_path / "out", *(word for c in changes for word in ("--set", c)))
     assert done.returncode == 3, done.stderr
@@ -265,7 +267,7 @@ def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_m
     heavy = "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"
     share = f"parallel.ranks_per_model={ranks_per_model}"
     soon = ("--set", "model.solver.minimum_load_step=0.5", "--set", "model.solver.iterations=4")
-    done = tissuq("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, *soon, ranks=2)
+    done = tissuq_on_two_ranks("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, *soon)
     assert done.returncode == 1
     assert done.stderr.count("failed: the model has no answer at the mean parameters") == 1
     assert not (tmp_path / "out").exists()  # a corrected study may go there

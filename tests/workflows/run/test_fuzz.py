@@ -79,7 +79,7 @@ def check_all(folder, capsys, documents, count, seed):
 
 
 def test_mutations_of_shipped_studies(capsys):
-    assert 20 < check_all(CONFIGS, capsys, SHIPPED, 150, 1) < 100
+    assert 10 < check_all(CONFIGS, capsys, SHIPPED, 75, 1) < 50
 
 
 @pytest.mark.slow
@@ -180,7 +180,7 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("name", "how"),
     [

@@ -7,6 +7,7 @@ import re
 import resource
 import signal
 import subprocess
+import sys
 import time
 from contextlib import suppress
 from functools import partial
@@ -15,7 +16,17 @@ from threading import Thread
 
 import pytest
 
-from tests.launch import HANGS, NOT_KEPT, ROOT, TISSUQ, environment, in_process, on_ranks, run_script
+from tests.launch import (
+    HANGS,
+    NOT_KEPT,
+    ROOT,
+    TISSUQ,
+    environment,
+    in_process,
+    on_ranks,
+    run_script,
+    tissuq_on_two_ranks,
+)
 from workflows.__main__ import main
 
 MODEL = """
@@ -64,7 +75,8 @@ FEW = ("--set", "method.samples=4", "--set", "method.max_order=1")
 def study(tmp_path):
     (tmp_path / "endless.py").write_text(MODEL)
     (tmp_path / "study.toml").write_text(STUDY)
-    return tmp_path / "study.toml"
+    yield tmp_path / "study.toml"
+    sys.modules.pop("endless", None)
 
 
 def tissuq(*arguments, ranks=None, case="", limits=()):
@@ -87,7 +99,16 @@ def tissuq(*arguments, ranks=None, case="", limits=()):
     )
 
 
-def test_results_are_printed_and_kept_before_the_report_is_drawn(study, tmp_path):
+def in_case(case, ranks, *arguments):
+    """Run with a case of the model: in this process, or on ranks of their own, which end with it."""
+    if ranks:
+        return tissuq(*arguments, ranks=ranks, case=case)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CASE", case)
+        return in_process(*arguments)
+
+
+def test_results_are_printed_and_kept_before_the_report_is_drawn(study, tmp_path, undrawn):
     out = tmp_path / "out"
     command = [TISSUQ, "run", study, "--out", out]
     begun = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
@@ -116,7 +137,7 @@ def reasons(done):
     return [line for line in done.stderr.splitlines() if line.startswith(("failed:", "interrupted"))]
 
 
-@pytest.mark.parametrize("mebibytes", [100, 250, 500])
+@pytest.mark.parametrize("mebibytes", [100, 250, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_program_without_memory_says_so(study, tmp_path, mebibytes):
     done = tissuq("run", study, "--out", tmp_path / "out", limits=[(resource.RLIMIT_AS, mebibytes * 2**20)])
     if done.returncode == 0:  # enough for this model
@@ -183,7 +204,7 @@ def test_check_foresees_that_memory_runs_out():
     ],
 )
 def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
-    done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", ranks=ranks, case=case)
+    done = in_case(case, ranks, "run", study, "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 1
     (said,) = reasons(done)
     assert re.fullmatch(re.escape(reason) + r" at a = 0\.\d+", said)  # of a machine that has plenty, no figures
@@ -195,11 +216,11 @@ def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
-    limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=8")
-    done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks, case="loop")
+    limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=4")
+    done = in_case("loop", ranks, "run", study, "--out", tmp_path / "out", "--no-report", *limited)
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert 0 < summary["failed"] < 8
+    assert 0 < summary["failed"] < 4
     assert {one["reason"] for one in summary["failures"]} == {"endless.value took longer than solve_seconds = 0.4"}
     assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
 
@@ -255,12 +276,12 @@ def test_a_server_that_never_ends_is_a_failed_solve(study, tmp_path, monkeypatch
         url = f"http://127.0.0.1:{server.server_port}"
         there = STUDY.replace('"python"', '"um-bridge"').replace('function = "endless.value"', f'url = "{url}"')
         study.write_text(there)
-        limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=8")
-        done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks)
+        limited = ("--set", "model.solve_seconds=0.4", "--set", "method.samples=4")
+        done = in_case("", ranks, "run", study, "--out", tmp_path / "out", "--no-report", *limited)
         server.shutdown()
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert 0 < summary["failed"] < 8
+    assert 0 < summary["failed"] < 4
     assert {one["reason"] for one in summary["failures"]} == {f"{url} took longer than solve_seconds = 0.4"}
     assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
 
@@ -272,7 +293,8 @@ def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
     """No solve is so fast; the ranks that share a model agree."""
     limited = ("--set", "model.solver.solve_seconds=1e-9", "--set", "method.kind=monte-carlo")
     few = ("--set", "method.samples=6", "--set", f"parallel.ranks_per_model={ranks or 1}")
-    done = tissuq("run", "configs/tiny.toml", "--out", tmp_path / "out", *limited, *few, ranks=ranks)
+    words = ("run", ROOT / "configs" / "tiny.toml", "--out", tmp_path / "out", *limited, *few)
+    done = tissuq_on_two_ranks(*words) if ranks else in_process(*words)
     assert done.returncode == 1, done.stderr
     (reason,) = reasons(done)
     assert "the solve took longer than solve_seconds = 1e-09" in reason
@@ -324,7 +346,7 @@ for size in (100, 2_000, 10_000, 50_000):
 """
 
 
-def test_a_full_disk_stops_a_study_that_the_same_command_continues(study, tmp_path):
+def test_a_full_disk_stops_a_study_that_the_same_command_continues(study, tmp_path, undrawn):
     """No larger file is allowed: study.toml, a block, results, the report."""
     out = tmp_path / "out"
     done = run_script(None, ON_A_SMALL_DISK, study, "--quiet", "--out", out)
@@ -413,7 +435,7 @@ def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
     "name", ["summary.json", "results.nc", "report.html", "evaluations.h5", "sources.json", "evaluations"]
 )
 @pytest.mark.parametrize("harm", ["folder", "file", "loop"])
-def test_what_stands_in_the_way_is_said_and_the_rest_continues(study, tmp_path, capsys, name, harm):
+def test_what_stands_in_the_way_is_said_and_the_rest_continues(study, tmp_path, capsys, name, harm, undrawn):
     """In one line, and when it is gone the same command ends well."""
     if harm == "file" and name != "evaluations":
         pytest.skip("is a file")

@@ -11,7 +11,7 @@ import pyvista
 import xarray as xr
 
 from forward.bodies.mesh_file import MeshFile
-from tests.launch import TISSUQ, assert_same_bits, in_process, run
+from tests.launch import TISSUQ, assert_same_bits, in_process, run, tissuq_on_two_ranks
 from tests.meshes import corner
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
@@ -120,7 +120,7 @@ def test_a_study_that_was_interrupted_keeps_its_mesh(study, finished):
     assert_same_bits(directory, finished)
 
 
-def test_results_that_were_moved_are_reported(study, finished):
+def test_results_that_were_moved_are_reported(study, finished, undrawn):
     directory = study.parent / "elsewhere" / "moved"
     shutil.copytree(finished, directory)
     (directory / "mesh.npz").unlink()
@@ -154,8 +154,8 @@ def test_a_limit_that_is_reached_is_a_warning(study):
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_a_body_without_an_answer_leaves_no_folder(study, ranks):
     directory = study.parent / f"failed {ranks}"
-    never = ("--set", "model.solver.solve_seconds=1e-9")
-    done = run(ranks, TISSUQ, "run", study, "--out", directory, "--no-report", *never)
+    words = ("run", study, "--out", directory, "--no-report", "--set", "model.solver.solve_seconds=1e-9")
+    done = tissuq_on_two_ranks(*words) if ranks else in_process(*words)
     assert done.returncode == 1
     assert "the solve took longer than solve_seconds" in done.stderr
     assert "Traceback" not in done.stderr

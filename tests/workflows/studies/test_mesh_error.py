@@ -101,10 +101,10 @@ def test_what_was_there_is_the_same_to_the_bit_without_estimates():
     "method",
     [
         "{kind='monte-carlo', samples=8}",
-        "{kind='quasi-monte-carlo', samples=32, scrambles=4}",
+        "{kind='quasi-monte-carlo', samples=16, scrambles=4}",
         "{kind='multilevel-chaos', samples=16, order=2}",
-        "{kind='sobol', design='saltelli', samples=32, scrambles=4}",
-        "{kind='derivative-based', samples=32, scrambles=4}",
+        "{kind='sobol', design='saltelli', samples=16, scrambles=4}",
+        "{kind='derivative-based', samples=16, scrambles=4}",
         "{kind='local-sensitivity'}",
         "{kind='compare', repeats=2, textbook=0, methods=[{kind='monte-carlo', budgets=[4]}],"
         " reference={kind='chaos', samples=8, max_order=2}}",
@@ -167,7 +167,7 @@ main(sys.argv[1:])
 
 
 @pytest.mark.fem
-def test_the_summary_and_the_terminal_say_it(tmp_path):
+def test_the_summary_and_the_terminal_say_it(tmp_path, undrawn):
     study = ["run", TINY, "--set", "model.body.cells=[2, 1, 1]", "--set", "method.samples=8", "--out", tmp_path / "out"]
     done = in_process(*study)
     assert done.returncode == 0, done.stderr
@@ -209,7 +209,7 @@ def test_the_summary_and_the_terminal_say_it(tmp_path):
 
 
 @pytest.mark.fem
-def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path):
+def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path, undrawn):
     """No expansion explains rounding, which is no error of the study."""
     outputs = (
         "[{name='uy', kind='mean-displacement', on='x-max', component='y'}, "
@@ -282,7 +282,7 @@ def of_run(directory, *settings):
 
 
 @pytest.mark.fem
-def test_estimates_that_were_planned_and_failed_are_an_error(tmp_path):
+def test_estimates_that_were_planned_and_failed_are_an_error(tmp_path, undrawn):
     code, printed, summary = of_run(tmp_path / "D", *FAR_TOO_COARSE)
     assert code == 3
     assert summary["failed"] == 0

@@ -11,8 +11,7 @@ import pytest
 import xarray as xr
 
 from forward.pointwise import FunctionModel
-from tests.launch import TISSUQ, environment
-from tests.launch import run as on_ranks
+from tests.launch import TISSUQ, environment, in_process, tissuq_on_two_ranks
 from uq.estimators.averaged import average
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.hdf5 import netcdf
@@ -85,13 +84,13 @@ def mistake(path):
 def test_draws_give_the_moments_of_a_loop_over_them_with_any_ranks(folder):
     path = study(folder, 'from = "draws.csv"\nc = { kind = "normal", mean = 0, std = 0.1 }')
     files = []
-    for ranks in (None, 3):
+    for ranks, tissuq in ((1, in_process), (2, tissuq_on_two_ranks)):
         out = folder / f"out-{ranks}"
-        done = on_ranks(ranks, TISSUQ, "run", path, "--out", out, "--no-report", "--quiet")
+        done = tissuq("run", path, "--out", out, "--no-report", "--quiet")
         assert done.returncode == 0, done.stderr
         files.append((out / "results.nc").read_bytes())
     assert files[0] == files[1]
-    found = xr.load_dataset(folder / "out-None" / "results.nc")
+    found = xr.load_dataset(folder / "out-1" / "results.nc")
     assert found.parameter.values.tolist() == ["c", "a", "b"]
     points = found["points"].to_numpy()
     assert np.array_equal(points[np.argsort(points[:, 1]), 1:], NUMBERS[np.argsort(NUMBERS[:, 0])])  # each once
@@ -140,11 +139,12 @@ def test_other_draws_do_not_continue_a_study(folder, capsys):
         parse(blocks)
 
 
-def test_a_killed_study_goes_on(folder):
+def test_a_killed_study_goes_on(folder, monkeypatch):
     path = study(folder, method='kind = "chaos"\nsamples = 40')
     whole, cut = folder / "whole", folder / "cut"
     arguments = ["run", path, "--no-report", "--quiet", "--out"]
-    assert on_ranks(None, TISSUQ, *arguments, whole).returncode == 0
+    assert in_process(*arguments, whole).returncode == 0
+    monkeypatch.delitem(sys.modules, "drawn_model")
     (folder / "drawn_model.py").write_text(
         MODULE + "import os, itertools\ncount, known = itertools.count(), value\n"
         "def value(p):\n    if next(count) > 20 and os.environ.get('KILL'): os._exit(9)\n    return known(p)\n"
@@ -153,7 +153,7 @@ def test_a_killed_study_goes_on(folder):
     killed = subprocess.run(command, env=environment() | {"KILL": "1"}, capture_output=True, check=False)
     assert killed.returncode == 9
     assert not (cut / "results.nc").exists()
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
+    done = in_process(*arguments, cut)
     assert done.returncode == 0, done.stderr
     assert (cut / "results.nc").read_bytes() == (whole / "results.nc").read_bytes()
 
@@ -492,7 +492,7 @@ def population(folder, source, more=""):
     return path
 
 
-def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
+def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch, undrawn):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
     folder, _ = selected
@@ -517,7 +517,7 @@ def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
     assert files[0] == files[1]
 
 
-def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch):
+def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch, undrawn):
     """Five specimens, whose grade moves one of their numbers; mistakes in covariates are one line each."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
@@ -614,7 +614,7 @@ def test_a_source_may_be_named_by_its_file(selected, tmp_path):
 
 
 @pytest.mark.fem
-def test_predictions_are_averaged_over_candidates(selected, tmp_path):
+def test_predictions_are_averaged_over_candidates(selected, tmp_path, undrawn):
     folder, _ = selected
     source = {"file": str(folder / "results"), "group": "one", "model": "averaged"}
     blocks = BODY | {"parameters": {"from": source}, "method": {"kind": "monte-carlo", "samples": 8}}

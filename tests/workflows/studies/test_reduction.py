@@ -44,7 +44,7 @@ file = "model.npz"
 "loads.gravity.density" = {{ kind = "uniform", lower = 900, upper = 1100 }}
 [method]
 kind = "quasi-monte-carlo"
-samples = 32
+samples = 16
 scrambles = 4
 """
 SIZES = [
@@ -72,7 +72,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def body(folder):
     """Results of the body itself."""
-    (folder / "direct.toml").write_text(BODY + '[method]\nkind = "quasi-monte-carlo"\nsamples = 32\nscrambles = 4\n')
+    (folder / "direct.toml").write_text(BODY + '[method]\nkind = "quasi-monte-carlo"\nsamples = 16\nscrambles = 4\n')
     assert main(["run", str(folder / "direct.toml"), "--out", str(folder / "direct"), "--quiet", "--no-report"]) == 0
     return xr.load_dataset(folder / "direct" / "results.nc")
 
@@ -185,7 +185,7 @@ def test_candidates_that_are_reduced_models_are_not_checked_for_their_meshes(fol
 
 
 def test_the_full_model_is_asked_above_a_tolerance(folder):
-    (folder / "checked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("32", "8"))
+    (folder / "checked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("16", "8"))
     assert main(["run", str(folder / "checked.toml"), "--out", str(folder / "checked"), "--quiet", "--no-report"]) == 0
     assert json.loads((folder / "checked" / "summary.json").read_text())["work"]["factorisations"] > 0
 
@@ -363,7 +363,7 @@ def test_a_column_that_buckles(tmp_path):
 
 
 @pytest.mark.fem
-def test_without_unseen_samples_there_is_a_report(tmp_path):
+def test_without_unseen_samples_there_is_a_report(tmp_path, undrawn):
     few = ("snapshots=4", "modes=3", "rounds=0", "derivatives=false", "unseen=0")
     sets = [word for one in few for word in ("--set", f"method.{one}")]
     tiny = ROOT / "configs" / "tiny.toml"
