@@ -337,7 +337,7 @@ def test_other_loads_and_places_of_a_specimen(specimens):
 @pytest.mark.fem
 def test_a_field_predicts_by_adjoints(specimens):
     """Against draws of the stored posterior, through the model."""
-    assert ran(specimens / "field.toml", specimens / "field", "method.draws=600") in (0, 3)
+    assert ran(specimens / "field.toml", specimens / "field", "method.draws=150") in (0, 3)
     found = results(specimens / "field").isel(data_set=0)
     study = load(specimens / "field.toml")
     assert [str(goal) for goal in found["goal"].values] == NAMES
