@@ -68,7 +68,7 @@ OF_SPECIMEN = (
 files = ["data"]
 [method]
 kind = "invert"
-samples = 64
+samples = 32
 starts = 1
 mesh_error = false
 """

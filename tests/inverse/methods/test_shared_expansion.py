@@ -53,7 +53,7 @@ files = ["data"]
 
 [method]
 kind = "invert"
-samples = 64
+samples = 32
 starts = 1
 seed = 2
 """  # noqa: E501

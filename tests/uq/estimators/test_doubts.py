@@ -222,7 +222,14 @@ def test_indices_beyond_their_bounds_are_errors_of_the_program(changes, said):
 # --- coverage ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["hinge", "jump", "oscillation", "absolute value", "peak"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hinge",
+        "jump",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("oscillation", "absolute value", "peak")),
+    ],
+)
 def test_intervals_cover_what_is_not_smooth(name):
     """A small part of the table of docs/measurements.md."""
     for method in (Chaos(samples=40, fields=False), QuasiMonteCarlo(samples=64, fields=False)):
