@@ -239,7 +239,7 @@ def check_coverage(of, count, **settings):
     low, high = stats.binom.ppf([0.015, 0.988], count, 0.95)
     assert low <= (np.abs(mean) < t * mean_error).sum() <= high
     t = stats.t.ppf(0.975, 15 if settings["coefficient"] == "one" else 13)
-    low, high = stats.binom.ppf([0.004, 0.997], count, 0.95)
+    low, high = stats.binom.ppf([0.004, 0.9985], count, 0.95)
     assert low <= (np.abs(variance) < t * variance_error).sum() <= high
 
 
