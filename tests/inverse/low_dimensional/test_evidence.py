@@ -212,11 +212,12 @@ def test_evidence_of_priors_with_inadmissible_tails(correlated, by_nested_sampli
     tests = [MaterialTest(mode="uniaxial", at=(0.8, 1.2, 1.5))]
     model = HomogeneousModel("mooney-rivlin", {}, tests, ("C1", "C2"))
     data, sigma = model.stresses(np.array([[80.0, -20.0]]))[0], np.full(3, 150.0)
-    x = np.linspace(-8, 8, 801)
+    x = np.linspace(-8, 8, 1601)
     grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     points = inputs.from_normals(grid)[0]
     good = points.sum(axis=1) > 0
-    misfit = (((model.stresses(points) - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
+    stresses = points @ model.stresses(np.eye(2))  # linear in the constants
+    misfit = (((stresses - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
     exact = {}
     for width in (1.0, 0.5, 2.0):
         prior = -((grid / width) ** 2).sum(axis=1) / 2

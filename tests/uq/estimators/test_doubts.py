@@ -7,6 +7,7 @@ import xarray as xr
 from benchmarks import coverage, tails
 from benchmarks.coverage import CASES, Vectorised, measure
 from forward.pointwise import FunctionModel
+from tests.functions import AtOnce
 from tests.states import WithState
 from uq.estimators.doubts import of_indices
 from uq.evaluation.evaluate import SerialEvaluate
@@ -127,8 +128,7 @@ def test_heavy_tails_are_told(method):
     inputs = Inputs({"a": UNIT, "b": Normal(mean=0.0, std=1.0)})
     model = FunctionModel(lambda p: p[0] + p[1], inputs.names, ("y",), lambda p: [[1.0, 1.0]])
     told = [
-        findings(method.model_copy(update={"seed": s, "samples": 128}).run(inputs, SerialEvaluate(model)))
-        for s in range(10)
+        findings(method.model_copy(update={"seed": s, "samples": 128}).run(inputs, AtOnce(model))) for s in range(10)
     ]
     assert told == [[]] * 10
 

@@ -66,7 +66,7 @@ def waves(amplitude, tilt, missing=lambda a: False):
     return FunctionModel(value, ("a", "b"), ("f",))
 
 
-SEEDS = 50
+SEEDS = 100
 
 
 @pytest.mark.parametrize("reuse", [True, False])
