@@ -621,7 +621,8 @@ def test_probabilities_are_calibrated():
     said, happened = [], []
     for _ in range(20):
         for k, kind in enumerate(FIVE):
-            found = compare(measured(kind, rng, noise=0.15), noise=StatedNoise(relative=0.15, absolute=5e3))
+            noise = StatedNoise(relative=0.15, absolute=5e3)
+            found = compare(measured(kind, rng, noise=0.15), noise=noise, samples=64)
             said.append(found["probability"].to_numpy())
             happened.append(np.arange(len(FIVE)) == k)
     P, true = np.concatenate(said), np.concatenate(happened)
