@@ -215,13 +215,13 @@ def judged(posterior, samples=256, **settings):
 def test_verdicts_on_few_parameters():
     assert judged(few()).trust == "laplace"
     assert str(judged(few())).startswith("Laplace's Gaussian can be trusted: the posterior is Gaussian")
-    assert judged(quick(ridge(0.1))).trust == "corrected"
     wrong = judged(few(wave=3.0))
     assert wrong.trust == "neither"
     assert "does not explain the data" in wrong.why
     posterior = quick(ridge(0.1))
     gaussian = laplace(posterior)
     found, test = evidence(posterior, gaussian, 256), examine_few(posterior, gaussian)
+    assert verdict_on_few(gaussian, found, test).trust == "corrected"
     lost = verdict_on_few(replace(gaussian, converged=False), found, test)
     assert (lost.trust, lost.why) == ("neither", "the search for the mode did not converge")
     uneven = replace(found, pareto_k=0.9, ess=30.0)

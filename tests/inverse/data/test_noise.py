@@ -70,7 +70,7 @@ def quadrature(noise=None):
     a = np.linspace(-3, 5, 4001)
     s, weight = np.ones(1), np.ones(1)
     if noise is not None:
-        z = np.linspace(-6, 6, 241)
+        z = np.linspace(-6, 6, 61)
         s, weight = noise.from_normal(z)[0], stats.norm.pdf(z) * (z[1] - z[0])
     r = (a[:, None, None] * SLOPES - VALUES) / (SIGMA * s[:, None])
     log = (stats.t(HEAVY.degrees).logpdf(r) - np.log(SIGMA * s[:, None])).sum(axis=2)

@@ -178,7 +178,7 @@ def test_the_prior_has_the_variance_that_was_asked_and_the_closed_form_inside():
 
 @cache
 def coarse():
-    posterior, true = problem(5)
+    posterior, true = problem(4)
     return posterior, true, find_mode(posterior)
 
 
@@ -319,13 +319,13 @@ def test_a_field_is_felt_from_forces_alone():
         for number, (x, y) in enumerate(at)
     )
     field = {"of": "stiffness", "length": 0.5, "std": 0.5, "basis": "nodes"}
-    body = {"size": (1.0, 1.0, 0.5), "cells": (4, 4, 2), "degree": 1}
+    body = {"size": (1.0, 1.0, 0.5), "cells": (3, 3, 2), "degree": 1}
     spec = small(body=body, cases=cases, observed=(), fields=(field,))
     prior, names = spec.fields[0].prior(spec.body), spec.coefficients
     model = spec.build(MPI.COMM_SELF, names)
     places = model.vertices.coordinates
     true = np.where(places[:, 0] > 0.5, 0.6, -0.3)
-    assert len(true) == len(names) == 75
+    assert len(true) == len(names) == 48
     data = model.solve(true).outputs
     sigma = 0.03 * data
     posterior = FieldPosterior(model, data * (1 + 0.03 * np.array([1, -1, 0.5, -0.5])), Noise(sigma), prior)
@@ -334,7 +334,7 @@ def test_a_field_is_felt_from_forces_alone():
     assert mode.converged
     values = mode.point.values
     J = model.solve(values).adjoint(np.eye(4))
-    root = prior.root(np.eye(75))  # rows L e_i
+    root = prior.root(np.eye(48))  # rows L e_i
     covariance = root.T @ root
     gap = (posterior.data - mode.point.solution.outputs) / sigma**2
     exact = np.linalg.inv(np.linalg.inv(covariance) + J.T @ np.diag(sigma**-2.0) @ J)

@@ -1,5 +1,6 @@
 """Evidence: closed forms, brute force, nested sampling, and whether the stated errors are honest."""
 
+from functools import cache
 from importlib.util import find_spec
 
 import numpy as np
@@ -28,16 +29,20 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from workflows.config.study import load
 
+remembered = cache(sobol_points)
+
 
 def brute_force(posterior, draws=2**19):
     """Ln of the mean likelihood over points of the prior."""
-    points = posterior.inputs.points(sobol_points(5, 0, 0, draws, 4))
+    points = posterior.inputs.points(remembered(5, 0, 0, draws, 4))
     misfit = (((two_of_four(points) - posterior.data) / posterior.noise.sigma) ** 2).sum(axis=1) / 2
     return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.noise.sigma.prod())
 
 
 @pytest.mark.flags
-@pytest.mark.parametrize(("noise", "allowed", "repeats"), [(0.3, 0.03, 4), (0.1, 0.1, 4), (0.03, 0.3, 4)])
+@pytest.mark.parametrize(
+    ("noise", "allowed", "repeats"), [(0.3, 0.03, 4), pytest.param(0.1, 0.1, 4, marks=pytest.mark.slow), (0.03, 0.3, 4)]
+)
 def test_curved_ridge(noise, allowed, repeats):
     posterior = ridge(noise)
     truth = brute_force(posterior)
@@ -211,7 +216,8 @@ def test_evidence_of_priors_with_inadmissible_tails(correlated, by_nested_sampli
     grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     points = inputs.from_normals(grid)[0]
     good = points.sum(axis=1) > 0
-    misfit = (((model.stresses(points) - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
+    stresses = points @ model.stresses(np.eye(2))  # linear in the constants
+    misfit = (((stresses - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
     exact = {}
     for width in (1.0, 0.5, 2.0):
         prior = -((grid / width) ** 2).sum(axis=1) / 2

@@ -87,7 +87,7 @@ def test_where_it_is_gaussian_everything_is_of_the_gaussian(size):
     assert found.ess > 200  # its points are draws of it
 
 
-@pytest.mark.parametrize(("size", "seed"), [(9, 7), (25, 7), (40, 7), (40, 8)])
+@pytest.mark.parametrize(("size", "seed"), [(9, 7), (25, 7), (40, 7), pytest.param(40, 8, marks=pytest.mark.slow)])
 def test_bent_a_little(size, seed):
     posterior, A = bent(size, 0.25, seed)
     gaussian = laplace(posterior, starts=1)
@@ -266,7 +266,10 @@ def test_how_far_a_search_that_did_not_converge_is_from_its_end():
     assert said.endswith("did not converge: its next step would move an unknown by up to 0.31 standard deviations")
 
 
-@pytest.mark.parametrize(("size", "seed"), [(25, 7), (25, 8), (25, 9), (40, 7), (60, 7)])
+@pytest.mark.parametrize(
+    ("size", "seed"),
+    [(25, 7), *(pytest.param(25, seed, marks=pytest.mark.slow) for seed in (8, 9)), (40, 7), (60, 7)],
+)
 def test_advice_on_the_number_of_points_holds_when_taken(size, seed):
     """From 32 points, of which one or two may count: the advice is a number, and enough."""
     posterior, _ = bent(size, 0.25, seed)

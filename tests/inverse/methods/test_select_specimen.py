@@ -219,7 +219,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
 
 def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     """A mesh that is too coarse no longer loses for that alone, but for what is uncertain of its correction."""
-    it = load(study, ["method.noise.absolute=0.02", "method.samples=64"])
+    it = load(study, ["method.noise.absolute=0.02"])
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
     finer = {name: extrapolated(model, np.array([1e3])).of(model) for name, model in coarse.items()}
     lines = []

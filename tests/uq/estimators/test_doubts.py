@@ -7,6 +7,7 @@ import xarray as xr
 from benchmarks import coverage, tails
 from benchmarks.coverage import CASES, Vectorised, measure
 from forward.pointwise import FunctionModel
+from tests.functions import AtOnce
 from tests.states import WithState
 from uq.estimators.doubts import of_indices
 from uq.evaluation.evaluate import SerialEvaluate
@@ -127,8 +128,7 @@ def test_heavy_tails_are_told(method):
     inputs = Inputs({"a": UNIT, "b": Normal(mean=0.0, std=1.0)})
     model = FunctionModel(lambda p: p[0] + p[1], inputs.names, ("y",), lambda p: [[1.0, 1.0]])
     told = [
-        findings(method.model_copy(update={"seed": s, "samples": 128}).run(inputs, SerialEvaluate(model)))
-        for s in range(10)
+        findings(method.model_copy(update={"seed": s, "samples": 128}).run(inputs, AtOnce(model))) for s in range(10)
     ]
     assert told == [[]] * 10
 
@@ -222,7 +222,14 @@ def test_indices_beyond_their_bounds_are_errors_of_the_program(changes, said):
 # --- coverage ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["hinge", "jump", "oscillation", "absolute value", "peak"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hinge",
+        "jump",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("oscillation", "absolute value", "peak")),
+    ],
+)
 def test_intervals_cover_what_is_not_smooth(name):
     """A small part of the table of docs/measurements.md."""
     for method in (Chaos(samples=40, fields=False), QuasiMonteCarlo(samples=64, fields=False)):

@@ -29,7 +29,7 @@ def drawn(seed, counts):
 def test_intervals_hold_and_are_closer_than_those_of_the_model_alone():
     exact = np.exp(np.hypot(0.5, 0.03) * stats.norm.ppf(P))
     held, errors, alone = [], [], []
-    for seed in range(120):
+    for seed in range(60):
         found = quantiles_of_groups(drawn(seed, (60, 0, 1500)), np.ones(1), P)
         held.append((found.lower[:, 0] <= exact) & (exact <= found.upper[:, 0]))
         errors.append(found.central[:, 0] - exact)

@@ -63,7 +63,7 @@ def test_what_does_not_look_log_normal_has_no_spread():
     [
         (QuasiMonteCarlo(samples=256, control="none", fields=False), "1/ω, cv 0.5"),
         (QuasiMonteCarlo(samples=256, fields=False), "1/ω, cv 0.5"),
-        (Chaos(samples=64, fields=False), "product, cv 0.5"),
+        pytest.param(Chaos(samples=64, fields=False), "product, cv 0.5", marks=pytest.mark.slow),
         (Chaos(samples=64, fields=False), "1/ω, cv 1"),
     ],
     ids=("points", "tangent", "product", "reciprocal"),
@@ -151,19 +151,22 @@ ODD = {case.name: case for case in (*oddities.cases(), *held_out.first())}
         (QuasiMonteCarlo(samples=256, fields=False), "exp(0.7 z)"),
         pytest.param(QuasiMonteCarlo(samples=64, control="chaos", fields=False), "5 - exp(z)", marks=pytest.mark.slow),
         (QuasiMonteCarlo(samples=64, control="chaos", fields=False), "sinh(z)"),
-        (QuasiMonteCarlo(samples=256, control="none", fields=False), "u^-0.25 − v^-0.25"),
+        pytest.param(
+            QuasiMonteCarlo(samples=256, control="none", fields=False), "u^-0.25 − v^-0.25", marks=pytest.mark.slow
+        ),
         (Chaos(samples=16, fields=False), "sinh(z)"),
         (Chaos(samples=64, gradients=False, fields=False), "sinh(z)"),
-        (Chaos(samples=64, gradients=False, fields=False), "ln(1 + exp(3 z))"),
-        (Chaos(samples=16, fields=False), "cosh(z)"),
-        (Chaos(samples=16, fields=False), "u^-0.45"),
+        pytest.param(Chaos(samples=64, gradients=False, fields=False), "ln(1 + exp(3 z))", marks=pytest.mark.slow),
+        pytest.param(Chaos(samples=16, fields=False), "cosh(z)", marks=pytest.mark.slow),
+        pytest.param(Chaos(samples=16, fields=False), "u^-0.45", marks=pytest.mark.slow),
         (Chaos(samples=16, gradients=False, fields=False), "1/(0.001 + u)"),
     ],
     ids=lambda value: value if isinstance(value, str) else value.kind,
 )
 def test_misses_are_not_silent(method, name):
     """Before, 17 to 75 % of these intervals missed the truth without a finding."""
-    assert measure(ODD[name], method, 25 if method.kind == "chaos" else 50).silent[1] <= 0.12
+    few = "chaos" in (method.kind, getattr(method, "control", None))
+    assert measure(ODD[name], method, 25 if few else 50).silent[1] <= 0.12
 
 
 @pytest.mark.unit

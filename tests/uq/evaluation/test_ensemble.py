@@ -1,10 +1,11 @@
 """Groups of ranks: same numbers as in one process, no hang when something breaks."""
 
+import sys
 import time
 
 import pytest
 
-from tests.launch import run_script
+from tests.launch import on_kept_ranks, run_script
 
 pytestmark = pytest.mark.mpi
 
@@ -117,11 +118,17 @@ for case in sys.argv[1:]:
 CASES = ("plain", "fails", "uneven", "many", "models", "passing")
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow), 3])  # two are two of three
+@pytest.mark.parametrize("ranks", [pytest.param(2, marks=pytest.mark.slow), 3])  # two are two of three
 def test_same_numbers_as_in_one_process(ranks):
     done = run_script(ranks, STUDY, *CASES)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [*CASES]
+
+
+def test_one_process_is_a_group_of_its_own(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["script", *CASES])
+    exec(compile(STUDY, "script", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.split() == [*CASES]
 
 
 def test_a_mistake_on_one_rank_stops_all_ranks():
@@ -133,7 +140,7 @@ def test_a_mistake_on_one_rank_stops_all_ranks():
 
 
 def test_a_method_that_gives_up_releases_the_other_ranks():
-    done = run_script(3, STUDY, "method")
+    done = on_kept_ranks(2, STUDY, "method")
     assert done.returncode == 1
     assert "caught the method gave up" in done.stdout
 
@@ -143,9 +150,9 @@ def test_ranks_that_cannot_be_split_evenly():
 from mpi4py import MPI
 from uq.evaluation.ensemble import Ensemble
 try:
-    Ensemble.split(MPI.COMM_WORLD, 2)
+    Ensemble.split(MPI.COMM_WORLD, 3)
 except ValueError as error:
     print(error)
 """
-    done = run_script(3, script)
-    assert "3 ranks cannot be split into groups of ranks_per_model = 2" in done.stdout
+    done = on_kept_ranks(2, script)
+    assert "2 ranks cannot be split into groups of ranks_per_model = 3" in done.stdout

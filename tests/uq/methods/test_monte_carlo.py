@@ -96,7 +96,7 @@ def beam():
 
     study = load(Path(__file__).parent.parent.parent.parent / "configs" / "tiny.toml")
     evaluate = SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names))
-    x, weights = roots_jacobi(8, 1, 1)  # Beta(2, 2) on [-1, 1]
+    x, weights = roots_jacobi(5, 1, 1)  # Beta(2, 2) on [-1, 1]
     lower, upper = np.array([[m.lower, m.upper] for m in study.parameters.values()]).T
     grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     values = evaluate(Request(lower + (upper - lower) * (grid + 1) / 2)).outputs

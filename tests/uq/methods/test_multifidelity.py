@@ -6,6 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy import stats
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
@@ -65,12 +66,18 @@ def waves(amplitude, tilt, missing=lambda a: False):
     return FunctionModel(value, ("a", "b"), ("f",))
 
 
+SEEDS = 100
+
+
 @pytest.mark.parametrize("reuse", [True, False])
 def test_unbiased_with_honest_errors_and_gain(reuse):
-    """Of 300 seeds 92 to 97 % of the intervals hold the truth (`python -m benchmarks multifidelity --only closed`)."""
+    """Of 300 seeds 92 to 97 % of the intervals hold the truth (`python -m benchmarks multifidelity --only closed`).
+
+    Of 100 it would be less than 88 % once in a hundred times; the same holds for fewer.
+    """
     evaluate = AtOnce(waves(0.3, 0.0), others={"c1": waves(0.27, 0.1)})
     rows = []
-    for seed in range(100):
+    for seed in range(SEEDS):
         # Without the pilot, few samples of the model are left, and claims are wider by Student's factor.
         samples = 60 if reuse else 120
         settings = {"cheap": cheap(0.05), "control": "none", "quantiles": (), "seed": seed}
@@ -81,7 +88,7 @@ def test_unbiased_with_honest_errors_and_gain(reuse):
     mean, mean_error, std, std_error, gain = np.array(rows).T
     for error, claim in ((mean - MEAN, mean_error), (std - np.sqrt(VARIANCE), std_error)):
         assert abs(error.mean()) < 3 * error.std() / np.sqrt(len(error))
-        assert (np.abs(error) < 1.96 * claim).mean() >= 0.88
+        assert (np.abs(error) < 1.96 * claim).sum() >= stats.binom.ppf(0.01, SEEDS, 0.94)
         assert np.sqrt((claim**2).mean()) == pytest.approx(error.std(), rel=0.3)
     true = VARIANCE / samples / ((mean - MEAN) ** 2).mean()
     assert true > 5
@@ -315,7 +322,7 @@ def test_a_comparison_takes_it():
         {"kind": "multifidelity", "control": "none", "cheap": cheap(0.02), "budgets": (40, 80)},
     )
     known = {"f": {"mean": MEAN, "std": np.sqrt(VARIANCE)}, "g": {"mean": 10 * MEAN + 1, "std": 10 * np.sqrt(VARIANCE)}}
-    method = Compare(methods=entries, reference={"kind": "given", "values": known}, repeats=12, textbook=0)
+    method = Compare(methods=entries, reference={"kind": "given", "values": known}, repeats=6, textbook=0)
     data = method.run(INPUTS, AtOnce(wave(0.3), others={"c1": wave(0.29, 0.1)}))
     errors = data["mean_rmse"].sel(output="f").values
     assert errors[1] < 0.6 * errors[0]

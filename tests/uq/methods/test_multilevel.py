@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy import stats
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
@@ -84,8 +85,11 @@ def test_a_single_term_is_the_estimate_from_sums():
         np.testing.assert_allclose(getattr(found, name), getattr(sums, name), rtol=1e-10)
 
 
+REPEATS = 60
+
+
 @cache
-def repeats(control, count=100):
+def repeats(control, count=REPEATS):
     """Deviations of mean and variance on the finest mesh, with the claimed errors, each (count,)."""
     rows = []
     mean, variance = exact(2)
@@ -104,8 +108,9 @@ def test_unbiased_on_the_finest_mesh_with_honest_errors(control):
     mean, mean_error, variance, variance_error = repeats(control)
     for deviation, error in ((mean, mean_error), (variance, variance_error)):
         assert abs(deviation.mean()) < 3 * deviation.std() / np.sqrt(len(deviation))
-        assert 0.88 <= (np.abs(deviation) < 1.96 * error).mean() <= 0.99
-        assert np.sqrt((error**2).mean()) == pytest.approx(deviation.std(), rel=0.2)
+        low, high = stats.binom.ppf([0.003, 0.97], REPEATS, 0.95)  # of 100, 88 and 99
+        assert low <= (np.abs(deviation) < 1.96 * error).sum() <= high
+        assert np.sqrt((error**2).mean()) == pytest.approx(deviation.std(), rel=2 / np.sqrt(REPEATS))
 
 
 def test_controls_are_worth_what_they_say():
@@ -432,7 +437,7 @@ def test_a_mesh_that_is_too_large_is_refused():
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("control", CONTROLS)
-@pytest.mark.parametrize("levels", [2, 3])
+@pytest.mark.parametrize("levels", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_pictures_have_axes_with_units(control, levels):
     data = MultilevelMonteCarlo(samples=20, levels=levels, control=control).run(INPUTS, hierarchy(levels))
     data = data.assign_coords(unit=("output", ["m", "1"]))
@@ -464,7 +469,9 @@ def small(tmp_path_factory):
     place = tmp_path_factory.mktemp("multilevel")
     text = (ROOT / "configs" / "tiny.toml").read_text()
     (place / "small.toml").write_text(text[: text.index("[method]")] + METHOD)
-    done = in_process("run", place / "small.toml", *SMALL, "--out", place / "out")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plots, "svg", lambda ax: b"<svg/>")  # the pictures are drawn in a test of their own
+        done = in_process("run", place / "small.toml", *SMALL, "--out", place / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads((place / "out" / "summary.json").read_text())["outputs"]["uy_max"]
     (line,) = (line for line in done.stdout.splitlines() if f" {found['mesh_error'] / 0.01:+.2g} " in line)  # in cm

@@ -120,17 +120,15 @@ def leaning(deviations):
     [  # what the controls are exact for is in a test of its own
         *(("product", control) for control in CONTROLS if control != "chaos"),
         pytest.param("product", "chaos", marks=pytest.mark.slow),
-        *(("ishigami", control) for control in ("tangent", "quadratic")),
-        *(pytest.param("ishigami", control, marks=pytest.mark.slow) for control in ("none", "chaos")),
         *(
             pytest.param(name, control, marks=pytest.mark.slow)
-            for name in ("linear", "quadratic")
+            for name in ("ishigami", "linear", "quadratic")
             for control in CONTROLS
         ),
     ],
 )
 def test_mean_and_variance_are_unbiased(name, control):
-    mean, _, variance, _ = repeats(CASES[name], 60, samples=32, scrambles=4, control=control)
+    mean, _, variance, _ = repeats(CASES[name], 40, samples=32, scrambles=4, control=control)
     assert is_unbiased(mean, CASES[name][2])
     assert is_unbiased(variance, CASES[name][3])
 
@@ -142,7 +140,7 @@ def test_a_control_of_which_the_mean_is_not_known_would_be_noticed(monkeypatch):
         of = partial(lambda control, _, *rest, **fields: control(elsewhere, *rest, **fields), control)
         monkeypatch.setattr(quasi_monte_carlo, name, of)
     for control in ("tangent", "quadratic"):
-        mean, _, _, _ = repeats(PRODUCT, 60, samples=32, scrambles=4, control=control)
+        mean, _, _, _ = repeats(PRODUCT, 40, samples=32, scrambles=4, control=control)
         assert not is_unbiased(mean, PRODUCT[2])
 
 
@@ -223,7 +221,7 @@ def test_claimed_intervals_cover_where_controls_are_useless(control, coefficient
     ],
 )
 def test_claimed_intervals_cover(control, coefficient):
-    check_coverage(PRODUCT, 250, samples=256, control=control, coefficient=coefficient)
+    check_coverage(PRODUCT, 120, samples=256, control=control, coefficient=coefficient)
 
 
 @pytest.mark.slow
@@ -232,12 +230,18 @@ def test_claimed_intervals_cover_with_a_chaos_control():
 
 
 def check_coverage(of, count, **settings):
-    """The 95 % intervals of Student's distribution for 16 scrambles cover the mean in 92 to 98 % of the repeats."""
+    """The 95 % intervals of Student's distribution for 16 scrambles cover the mean in 92 to 98 % of 250 repeats.
+
+    Of few, in as many as are as probable.
+    """
     mean, mean_error, variance, variance_error = repeats(of, count, **settings)
     t = stats.t.ppf(0.975, 15 if settings["coefficient"] == "one" else 14)
-    assert 0.92 <= (np.abs(mean) < t * mean_error).mean() <= 0.98
+    few = count < 200
+    low, high = stats.binom.ppf([0.015, 0.988], count, 0.95) / count if few else (0.92, 0.98)
+    assert low <= (np.abs(mean) < t * mean_error).mean() <= high
     t = stats.t.ppf(0.975, 15 if settings["coefficient"] == "one" else 13)
-    assert 0.91 <= (np.abs(variance) < t * variance_error).mean() <= 0.99
+    low, high = stats.binom.ppf([0.004, 0.9985], count, 0.95) / count if few else (0.91, 0.99)
+    assert low <= (np.abs(variance) < t * variance_error).mean() <= high
 
 
 @pytest.mark.parametrize("name", ["ishigami", "product"])
@@ -260,7 +264,7 @@ def test_controls_are_exact_where_the_model_is_their_polynomial(coefficient):
 
 
 def test_the_better_the_control_the_smaller_the_error():
-    errors = [repeats(PRODUCT, 12, samples=64, control=control) for control in CONTROLS]
+    errors = [repeats(PRODUCT, 6, samples=64, control=control) for control in CONTROLS]
     none, tangent, quadratic, chaos = (np.sqrt((e**2).mean(axis=1)) for e in errors)
     for estimate in (0, 1, 2, 3):
         assert 2 * quadratic[estimate] < tangent[estimate] < none[estimate]
@@ -396,19 +400,19 @@ def test_an_expansion_is_held_beyond_its_samples_where_it_goes_wrong():
     root, w = np.sqrt(0.1 + 81 * x**2), w * np.exp(-81 * x**2 / 2)
     w = w / w.sum()
     exact = np.sqrt(w @ root**2 - (w @ root) ** 2 + 1)
-    for seed in range(8):  # up to 11 times the standard deviation off, and 95 % intervals that missed it
+    for seed in range(4):  # up to 11 times the standard deviation off, and 95 % intervals that missed it
         data = QuasiMonteCarlo(samples=64, control="chaos", seed=seed).run(inputs, AtOnce(model))
         assert data["std"].item() == pytest.approx(exact, rel=0.15)
 
 
-def test_borehole():
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_borehole(seed):
     """A log-normal parameter that does next to nothing made the standard deviation 4.6e5 ± 4e-7 in place of 28.596."""
     model = FunctionModel(skewed.borehole, skewed.INPUTS.names, ("flow",), skewed.slopes)
-    for seed in (0, 2):
-        data = QuasiMonteCarlo(samples=256, control="chaos", seed=seed).run(skewed.INPUTS, AtOnce(model))
-        assert data["mean"].item() == pytest.approx(73.739, rel=1e-3)
-        assert data["std"].item() == pytest.approx(28.596, rel=1e-3)
-        assert 1e-5 < data["std_error"].item() / 28.596 < 1e-2
+    data = QuasiMonteCarlo(samples=256, control="chaos", seed=seed).run(skewed.INPUTS, AtOnce(model))
+    assert data["mean"].item() == pytest.approx(73.739, rel=1e-3)
+    assert data["std"].item() == pytest.approx(28.596, rel=1e-3)
+    assert 1e-5 < data["std_error"].item() / 28.596 < 1e-2
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -487,14 +491,14 @@ def test_tolerance_is_met_by_doubling():
         return model.function(p)
 
     counted = replace(model, function=counting)
-    data = QuasiMonteCarlo(tolerance=1e-5, seed=1).run(inputs, SerialEvaluate(counted))
+    data = QuasiMonteCarlo(tolerance=4e-5, seed=1).run(inputs, SerialEvaluate(counted))
     n = data.sizes["sample"]
-    assert data["mean_error"].item() <= 1e-5 * data["mean"].item()
+    assert data["mean_error"].item() <= 4e-5 * data["mean"].item()
     assert 64 < n < 100_000
     assert n == 16 * 2 ** int(np.log2(n / 16))
     assert len(asked) == 1 + n, "no point is asked for twice"
     assert re.fullmatch(
-        r"tolerance 1e-05 met: relative error .* samples \(16 scrambles of \d+ Sobol' points\)", data.stopped
+        r"tolerance 4e-05 met: relative error .* samples \(16 scrambles of \d+ Sobol' points\)", data.stopped
     )
     fixed = QuasiMonteCarlo(samples=n, seed=1).run(inputs, SerialEvaluate(model))
     assert fixed["mean"].item() == data["mean"].item()
@@ -705,8 +709,14 @@ def beam():
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("coefficient", ["one", "optimal"])
-@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize(
+    ("control", "coefficient"),
+    [
+        *((control, "one") for control in CONTROLS),
+        ("tangent", "optimal"),
+        *(pytest.param(control, "optimal", marks=pytest.mark.slow) for control in ("none", "quadratic", "chaos")),
+    ],
+)
 def test_field_agrees_with_scalar(beam, control, coefficient):
     """The largest displacement is that of a corner of the free end at every sample, so its moments are the field's."""
     inputs, evaluate = beam

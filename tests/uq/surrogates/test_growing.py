@@ -57,7 +57,9 @@ def sampled(beam, method, monkeypatch=None):
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("kind", [MonteCarlo, SensitivityMonteCarlo, QuasiMonteCarlo])
+@pytest.mark.parametrize(
+    "kind", [MonteCarlo, pytest.param(SensitivityMonteCarlo, marks=pytest.mark.slow), QuasiMonteCarlo]
+)
 def test_later_samples_begin_closer_and_end_at_the_same_states(beam, kind, monkeypatch):
     method = kind(samples=128, **({"scrambles": 4} if kind is QuasiMonteCarlo else {}))
     dataset, asked = sampled(beam, method)
