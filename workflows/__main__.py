@@ -1,4 +1,4 @@
-"""The command line: tissuq check | run | report | reduce | live | serve | init | schema | completion."""
+"""The command line: tissuq check | run | solve | report | reduce | live | serve | init | schema | completion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from workflows.studies.study import StudyKind
+    from workflows.studies.study import Sampled, StudyKind
 
 # One thread per rank: ranks are the parallelism, and BLAS threads would compete with them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -116,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
 
     check = added("check", _check, "validate a study and print what it will cost")
     run = added("run", _run, "run a study, or continue it (under mpirun for several ranks)")
+    solve = added("solve", _solve, "solve once, at the means of the parameters of a study, and print the outputs")
     report = added("report", _report, "rebuild the report of results; several are compared side by side")
     serve = added("serve", _serve, "serve the model of a study to other programs by UM-Bridge")
     reduce = added("reduce", _reduce, "make a reduced model of the body of a study, over its random parameters")
@@ -128,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts devices on other machines too")
     live.add_argument("--no-token", action="store_true", help="serve everyone who reaches the ports")
     live.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    for command in (check, run, reduce, serve):
+    for command in (check, run, solve, reduce, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
         command.add_argument(
             "--set",
@@ -194,6 +195,21 @@ def _run(options: argparse.Namespace) -> int:
     return _run_study(options, _load(options), options.study.stem)
 
 
+def _solve(options: argparse.Namespace) -> str:
+    from workflows.solve import solved
+
+    return solved(_sampled(options, "solve"))
+
+
+def _sampled(options: argparse.Namespace, to_do: str) -> Sampled:
+    from workflows.config.mistakes import StudyError
+
+    study = _load(options)
+    if study.sampled is None:
+        raise StudyError(f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to {to_do}")
+    return study.sampled
+
+
 def _reduce(options: argparse.Namespace) -> int:
     from workflows.config.study import kind_of
     from workflows.studies.reduction import OTHER_METHOD
@@ -238,13 +254,9 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from workflows.config.mistakes import StudyError
     from workflows.serve import serve
 
-    study = _load(options)
-    if study.sampled is None:
-        raise StudyError(f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve")
-    serve(study.sampled, options.port, options.host, quiet=options.quiet)
+    serve(_sampled(options, "serve"), options.port, options.host, quiet=options.quiet)
     return DONE
 
 

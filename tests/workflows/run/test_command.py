@@ -192,6 +192,36 @@ def test_a_model_on_two_ranks_agrees(finished, tmp_path):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+def test_one_solve_at_the_means(finished):
+    """The value at the mean parameters that a study states; ranks share the body, and the first of them prints."""
+    stated = xr.load_dataset(finished / "results.nc")["nominal"]
+    script = "import sys; from workflows.__main__ import main; code = main(['solve', sys.argv[1]]); print(*sys.modules)"
+    done = run_script(None, script, TINY)
+    assert done.returncode == 0, done.stderr
+    first, _, means, took, names = done.stdout.splitlines()
+    assert not {"xarray", "pandas", "chaospy", "matplotlib", "h5py"} & set(names.split())
+    name, value, unit = first.split()
+    assert (name, unit) == ("uy_max", "cm")
+    assert float(value) == pytest.approx(100 * stated.sel(output="uy_max").item(), rel=1e-5)
+    assert means == "at the means: loads.gravity.density = 750, material.D1 = 300,000"
+    assert "error of the mesh not known" in took
+    shared = tissuq_on_two_ranks("solve", TINY)
+    assert shared.stdout.splitlines()[:3] == done.stdout.splitlines()[:3]
+
+
+@pytest.mark.fem
+def test_what_has_no_single_model_or_no_answer_is_not_solved():
+    done = in_process("solve", ROOT / "configs" / "inclusion.toml")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "is of kind 'invert', expected a study of one model to solve" in done.stderr
+    far = 'parameters."loads.gravity.density"={ kind = "uniform", lower = 1e6, upper = 1e7 }'
+    done = in_process("solve", TINY, "--set", far)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("failed: stopped at")
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
 def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     # Kills while errors of the mesh are estimated are in tests/workflows/studies/test_mesh_error.py.
     arguments = ("run", TINY, "--set", "method.samples=240", "--set", "mesh_error=false", "--no-report", "--out")
