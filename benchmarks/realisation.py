@@ -79,7 +79,7 @@ def rows(cells: tuple[int, int, int]) -> None:
             with timed(fast[k], i):
                 solution = model.solve(point, predict(point))
             work = solution.work
-            audited[i] = work.audits > 0
+            audited[i] |= work.audits > 0
             corrections[k, i] = work.back_substitutions - work.audit_back_substitutions
             if i % SIZES[cells] == 0:
                 require_same(solution.state, states[i])
