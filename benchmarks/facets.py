@@ -9,7 +9,6 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-import sympy
 from mpi4py import MPI
 from scipy.integrate import solve_bvp
 
@@ -93,6 +92,8 @@ def octant(cell: str, along: int, layers: int) -> tuple[FloatArray, IntArray]:
 
 def exact() -> FloatArray:
     """Return the outputs by collocation: dP/dR + 2 (P − S)/R = 0 with the nominal stresses P along R and S across."""
+    import sympy
+
     along, across = sympy.symbols("along across")
     J = along * across**2
     W = C1 * (J ** sympy.Rational(-2, 3) * (along**2 + 2 * across**2) - 3) + D1 * (J - 1) ** 2
