@@ -211,11 +211,9 @@ class Saturation:
         What is added to these errors (m,) then, where what is seen and what is true do not go together; at other
         solutions, in proportion to the outputs. None for zeros.
     doubts
-        How far the calibrated errors (m,) may be wrong at the solution where this was found; None where that is not
-        known.
+        How far the calibrated errors (m,) may be wrong at the solution where this was found; None where not known.
     hidden
-        What flat facets hide of a curved surface, in the outputs (m,) there, which richer elements do not see; None
-        where that is nothing, NaN where it is not known.
+        What flat facets of a curved surface hide in the outputs (m,) there; None for nothing, NaN where not known.
     """
 
     outputs: FloatArray
