@@ -201,10 +201,8 @@ class Saturation:
     ----------
     outputs
         What the estimated errors of the outputs (m,) have to be multiplied by; NaN where there is no estimate.
-    state
-        The same of the state.
-    energy
-        The same of the energy of the difference.
+    state, energy
+        The same of the state, and of the energy of the difference.
     measured
         Whether they were found for this model; typical values if not.
     shifts
