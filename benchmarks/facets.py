@@ -12,8 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.integrate import solve_bvp
 
-from forward.bodies.hexahedra import FACES
-from forward.bodies.mesh import TETRAHEDRA, IntArray
+from forward.bodies.mesh import FACES, TETRAHEDRA, IntArray
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray
 
@@ -30,14 +29,15 @@ def main() -> None:
     print(f"| cells | {' | '.join(f'{name}: error, mesh ± doubt, facets' for name in NAMES)} |\n|{'---|' * 5}")
     with tempfile.TemporaryDirectory() as folder:
         for cell, along, layers in MESHES:
-            solution = body(Path(folder), cell, along, layers).build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+            spec = body(Path(folder), cell, along, layers)
+            solution = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
             known = solution.saturation()
             assert known.doubts is not None
             assert known.hidden is not None
             of_mesh = solution.mesh_error().calibrated(known).outputs
             parts = 100 * np.array([true - solution.outputs, of_mesh, known.doubts, known.hidden]) / solution.outputs
             found = (f"{error:.2f}, {e:.2f} ± {doubt:.2f}, {hidden:.2f}" for error, e, doubt, hidden in parts.T)
-            print(f"| {3 * along**2 * layers} × {cell} | {' | '.join(found)} |", flush=True)
+            print(f"| {spec.body.cells_in_words} × {cell} | {' | '.join(found)} |", flush=True)
 
 
 def body(folder: Path, cell: str, along: int, layers: int) -> Hyperelastic:
@@ -45,7 +45,7 @@ def body(folder: Path, cell: str, along: int, layers: int) -> Hyperelastic:
     points, cells = octant(cell, along, layers)
     radii, facets, tags = np.linalg.norm(points, axis=1), [], []
     for corners in cells:
-        for face in FACES if cell == "hexahedron" else [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]:
+        for face in FACES[cell]:
             on = corners[face]
             places = {5: radii[on] - INNER, **{7 + axis: points[on, axis] for axis in range(3)}}
             for tag in (tag for tag, away in places.items() if np.abs(away).max() < 1e-9):

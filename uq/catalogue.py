@@ -130,8 +130,8 @@ TABLE: dict[str, str | Words] = {
     "facets": "The surface is curved, and the faces of its cells are flat: what lies between them changes outputs at "
     "the mean parameters by about this much: {about}. Estimates of the error of the mesh do not see it, nor does a "
     "mesh that is divided here; it is part of their doubt (mesh_error_doubt). Mesh the body again with smaller cells.",
-    "facets-unknown": "The surface is curved, and the faces of its cells are flat: what lies between them does is not "
-    "known, since there is no answer with the surface moved by as much. Compare with a mesh of smaller cells.",
+    "facets-unknown": "The surface is curved, and the faces of its cells are flat: the effect of what lies between is "
+    "not known, since there is no answer with the surface moved by as much. Compare with smaller cells.",
     "solves-chosen": "Full solves were chosen where cheap models differ: {chosen:,} of {points:,} points, with "
     "probabilities from {least:.2g} to {most:.2g} that grow with the difference of '{first}' and '{second}', and "
     "weighted by their inverse. Another choice would change the errors, but not what is estimated.",

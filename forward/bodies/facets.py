@@ -18,11 +18,11 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
-from forward.bodies.mesh import EDGES, FACES, IntArray, Loaded
+from forward.bodies.mesh import EDGES, IntArray, Loaded, surface_of
 from forward.model import FloatArray
 
 CREASE = np.cos(np.radians(40.0))  # cosine of the angle between facets from which on they are of two parts
-FLAT = 1e-6  # of the length of an edge: heights of facets that are rounding
+FLAT = 1 - 1e-6  # that above which they are in one plane
 FITS = 3  # of a quadratic surface, each with the normal of the one before
 ROUND = 6  # neighbours at least, of the five numbers of such a surface
 PARALLEL = 0.2  # singular value below which normals of parts that meet are the same
@@ -40,41 +40,38 @@ def lifted(mesh: Loaded) -> Loaded | None:
     joined = csr_matrix((np.ones(smooth.sum()), pairs[smooth].T), shape=(len(facets),) * 2)
     _, part = connected_components(joined, directed=False)
     bent = np.zeros(part.max() + 1, dtype=bool)
-    bent[part[pairs[smooth & (turns < 1 - FLAT), 0]]] = True
+    bent[part[pairs[smooth & (turns < FLAT), 0]]] = True
     if not bent.any():
         return None
-    n = len(mesh.points)
     seen: dict[int, list[tuple[FloatArray, float]]] = {}  # normals of the parts at a vertex, and heights along them
     for number in range(len(bent)):
-        own = facets[part == number]
+        own, normal = facets[part == number], normals[part == number]
         vertices = np.unique(own)
         if bent[number]:
-            along, heights = _heights(mesh.points, own, vertices, _normals_at(vertices, own, normals[part == number]))
+            along, heights = _heights(mesh.points[vertices], np.searchsorted(vertices, own), normal)
         else:
-            along, heights = np.tile(normals[part == number][0], (len(vertices), 1)), np.zeros(len(vertices))
-        for vertex, normal, height in zip(vertices.tolist(), along, heights.tolist(), strict=True):
-            seen.setdefault(vertex, []).append((normal, height))
-    shifts = np.zeros((n, 3))
+            along, heights = np.tile(normal[0], (len(vertices), 1)), np.zeros(len(vertices))
+        for vertex, one, height in zip(vertices.tolist(), along, heights.tolist(), strict=True):
+            seen.setdefault(vertex, []).append((one, height))
+    shifts = np.zeros(mesh.points.shape)
     for vertex, parts in seen.items():
         shifts[vertex] = np.linalg.pinv([one for one, _ in parts], rcond=PARALLEL) @ [height for _, height in parts]
-    longest = np.linalg.norm(np.ptp(mesh.points[facets], axis=1), axis=1).max()
-    if np.abs(shifts).max() < FLAT * longest:
-        return None
     return replace(mesh, points=mesh.points + _followed(mesh, np.array(sorted(seen)), shifts))
 
 
 def _surface(mesh: Loaded) -> tuple[IntArray, FloatArray]:
     """Facets (n, 3 or 4) of the surface, and their normals (n, 3) outwards."""
-    faces = mesh.cells[:, FACES[mesh.cell]]
-    flat = faces.reshape(-1, faces.shape[2])
-    _, first, count = np.unique(np.sort(flat, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = first[count == 1]
-    facets, corners = flat[outer], mesh.points[flat[outer]]
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1])
+    facets, owners = surface_of(mesh.cells, mesh.cell)
+    corners = mesh.points[facets]
+    normals = _crossed(corners)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    inside = mesh.points[mesh.cells].mean(axis=1)[outer // faces.shape[1]]
-    inwards = ((corners.mean(axis=1) - inside) * normals).sum(axis=1) < 0
-    return facets, np.where(inwards[:, None], -normals, normals)
+    outwards = corners.mean(axis=1) - mesh.points[mesh.cells[owners]].mean(axis=1)
+    return facets, np.where(((outwards * normals).sum(axis=1) < 0)[:, None], -normals, normals)
+
+
+def _crossed(corners: FloatArray) -> FloatArray:
+    """Normals (n, 3) of facets with these corners (n, 3 or 4, 3), twice as long as they are large."""
+    return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]))
 
 
 def _neighbours(facets: IntArray) -> IntArray:
@@ -86,45 +83,34 @@ def _neighbours(facets: IntArray) -> IntArray:
     return np.asarray(np.column_stack([order[same], order[same + 1]]) // facets.shape[1])
 
 
-def _normals_at(vertices: IntArray, facets: IntArray, normals: FloatArray) -> FloatArray:
-    """Means (n, 3) of the normals of the facets around vertices."""
-    sums = np.zeros((len(vertices), 3))
-    for corner in facets.T:
-        np.add.at(sums, np.searchsorted(vertices, corner), normals)
-    return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
+def _heights(points: FloatArray, facets: IntArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normals (n, 3) of a curved part at its vertices, and mean heights (n,) of the surface above the facets there.
 
-
-def _heights(
-    points: FloatArray, facets: IntArray, vertices: IntArray, normals: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Normals (n, 3) of a curved part at its vertices, and mean heights (n,) of the surface above the facets there."""
-    local = np.searchsorted(vertices, facets)
-    n, corners = len(vertices), local.shape[1]
-    links = np.stack([np.repeat(local, corners, axis=1).ravel(), np.tile(local, (1, corners)).ravel()])
-    near = csr_matrix((np.ones(links.shape[1]), links), shape=(n, n))
+    Of its points (n, 3), and its facets (k, 3 or 4) with their normals (k, 3).
+    """
+    n, (count, corners) = len(points), facets.shape
+    around = csr_matrix((np.ones(facets.size), (facets.ravel(), np.repeat(np.arange(count), corners))), (n, count))
+    near = around @ around.T
     wider = csr_matrix(near @ near)
-    at = points[vertices]
-    normals, forms = normals.copy(), np.zeros((n, 3, 3))
+    along, forms = around @ normals, np.zeros((n, 3, 3))
     for i in range(n):
-        around = wider.indices[wider.indptr[i] : wider.indptr[i + 1]]
-        if len(around) <= ROUND:
-            around = csr_matrix(wider[[i]] @ wider).indices
-        normals[i], forms[i] = _quadratic(at[around[around != i]] - at[i], normals[i])
-    ends = np.stack([local, np.roll(local, -1, axis=1)], axis=2)  # of the edges around each facet
-    edges = at[ends[..., 1]] - at[ends[..., 0]]
-    bent = np.einsum("fei,fekij,fej->fek", edges, forms[ends], edges)
-    heights = -bent.mean(axis=2).sum(axis=1) / 24
-    first, last = at[local[:, 2]] - at[local[:, 0]], at[local[:, -1]] - at[local[:, 1]]
-    areas = np.linalg.norm(np.cross(first, last), axis=1)
-    weights, sums = np.zeros(n), np.zeros(n)
-    for corner in local.T:
-        np.add.at(weights, corner, areas)
-        np.add.at(sums, corner, areas * heights)
-    return normals, sums / weights
+        others = wider.indices[wider.indptr[i] : wider.indptr[i + 1]]
+        if len(others) <= ROUND:
+            others = csr_matrix(wider[[i]] @ wider).indices
+        along[i], forms[i] = _quadratic(points[others[others != i]] - points[i], along[i])
+    ends = np.stack([facets, np.roll(facets, -1, axis=1)], axis=2)  # of the edges around each facet
+    edges = points[ends[..., 1]] - points[ends[..., 0]]
+    heights = -np.einsum("fei,fekij,fej->f", edges, forms[ends], edges) / 48  # means of both ends
+    areas = np.linalg.norm(_crossed(points[facets]), axis=1)
+    return along, (around @ (areas * heights)) / (around @ areas)
 
 
 def _quadratic(around: FloatArray, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normal (3,) and second fundamental form (3, 3) of the quadratic surface through 0 that is nearest to points."""
+    """Normal (3,) and second fundamental form (3, 3) of the quadratic surface through 0 that is nearest to points.
+
+    The normal given is about that, of any length.
+    """
+    normal = normal / np.linalg.norm(normal)
     squares = (around**2).sum(axis=1)
     weights = 1 / np.sqrt(squares + squares.mean())
     form = np.zeros((3, 3))

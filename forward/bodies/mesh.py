@@ -128,9 +128,15 @@ def twins_of(points: FloatArray) -> int:
 
 def surface_faces(cells: IntArray, cell: str) -> IntArray:
     """Return the faces (n, 3 or 4) that belong to one cell, by their vertices."""
+    return surface_of(cells, cell)[0]
+
+
+def surface_of(cells: IntArray, cell: str) -> tuple[IntArray, IntArray]:
+    """Return the faces (n, 3 or 4) that belong to one cell, by their vertices, and the numbers (n,) of these cells."""
     faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(faces[first[count == 1]])
+    outer = first[count == 1]
+    return np.asarray(faces[outer]), np.asarray(outer // len(FACES[cell]))
 
 
 def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, IntArray, int]:

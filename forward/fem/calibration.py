@@ -160,12 +160,12 @@ class FinerMesh:
         return tuple(self._model.parameters[i] for i in self._scalars)
 
     @cached_property
-    def _lifted(self) -> tuple[Body, list[Functional]] | None:
+    def _lifted(self) -> LoadedBody | None:
         """The body with its surface moved by what its facets hide; None where they hide nothing.
 
         Outputs at points that do not lie in it are those at the nearest places, which lie in both.
         """
-        model, spec, comm = self._model, self._model.spec, self._model.equations.comm
+        spec, comm = self._model.spec, self._model.equations.comm
         file = spec.body
         if file.kind != "mesh":
             return None
@@ -175,8 +175,14 @@ class FinerMesh:
             return None
         body = MeshInMemory.of(mesh, held, file)
         outputs = comm.bcast(None if mesh is None else tuple(output.within(body) for output in spec.outputs))
-        there = _once(model, spec.model_copy(update={"body": body, "outputs": outputs}), self._names)
-        return there, [output.functional(model.equations) for output in outputs]
+        return spec.model_copy(update={"body": body, "outputs": outputs})
+
+    @cached_property
+    def _moved(self) -> tuple[Body, list[Functional]]:
+        """That body for one solution, and its outputs on the mesh as it is."""
+        assert self._lifted is not None
+        here = [output.functional(self._model.equations) for output in self._lifted.outputs]
+        return _once(self._model, self._lifted, self._names), here
 
     def hidden(self, solution: FiniteElementSolution) -> FloatArray | None:
         """Return what flat facets hide of a curved surface in the outputs (m,); collective.
@@ -190,8 +196,8 @@ class FinerMesh:
                 return None
             if np.delete(solution.parameters, self._scalars).any():
                 return unknown
-            other, here = self._lifted
-            moved = other.solve(solution.parameters[self._scalars], Guess(solution.state))
+            body, here = self._moved
+            moved = body.solve(solution.parameters[self._scalars], Guess(solution.state))
         except (ModelError, SolveError):
             return unknown
         solution.visit()

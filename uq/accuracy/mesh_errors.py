@@ -180,8 +180,7 @@ def estimate(
             known = found.saturations[0]
     displaced = float(_factors(known["state"])) * np.vstack(states) if states else None
     measured = bool(known["measured"] == 1)
-    of_outputs = (known[name] for name in ("factors", "shifts", "doubts", "hidden"))
-    factors, shifts, doubts, hidden = of_outputs
+    factors, shifts, doubts, hidden = (known[name] for name in ("factors", "shifts", "doubts", "hidden"))
     return MeshErrors(merge(parts), displaced, factors, measured, shifts, doubts, hidden)
 
 

@@ -147,13 +147,13 @@ class _MeshErrors:
             self.errors[i] = found.outputs
         if self.saturations is None or self._spare is None:
             return
-        self.saturations[i]["hidden"] = 0.0
+        row = self.saturations[i]
+        row["hidden"] = 0.0
         try:
             factors = solution.saturation(self._spare)
         except SolveError:
             return
         if factors is not None:
-            row = self.saturations[i]
             row["factors"], row["state"], row["measured"] = factors.outputs, factors.state, factors.measured
             row["shifts"] = 0.0 if factors.shifts is None else factors.shifts
             row["doubts"] = np.nan if factors.doubts is None else factors.doubts
