@@ -23,7 +23,6 @@ from forward.model import FloatArray
 
 CREASE = np.cos(np.radians(40.0))  # cosine of the angle between facets from which on they are of two parts
 FLAT = 1 - 1e-6  # that above which they are in one plane
-FITS = 3  # of a quadratic surface, each with the normal of the one before
 ROUND = 6  # neighbours at least, of the five numbers of such a surface
 PARALLEL = 0.2  # singular value below which normals of parts that meet are the same
 
@@ -111,21 +110,16 @@ def _quadratic(around: FloatArray, normal: FloatArray) -> tuple[FloatArray, Floa
     The normal given is about that, of any length.
     """
     normal = normal / np.linalg.norm(normal)
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    x, y = (around @ tangents.T).T
     squares = (around**2).sum(axis=1)
     weights = 1 / np.sqrt(squares + squares.mean())
-    form = np.zeros((3, 3))
-    for _ in range(FITS):
-        tangents = np.linalg.svd(normal[None])[2][1:]
-        x, y = (around @ tangents.T).T
-        terms = np.column_stack([x, y, x * x / 2, x * y, y * y / 2])
-        sizes = np.linalg.norm(terms * weights[:, None], axis=0)
-        sizes[sizes == 0] = 1.0
-        found = np.linalg.lstsq(terms * weights[:, None] / sizes, weights * (around @ normal), rcond=1e-6)[0] / sizes
-        slopes, (xx, xy, yy) = found[:2], found[2:]
-        form = tangents.T @ np.array([[xx, xy], [xy, yy]]) @ tangents
-        normal = normal - slopes @ tangents
-        normal = normal / np.linalg.norm(normal)
-    return normal, form
+    terms = np.column_stack([x, y, x * x / 2, x * y, y * y / 2]) * weights[:, None]
+    sizes = np.linalg.norm(terms, axis=0)
+    sizes[sizes == 0] = 1.0
+    *slopes, xx, xy, yy = np.linalg.lstsq(terms / sizes, weights * (around @ normal), rcond=1e-6)[0] / sizes
+    normal = normal - slopes @ tangents
+    return normal / np.linalg.norm(normal), tangents.T @ np.array([[xx, xy], [xy, yy]]) @ tangents
 
 
 def _followed(mesh: Loaded, outer: IntArray, shifts: FloatArray) -> FloatArray:
