@@ -128,7 +128,7 @@ def test_the_shipped_map_of_stiffness_from_forces(tmp_path):
     found = xr.load_dataset(tmp_path / "map" / "results.nc").isel(data_set=0)
     prior = found["stiffness_prior_std"].to_numpy()
     assert (found["stiffness_std"].to_numpy() < prior).all()
-    places = np.column_stack([found[axis] for axis in "xyz"])
+    places = found["node_position"].to_numpy()
     for case in ("4-4", "16-4", "4-16", "16-16"):
         seen = places[(found["alone_stiffness_std"].sel(case=case).to_numpy() / prior).argmin()]
         at = np.array([float(number) for number in case.split("-")]) / 1e3
