@@ -104,9 +104,8 @@ TABLE: dict[str, str | Words] = {
     ),
     "mesh-unknown": "The error of the mesh is not known: {why}. What stands after ± does not hold it.",
     "mesh-estimates-disagree": Words(
-        "Richer elements and a finer mesh do not agree on the error of the mesh for {about}: where errors of "
-        "several places cancel, little more than their size is known (mesh_error_doubt). A finer mesh makes it "
-        "smaller.",
+        "Little more than the size of the error of the mesh is known for {about}: errors of several places cancel, "
+        "and what is left of them is not seen well (mesh_error_doubt). A finer mesh makes it smaller.",
         listed=8,
     ),
     "mesh-error-varies": "The error of the mesh does not follow from a few estimates for {about}: it varies with the "
@@ -126,7 +125,7 @@ TABLE: dict[str, str | Words] = {
     "that of the outputs says how large it may be.",
     "mesh-error-uncalibrated": "What part of the error of the mesh estimates see is not measured on a finer mesh, "
     "which would take too long for so few solves or too much memory, but typical: they are multiplied by "
-    "{factor:.2g}, and half of them is doubted (mesh_error_doubt).",
+    "{factor:.2g}, and half of them is doubted, or more where errors of several places cancel (mesh_error_doubt).",
     "facets": "The surface is curved, and the faces of its cells are flat: what lies between them changes outputs at "
     "the mean parameters by about this much: {about}. Estimates of the error of the mesh do not see it, nor does a "
     "mesh that is divided here; it is part of their doubt (mesh_error_doubt). Mesh the body again with smaller cells.",

@@ -32,6 +32,7 @@ LEAST, MOST = 0.5, 3.0  # factors
 # Where finding them takes too much memory: of linear elements, which see most, and of others at edges that are held.
 TYPICAL = {1: 1.1, 2: 1.35}
 RATES = np.geomspace(1e-3, 60.0, 2000)  # β
+OF_DEGREES, OF_TYPICAL = 0.25, 0.5  # doubt of an error that three degrees tell, and with a typical factor
 
 
 class FiniteElementSolution:
@@ -308,18 +309,38 @@ class FiniteElementSolution:
             found = finer.calibrated(self)
             if found is not None:
                 return found
-        if richer(spec) > allowance(spec, spare):
-            return typical(self.mesh_error().outputs, spec.body.degree)
-        return self._by_degrees()
+        return self._by_degrees() if richer(spec) <= allowance(spec, spare) else self._typical(self.mesh_error())
+
+    def _typical(self, error: MeshError) -> Saturation:
+        """Return what is typical of estimates with elements of this degree."""
+        factor = TYPICAL[self._model.spec.body.degree]
+        factors = np.where(np.isnan(error.outputs), np.nan, factor)
+        doubts = self._doubts(error, factors, OF_TYPICAL)
+        return Saturation(factors, factor, factor, measured=False, doubts=doubts)
+
+    def _doubts(self, error: MeshError, factors: FloatArray, share: float) -> FloatArray:
+        """How far errors of outputs times `factors` (m,) may be wrong: by a share of them.
+
+        Errors of outputs are of second order by Galerkin's orthogonality, as that of the energy is. What is smaller
+        than that, relative to the change from rest, is so since errors of several places cancel: then the share is of
+        what the error would be without.
+        """
+        equations = self.visit()
+        equations.set_state(np.zeros_like(self.state))
+        equations.linearisation_point.solution = None
+        at_rest = np.array([f.value() for f in self._model.functionals])
+        moved = self.outputs - self._seen(equations, np.zeros_like(self.state), lambda: at_rest)
+        usual = np.nan_to_num(error.relative) ** 2 * np.abs(moved)
+        return np.asarray(share * np.maximum(np.abs(factors * error.outputs), usual))
 
     def _by_degrees(self) -> Saturation:
         """Calibrate estimates by elements of two degrees more; typical values where that is too much or too rough."""
-        model = self._model
-        seen, degree = self.mesh_error().outputs, model.spec.body.degree
+        model, error = self._model, self.mesh_error()
+        seen, degree = error.outputs, model.spec.body.degree
         self.visit()
         twice = model.enriched_twice
         if twice is None:
-            return typical(seen, degree)
+            return self._typical(error)
         once, found = self.enriched_state, self.estimated(twice)
         n = 3 * model.equations.nodes_owned
         own, change = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
@@ -327,7 +348,9 @@ class FiniteElementSolution:
         (of_state,) = factors(products[0], products[1], degree)
         (of_energy,) = factors(once.energy, found.energy, degree)
         more = self._seen(twice.equations, found.state, lambda: twice.values(self, found)) - self.outputs
-        return Saturation(factors(seen, more, degree), float(of_state), float(of_energy))
+        of_outputs = factors(seen, more, degree)
+        doubts = self._doubts(error, of_outputs, OF_DEGREES)
+        return Saturation(of_outputs, float(of_state), float(of_energy), doubts=doubts)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:
         """Return contributions of this rank's cells to the mesh error of outputs, by `weights` (m,); collective.
@@ -368,9 +391,3 @@ def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.
     found[good] = np.clip(np.where(step > 0, powers, 1 + step), LEAST, MOST)
     found[np.isnan(one)] = math.nan
     return found
-
-
-def typical(seen: FloatArray, degree: int) -> Saturation:
-    """Return what is typical of elements of a degree, for outputs whose errors (m,) are seen."""
-    factor = TYPICAL[degree]
-    return Saturation(np.where(np.isnan(seen), np.nan, factor), factor, factor, measured=False)

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 
 POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
-DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
-ELSEWHERE, CHANGED = 0.15, 0.5  # the same of what was found at the mean, at other parameters, and where errors vary
-UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
+ELSEWHERE, CHANGED = 0.15, 0.5  # doubt of what calibrates at the mean, at other parameters, and where errors vary
+UNCALIBRATED = 0.5  # of an estimate whose doubt nobody says, relative to it: richer elements err too
 WITHOUT = {  # variables whose error of the mesh is not estimated
     "active_direction": "the active subspace",
     "field_sobol_first": "the Sobol' indices of the displacement field",
@@ -114,13 +113,13 @@ def with_mesh_errors(
 
 def unknown_of(found: MeshErrors) -> FloatArray:
     """What is not known of each calibrated error (m,), relative to it."""
-    usual = np.where(np.isfinite(found.saturation) & found.measured, DOUBT, UNCALIBRATED)
+    usual = np.full(len(found.doubts), UNCALIBRATED)
     if not len(found.points):
         return usual
     at_mean = np.abs(found.errors[0])
     known = np.isfinite(found.doubts) & (at_mean > 0)
     share = np.divide(found.doubts, at_mean, out=usual, where=known)
-    return np.where(known, np.hypot(share, np.hypot(ELSEWHERE, CHANGED * _spread(found))), usual)
+    return np.hypot(share, np.hypot(ELSEWHERE, CHANGED * _spread(found))) if found.measured else share
 
 
 def _spread(found: MeshErrors) -> FloatArray:

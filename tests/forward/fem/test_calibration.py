@@ -150,6 +150,28 @@ def solved(spec):
 
 
 @pytest.mark.fem
+def test_where_errors_cancel_the_typical_factor_is_doubted_more():
+    """Sheared and stretched, errors at both plates have opposite signs in the force, and at the point."""
+    moved = {"on": "z-max", "x": 0.2, "y": 0.0, "z": 0.05}
+    outputs = (
+        {"kind": "reaction", "name": "force", "on": "z-max", "component": "z"},
+        {"kind": "displacement", "name": "point", "at": (1.0, 0.5, 0.3), "component": "x"},
+        {"kind": "strain-energy", "name": "energy"},
+        {"kind": "max-von-mises", "name": "peak"},
+    )
+    solution = solved(block((3, 2, 2), outputs=outputs, displacements=(moved,)))
+    true = solved(block((6, 6, 6), 2, outputs=outputs, displacements=(moved,))).outputs - solution.outputs
+    found = solution.saturation(-1e9)
+    assert not found.measured
+    error = solution.mesh_error().calibrated(found).outputs
+    off, usual = np.abs(error - true)[:3], 0.5 * np.abs(error)[:3]
+    assert (off > usual).tolist() == [True, True, False]
+    assert (off <= found.doubts[:3]).all()
+    assert found.doubts[2] == pytest.approx(usual[2], rel=0.1)
+    assert np.isnan(found.doubts[3])
+
+
+@pytest.mark.fem
 @pytest.mark.slow
 def test_errors_on_a_curved_body_are_those_of_its_polyhedron(tmp_path):
     """Against the elements of one degree more on a mesh that is cut in four."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.fem.solution import LEAST, MOST, factors, typical
+from forward.fem.solution import LEAST, MOST, factors
 
 pytestmark = pytest.mark.unit
 
@@ -23,9 +23,3 @@ def test_what_is_no_power_is_bounded():
     np.testing.assert_allclose(found[[0, 1, 2, 3, 6, 7]], [1, MOST, 0.8, LEAST, 1.2, 1.2])
     assert 1.3 < found[4] < 2.0
     assert np.isnan(found[5])
-
-
-def test_what_is_typical_is_said_to_be():
-    found = typical(np.array([1.0, np.nan]), 2)
-    assert not found.measured
-    np.testing.assert_array_equal(found.outputs, [found.state, np.nan])
