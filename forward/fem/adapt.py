@@ -37,6 +37,7 @@ TIES = 1e-6  # indicators that differ by less, relative to each other, are equal
 TIMES = 2
 SEEN = 4  # last meshes from which the missed part of the error is estimated
 MOST = 3.0  # largest factor on an estimate
+LARGER = 1.25  # times an estimate with its factor: errors may be so large, and a tolerance holds for that
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def adapt(
         found = Adapted(mesh, indicators, held, cycles, None)
         before = None if finer.mixed else (model.equations, solution.state[None])
         say(_line(spec, cycle))
-        if (relative <= settings.tolerance).all():
+        if (LARGER * relative <= settings.tolerance).all():
             return found
         if marked is not None and indicators is not None:
             marked = marked.refined(largest(indicators), TIMES)
@@ -215,7 +216,7 @@ def _indicators(
     assert spec.adapt is not None
     named = np.array(spec.adapt.named(spec))
     relative, known = cycle.relative[named], named[cycle.sizes[named] > 0]
-    open_ones = relative > spec.adapt.tolerance
+    open_ones = LARGER * relative > spec.adapt.tolerance
     chosen = named[open_ones] if open_ones.any() else known
     if spec.adapt.indicator == "recovery" or not len(chosen):  # of a mesh too coarse for estimates, stresses tell
         equations = solution.visit()
