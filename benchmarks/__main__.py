@@ -47,6 +47,7 @@ NAMES = (
     "saddle",
     "sizes",
     "skewed",
+    "skewed_posteriors",
     "coverage",
     "meshes",
     "pgd",

@@ -249,12 +249,13 @@ def answer(posterior: Posterior, one: Assessment) -> Answer:
     if one.source == "chains":
         assert one.chains is not None
         return by_points("chains", one.chains.flat, even(len(one.chains.flat)))
-    return by_points("points", posterior.physical(one.evidence.density.x), one.evidence.weights)
+    x, weights = one.evidence.points
+    return by_points("points", posterior.physical(x), weights)
 
 
 def by_points(source: Source, points: FloatArray, weights: FloatArray) -> Answer:
-    """Return moments and quantiles of points (n, c) with weights (n,) of sum 1."""
-    used = weights > 0
+    """Return moments and quantiles of points (n, c) with weights (n,) of sum 1, some of which may be negative."""
+    used = weights != 0
     points, weights = points[used], weights[used]
     mean = weights @ points
     gaps = points - mean
@@ -302,7 +303,7 @@ def gaussian_points(gaussian: Laplace, count: int) -> FloatArray:
 
 
 def quantiles(values: FloatArray, weights: FloatArray, levels: Sequence[float]) -> FloatArray:
-    """Return quantiles of values (n,) at points with weights (n,) of sum 1."""
+    """Return quantiles of values (n,) at points with weights (n,) of sum 1, some of which may be negative."""
     order = np.argsort(values)
-    reached = np.cumsum(weights[order]) - weights[order] / 2
+    reached = np.maximum.accumulate(np.cumsum(weights[order]) - weights[order] / 2)
     return np.interp(levels, reached, values[order])

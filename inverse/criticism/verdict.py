@@ -67,11 +67,13 @@ def verdict_on_points(gaussian: Laplace, found: Evidence, chains: Chains | None 
         # A few points do not tell that more would not do.
         more = enough(found.ess, n, needed) if found.ess >= SOME else 0
         return _by_chains(said, chains, max(more, usual(c)) if n < usual(c) else more)
-    w, x = found.weights, found.density.x
+    if found.agreed:
+        said += "; a polynomial agrees with all"
+    x, w = found.points
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())
     ratio = np.log(np.sqrt(w @ (x - mean) ** 2) / width)
-    chance = 2 / np.sqrt(found.ess)
+    chance = 2 / np.sqrt(found.ess if found.many is None else 1 / (w @ w))
     worst = float(np.exp(ratio[np.abs(ratio).argmax()]))
     far = f"means are {shift:.2f} standard deviations from the mode, widths {worst:.2f} of the Gaussian's; {said}"
     if shift <= SHIFT + chance and np.abs(ratio).max() <= WIDTH + chance / np.sqrt(2):

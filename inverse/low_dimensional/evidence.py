@@ -20,11 +20,17 @@ than the better one. All points are weighted by the mixture of all the densities
 importance sampling: J.-M. Cornuet et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the proposals are
 right, and none is large where they are wrong and the first one was not. Points that were drawn several times count
 once, with the weights of all (`inverse.criticism.weights.quality`).
+
+Moments and quantiles need more points than that: of 250, six lie beyond an end of an interval. They are those of many
+points in the posterior of a polynomial, E_s[h], plus what solved points say of the difference, Σ (w_i − v_i) h_i with
+their weights w in the posterior and v in that of the polynomial: a control variate (B. Peherstorfer, K. Willcox, M.
+Gunzburger, SIAM Rev. 60 (2018) 550–591, section 3), where these weights have the smaller sum of squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -35,7 +41,7 @@ from inverse.criticism.weights import FEWEST, TRUSTED, normalised, quality, trus
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.proposals import Proposal, about, first, joint
-from inverse.low_dimensional.surrogate import SCRAMBLES, affordable, fit, sample, terms
+from inverse.low_dimensional.surrogate import SCRAMBLES, Cloud, affordable, fit, sample, terms
 from inverse.optional import imported
 from uq.inputs.sampling import sobol_points
 
@@ -44,6 +50,7 @@ QUARTERS = 4
 LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
 LIVE = 400  # points of nested sampling
 NOTHING = -1e300  # ln p(y | x) there where the model has no answer
+AGREED = 0.01  # of the posterior, root mean square over all its parts: what a polynomial may miss
 ROUNDED = 1e-9  # relative difference from a Gaussian that counts as rounding error
 
 Route = Literal["closed form", "importance", "surrogate"]
@@ -67,6 +74,9 @@ class Evidence:
         The posterior at the points.
     log_weights
         ln w (n,).
+    many
+        More points (N, c) with weights (N,) of sum 1, some of which are negative, that give moments and quantiles
+        better; None where there are none.
     """
 
     log_evidence: float
@@ -77,12 +87,30 @@ class Evidence:
     pareto_k: float
     density: Density
     log_weights: FloatArray
+    many: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """Points (N, c), and weights (N,) of sum 1, for moments and quantiles."""
+        return (self.density.x, self.weights) if self.many is None else self.many
 
     @property
     def trusted(self) -> bool:
         """Whether the estimate can be trusted."""
         different = len(np.unique(self.density.x, axis=0))
-        return self.route == "closed form" or trustworthy(self.pareto_k, self.ess, different)
+        weights = trustworthy(self.pareto_k, self.ess, different)
+        return self.route == "closed form" or weights or self.agreed
+
+    @property
+    def agreed(self) -> bool:
+        """Whether a polynomial tells the weights of all points that were solved: no share of the posterior is missed.
+
+        That counts for more than k̂, which takes a few larger weights of points of the prior for a tail.
+        """
+        if self.many is None:
+            return False
+        left = self.many[1][-len(self.log_weights) :]
+        return bool(left @ left <= AGREED**2)
 
     @property
     def weights(self) -> FloatArray:
@@ -134,15 +162,15 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     if opening is wide:
         # The others would see no more of what is far from the mode; polynomials do, and are right in few unknowns.
         if drawn.ess >= EVEN * quarter and drawn.pareto_k <= TRUSTED:
-            return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights")
+            return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights", gaussian)
     elif expected[best] >= EVEN:
         name = "Laplace's Gaussian" if best is normal else "Student's t about the mode"
         share += f", and all, with others from {name}, would be worth {100 * expected[best]:.0f} % of their number"
-        return _continued(posterior, pilot, best, seed, quarter, share)
+        return _continued(posterior, pilot, best, seed, quarter, share, gaussian)
     try:
         return _by_surrogate(posterior, pilot, gaussian, seed, quarter, f"{share}: uneven weights", expected[best])
     except SolveError as error:
-        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}")
+        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}", gaussian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,15 +181,29 @@ class _Part:
     log_over_prior: Callable[[FloatArray], FloatArray]
 
 
-def _weighted(parts: Sequence[_Part], route: Route, why: str) -> Evidence:
-    """Weight all points by the mixture of the densities they were drawn from, eight replicates in order."""
+def _weighted(parts: Sequence[_Part], route: Route, why: str, cloud: Cloud | None = None) -> Evidence:
+    """Weight all points by the mixture of the densities they were drawn from, eight replicates in order.
+
+    With a cloud, it stands for the posterior with what they differ from it.
+    """
     replicate = np.concatenate([np.arange(n) // (n // SCRAMBLES) for n in (len(part.density.x) for part in parts)])
     density = Density.joined([part.density for part in parts], np.argsort(replicate, kind="stable"))
     counts: dict[Callable[[FloatArray], FloatArray], int] = {}
     for part in parts:
         counts[part.log_over_prior] = counts.get(part.log_over_prior, 0) + len(part.density.x)
     log_over = joint(list(counts), [n / len(density.x) for n in counts.values()], density.x)
-    return weighed(density, density.log_likelihood - log_over, route, why)
+    found = weighed(density, density.log_likelihood - log_over, route, why)
+    return found if cloud is None else replace(found, many=_corrected(found, log_over, cloud))
+
+
+def _corrected(found: Evidence, log_over: FloatArray, cloud: Cloud) -> tuple[FloatArray, FloatArray] | None:
+    """Return points of a cloud and of an estimate with their weights; None where the cloud is no help."""
+    x, weights = found.density.x, found.weights
+    by_polynomial = cloud.surrogate.at(x).log_likelihood - log_over
+    if not np.isfinite(by_polynomial).any():
+        return None
+    many = np.concatenate([cloud.weights, weights - normalised(by_polynomial)])
+    return (np.concatenate([cloud.x, x]), many) if many @ many < weights @ weights else None
 
 
 def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -> Evidence:
@@ -187,12 +229,22 @@ def _drawn(posterior: Posterior, proposal: Proposal, seed: int, start: int, stop
 
 
 def _continued(
-    posterior: Posterior, parts: Sequence[_Part], proposal: Proposal, seed: int, quarter: int, why: str
+    posterior: Posterior,
+    parts: Sequence[_Part],
+    proposal: Proposal,
+    seed: int,
+    quarter: int,
+    why: str,
+    gaussian: Laplace | None = None,
 ) -> Evidence:
-    """Draw all quarters that are left from a proposal."""
+    """Draw all quarters that are left from a proposal; about a Gaussian, many points stand for them where they can."""
     done = sum(len(part.density.x) for part in parts)
     rest = _drawn(posterior, proposal, seed, done, QUARTERS * quarter, derivatives=False)
-    return _weighted([*parts, rest], "importance", why)
+    cloud = None
+    if gaussian is not None and affordable(len(posterior.inputs.names)):
+        with suppress(SolveError):
+            cloud = sample(fit(posterior, parts[0].density), gaussian, seed + 100)
+    return _weighted([*parts, rest], "importance", why, cloud)
 
 
 def _deviation(gaussian: Laplace, density: Density) -> FloatArray:
@@ -253,7 +305,7 @@ def _by_surrogate(
         picked = posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1)
         parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)
-        found = _weighted(parts, "surrogate", why)
+        found = _weighted(parts, "surrogate", why, cloud)
         if k == 1 and found.ess < otherwise * len(found.log_weights):
             raise SolveError(f"a polynomial makes them worth {found.ess:.0f} of {len(found.log_weights)}")
     # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density with a

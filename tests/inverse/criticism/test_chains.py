@@ -224,7 +224,7 @@ def test_verdicts_on_few_parameters():
     assert verdict_on_few(gaussian, found, test).trust == "corrected"
     lost = verdict_on_few(replace(gaussian, converged=False), found, test)
     assert (lost.trust, lost.why) == ("neither", "the search for the mode did not converge")
-    uneven = replace(found, pareto_k=0.9, ess=30.0)
+    uneven = replace(found, pareto_k=0.9, ess=30.0, many=None)
     assert "take method.samples = 1024, or run chains" in verdict_on_few(gaussian, uneven, test).why
     assert [enough(6, 64), enough(1.2, 64), enough(19, 40)] == [256, 1088, 160]
     short = chains_of_few(posterior, gaussian, lengths=replace(FEW, draws=10, burn=5))

@@ -1,0 +1,82 @@
+"""Moments and ends of intervals of skewed posteriors of few parameters, against quadrature."""
+
+import numpy as np
+import pytest
+
+from forward.pointwise import FunctionModel
+from inverse.criticism.assessment import Assessment, answer
+from inverse.data.noise import Noise
+from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.posterior import Posterior
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+
+CELLS = 2000
+LEVELS = (0.025, 0.975)
+
+
+def at_a_bound(p):
+    return p[:1]
+
+
+def saturating(p):
+    return p[:1] / (1 + p[:1])
+
+
+def bent(p):
+    return np.exp(p[:1]) + 0.3 * p[1:]
+
+
+CASES = {
+    "at a bound": (at_a_bound, lambda p: [[1.0]], {"a": Uniform(lower=0, upper=1)}, 0.02, 0.05),
+    "saturating": (saturating, lambda p: [[1 / (1 + p[0]) ** 2]], {"a": Uniform(lower=0, upper=50)}, 0.9, 0.05),
+    "bent": (
+        bent,
+        lambda p: [[np.exp(p[0]), 0.3]],
+        {"a": Normal(mean=0, std=1), "b": Normal(mean=0, std=1)},
+        1.0,
+        0.5,
+    ),
+}
+
+
+def posterior(case, seed):
+    """A posterior of one datum, and points of the prior with their weights in it."""
+    function, slopes, priors, datum, sigma = CASES[case]
+    data = np.array([datum + sigma * (np.random.default_rng(seed).normal() if seed else 0.0)])
+    inputs = Inputs(priors)
+    model = FunctionModel(function, tuple(priors), ("y",), lambda p: np.array(slopes(p)))
+    middles = (np.arange(CELLS) + 0.5) / CELLS
+    grid = np.stack(np.meshgrid(*[middles] * len(priors), indexing="ij"), axis=-1).reshape(-1, len(priors))
+    points = inputs.points(grid)
+    weights = np.exp(-0.5 * ((function(points.T)[0] - data[0]) / sigma) ** 2)
+    weights /= weights.sum()
+    return Posterior(inputs, SerialEvaluate(model), data, Noise(np.array([sigma]))), points, weights
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("seed", range(3))
+def test_moments_and_ends_are_those_of_the_posterior(case, seed):
+    """Of 256 points six lie beyond an end; and points of the prior, with larger weights, look like a tail."""
+    one, points, weights = posterior(case, seed)
+    mean = weights @ points
+    std = np.sqrt(weights @ (points - mean) ** 2)
+    gaussian = laplace(one)
+    found = evidence(one, gaussian, 256, seed=seed)
+    known = answer(one, Assessment(gaussian, found))
+    assert known.source == "points"
+    assert np.abs((known.mean - mean) / std).max() < 0.1
+    assert np.abs(known.std / std - 1).max() < 0.1
+    for below, level in zip(known.quantiles(LEVELS).T, LEVELS, strict=True):
+        assert np.abs(weights @ (points <= below) - level).max() < 0.0125  # half of what is outside an end
+
+
+def test_what_a_polynomial_misses_is_not_believed():
+    """With a jump that no polynomial follows, solved points are what counts."""
+    one, *_ = posterior("at a bound", 0)
+    jump = FunctionModel(lambda p: p[:1] + 0.1 * (p[0] > 0.03), ("a",), ("y",), lambda p: np.ones((1, 1)))
+    torn = Posterior(one.inputs, SerialEvaluate(jump), one.data, one.noise)
+    found = evidence(torn, laplace(torn), 256)
+    assert not found.agreed
