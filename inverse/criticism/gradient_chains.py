@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.phases import phase
 from inverse.criticism.chains import SPREAD, Chains, Lengths, in_units
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -56,6 +57,7 @@ class _Potential:
         return self._last[1:]
 
 
+@phase("running chains")
 def gradient_chains(
     posterior: Posterior,
     gaussian: Laplace,

@@ -31,6 +31,7 @@ from typing import Literal
 import numpy as np
 
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from inverse.criticism.weights import FEWEST, TRUSTED, normalised, quality, trustworthy
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
@@ -100,6 +101,7 @@ class Evidence:
         return float(self.log_evidence + top + np.log(ratio)), float(np.hypot(self.error, scatter))
 
 
+@phase("weighting points around the mode")
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
     """Estimate the evidence by `samples` solves around a Gaussian, by the route that the first of them suggest.
 
@@ -262,6 +264,7 @@ def _by_surrogate(
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))
 
 
+@phase("nested sampling")
 def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[float, float]:
     """Return ln Z and its standard error by nested sampling with `live` live points.
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.phases import phase
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, solves_of
 from inverse.criticism.comparison import Candidate, Compared, comparison
@@ -295,8 +296,9 @@ def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatAr
 
 @contextmanager
 def _of(pair: tuple[str, str]) -> Iterator[None]:
-    """Say of which candidate a model has no answer."""
+    """Say which candidate is looked at, and of which one a model has no answer."""
     try:
-        yield
+        with phase(pair[0]):
+            yield
     except SolveError as error:
         raise SolveError(f"candidate '{pair[0]}': {error.reason}", error.history) from None
