@@ -265,8 +265,10 @@ def _by_surrogate(
 
 
 @phase("nested sampling")
-def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[float, float]:
-    """Return ln Z and its standard error by nested sampling with `live` live points.
+def nested(
+    posterior: Posterior, *, seed: int = 0, live: int = LIVE, kept: Callable[..., float] = lambda x, solve: solve()
+) -> tuple[float, float]:
+    """Return ln Z and its standard error by nested sampling with `live` live points; what was `kept` is not solved.
 
     It shares only the likelihood with the other routes (J. Skilling, Bayesian Anal. 1 (2006) 833–860; by dynesty: J. S.
     Speagle, Mon. Not. R. Astron. Soc. 493 (2020) 3132–3158), and takes ten thousand solves or more: for cheap models.
@@ -280,7 +282,7 @@ def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[fl
     from scipy.special import ndtri
 
     def log_likelihood(x: FloatArray) -> float:
-        return max(float(posterior.at(x[None, :]).log_likelihood[0]), NOTHING)
+        return max(kept(x, lambda: float(posterior.at(x[None, :]).log_likelihood[0])), NOTHING)
 
     sampler = dynesty.NestedSampler(
         log_likelihood,

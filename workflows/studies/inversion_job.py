@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from forward.combine import Recorded
 from forward.fem.finer import extrapolated
@@ -20,7 +21,7 @@ from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
@@ -62,7 +63,11 @@ def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint:
     derivable(made.model, study.model.kind)
     if study.predict is not None:
         made = replace(made, predicted=study.predicted.build(ensemble.group, study.acting))
-    return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
+    return (
+        _one(study, made, ensemble, checkpoint)
+        if study.together
+        else _many(study, made, ensemble, directory, checkpoint)
+    )
 
 
 @dataclass(frozen=True)
@@ -174,14 +179,15 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
-def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, say: Callable[[str], None]) -> Problem:
-    """Return what is inverted of a data set, by its number."""
+def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensemble: Ensemble, kept: Kept) -> Problem:
+    """Return what is inverted of a data set, by its number; with a reduced model, steps are done more than once."""
     finer = None
     if seen.there is not None:
         model, why = seen.there
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, say)
+    steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
+    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, ensemble.say, steps)
 
 
 def _inverted(
@@ -254,7 +260,7 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
                 solved += log
             return _by_expansion(study, found, number, ensemble.say)
         seen = made.observed(number)
-        problem = _problem(study, number, seen, on, ensemble.say)
+        problem = _problem(study, number, seen, on, ensemble, kept(names[number]))
         if invert_field is not None:
             return invert_field(names[number], Recorded(seen.model, KeptSolves(kept(names[number]), solved)), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
@@ -343,7 +349,7 @@ def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel | None]:
     return lambda observed: observed_by(observed, models)
 
 
-def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
+def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     seen, predicted = made.observed(0), made.predicted
     recorders: dict[str, Recorder] = {}
@@ -361,7 +367,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
             # Values at moved points and errors of meshes are not kept.
             return full.on(name) if name == FINER else evaluate.on(name.partition(",")[0])
 
-        found = _inverted(study, made, seen, _problem(study, 0, seen, on, ensemble.say), full, cheap, None)
+        problem = _problem(study, 0, seen, on, ensemble, Kept(checkpoint, MPI.COMM_SELF, "steps"))
+        found = _inverted(study, made, seen, problem, full, cheap, None)
         if predicted is not None:
             from workflows.studies.predicted import prior_band
 

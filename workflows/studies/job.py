@@ -85,7 +85,7 @@ class MethodJob(Job):
     recorders
         What was evaluated, by the name under which it is stored.
     costly
-        Whether solves are worth storing: if not, an interrupted study starts again.
+        Whether solves are worth storing: if not, an interrupted study finds only the steps that its method keeps.
     node_volumes
         Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
     passing
