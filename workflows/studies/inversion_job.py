@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.combine import Recorded
-from forward.fem.finer import extrapolated
+from forward.fem.finer import Keep, extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
@@ -37,7 +37,7 @@ from workflows.studies.inversion_results import (
     judged,
     table_of_finished,
 )
-from workflows.studies.job import MOVED, MethodJob, TasksJob
+from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 
@@ -59,7 +59,9 @@ There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or wh
 
 def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
-    made = _outputs(study, ensemble) if study.specimen is None else _specimen(study, study.specimen, ensemble)
+    keep = kept_starts(checkpoint, ensemble.group)
+    specimen = study.specimen
+    made = _outputs(study, ensemble, keep) if specimen is None else _specimen(study, specimen, ensemble, keep)
     derivable(made.model, study.model.kind)
     if study.predict is not None:
         made = replace(made, predicted=study.predicted.build(ensemble.group, study.acting))
@@ -114,23 +116,23 @@ class _Made:
     predicted: ForwardModel | None = None
 
 
-def _outputs(study: InversionBlocks, ensemble: Ensemble) -> _Made:
+def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a model with outputs, of which the data tell which were measured; collective."""
     model, there = study.spec.build(ensemble.group, study.inputs.names), None
     if has_mesh(study.spec):
-        meshes, why = _meshes(study, model, study.inputs.mean)
+        meshes, why = _meshes(study, model, study.inputs.mean, keep)
         there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
     return _Made(model, lambda number: _Observed(model, there))
 
 
-def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
+def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
     model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
-    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean)
+    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
@@ -150,13 +152,13 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
 
 
 def _meshes(
-    study: InversionBlocks, model: ForwardModel, start: FloatArray
+    study: InversionBlocks, model: ForwardModel, start: FloatArray, keep: Keep
 ) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked
     try:
-        return extrapolated(model, start), ""
+        return extrapolated(model, start, keep), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
         return None, one_line(str(error))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from forward.combine import sums_of
-from forward.fem.finer import extrapolated
+from forward.fem.finer import Keep, extrapolated
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel
 from inverse.criticism.finer import Finer
@@ -18,7 +18,7 @@ from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
-from workflows.studies.job import MOVED, MethodJob
+from workflows.studies.job import MOVED, MethodJob, kept_starts
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
@@ -86,7 +86,10 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         return judged
 
     finer_ones = {
-        f"{n}/{g}/{FINER}": partial(build_finer, makers[n, g], study.models[n].inputs.mean) for n, g in checked
+        f"{n}/{g}/{FINER}": partial(
+            build_finer, makers[n, g], study.models[n].inputs.mean, kept_starts(checkpoint, ensemble.group, f"{n}/{g}")
+        )
+        for n, g in checked
     }
     moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
     return MethodJob(
@@ -101,11 +104,11 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
     )
 
 
-def build_finer(make: Make, start: FloatArray) -> ForwardModel:
+def build_finer(make: Make, start: FloatArray, keep: Keep) -> ForwardModel:
     """Make, on finer meshes, the specimen or the measured outputs of a body that `make` returns; collective."""
     own = make()
     body, _ = sums_of(own)
-    return extrapolated(body, start).of(own)
+    return extrapolated(body, start, keep).of(own)
 
 
 def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
+from forward.fem.finer import FromStart
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import gradient_chains
 from inverse.low_dimensional.posterior import Posterior
@@ -66,6 +67,28 @@ sigma = { y = 0.2 }
 [method]
 kind = "invert"
 chains = "hmc"
+samples = 32
+starts = 1
+seed = 1
+"""
+MESH = """
+[model]
+kind = "hyperelastic"
+body = { kind = "box", size = [1, 1, 1], cells = [1, 1, 1], cell = "hexahedron", degree = 2 }
+material = { kind = "neo-hookean", C1 = 1e4, D1 = 2e4 }
+clamp = ["z-min"]
+loads = [{ kind = "gravity", direction = [1, 0, 0], density = 200 }]
+outputs = [{ name = "u", kind = "max-displacement" }]
+
+[parameters]
+"material.C1" = { kind = "log-normal", mean = 1e4, std = 3e3 }
+
+[data]
+outputs = { u = 0.08 }
+sigma = { u = 0.004 }
+
+[method]
+kind = "invert"
 samples = 32
 starts = 1
 seed = 1
@@ -149,4 +172,23 @@ def test_chains_that_follow_gradients_go_on_where_they_were_killed(tmp_path, mon
     before, after = run(tmp_path, "parts", whole // 2, end), run(tmp_path, "parts")
     assert before == whole // 2
     assert after < 0.6 * whole
+    assert same(tmp_path)
+
+
+@pytest.mark.fem
+def test_finer_meshes_are_not_solved_at_the_start_again(tmp_path, monkeypatch):
+    """That takes most of an inversion for few parameters on a small machine."""
+    begun, begin = [], FromStart._begin
+    monkeypatch.setattr(FromStart, "_begin", lambda *given: begun.append(1) or begin(*given))
+    (tmp_path / "study.toml").write_text(MESH)
+    whole = run(tmp_path, "whole")
+    assert len(begun) == 1
+
+    def end():
+        raise Killed
+
+    parts = run(tmp_path, "parts", 5, end)  # in the search
+    assert len(begun) == 2
+    assert parts + run(tmp_path, "parts") <= whole + 1
+    assert len(begun) == 2
     assert same(tmp_path)
