@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from forward.fem.finer import FromStart
+from forward.reduced.reduction import Reduction
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import gradient_chains
 from inverse.low_dimensional.posterior import Posterior
@@ -74,7 +75,7 @@ seed = 1
 MESH = """
 [model]
 kind = "hyperelastic"
-body = { kind = "box", size = [1, 1, 1], cells = [1, 1, 1], cell = "hexahedron", degree = 2 }
+body = { kind = "box", size = [1, 1, 1], cells = [2, 2, 2], cell = "hexahedron", degree = 1 }
 material = { kind = "neo-hookean", C1 = 1e4, D1 = 2e4 }
 clamp = ["z-min"]
 loads = [{ kind = "gravity", direction = [1, 0, 0], density = 200 }]
@@ -192,3 +193,26 @@ def test_finer_meshes_are_not_solved_at_the_start_again(tmp_path, monkeypatch):
     assert parts + run(tmp_path, "parts") <= whole + 1
     assert len(begun) == 2
     assert same(tmp_path)
+
+
+@pytest.mark.fem
+def test_a_reduced_model_is_made_once(tmp_path, monkeypatch):
+    """Killed while its errors are measured, a run finds the model and what chose its snapshots."""
+    made, reduced = [], Reduction.reduced
+    monkeypatch.setattr(Reduction, "reduced", lambda *given: made.append(1) or reduced(*given))
+    blocks = MESH[: MESH.index("[data]")]
+    few = '[method]\nkind = "reduce"\nsnapshots = 6\nrounds = 1\nunseen = 4\nmodes = 4\n'
+    (tmp_path / "study.toml").write_text(blocks + few)
+    whole = run(tmp_path, "whole")
+    assert len(made) == 2
+
+    def end():
+        raise Killed
+
+    assert run(tmp_path, "parts", whole - 1, end) >= whole - 1  # among those unseen
+    assert len(made) == 4
+    run(tmp_path, "parts")
+    assert len(made) == 4
+    assert same(tmp_path)
+    one, other = (tmp_path / name / "reduced.npz" for name in ("whole", "parts"))
+    assert one.read_bytes() == other.read_bytes()
