@@ -25,6 +25,7 @@ from forward.fem.mesh_error_cost import own_estimate
 from forward.fem.model import HyperelasticModel
 from forward.machine import MIB, headroom
 from forward.model import FloatArray, Guess, SolveError
+from forward.phases import phase
 
 if TYPE_CHECKING:
     from forward.fem.solution import FiniteElementSolution
@@ -100,6 +101,7 @@ class Adapted:
     stopped: str | None
 
 
+@phase("refining the mesh")
 def adapt(
     spec: LoadedBody,
     comm: Any,

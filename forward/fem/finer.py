@@ -10,8 +10,9 @@ those of the mesh itself, interpolated.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,12 +34,16 @@ if TYPE_CHECKING:
 
 # Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
 ITERATIONS, LOAD_STEP = 12, 1 / 16
-Begun = tuple[tuple[tuple[FloatArray, FloatArray], ...], SolveError | None]  # states with derivatives, or why none
+# States with their derivatives; or none, and why: the reason, and the history of the solver.
+Begun = tuple[tuple[tuple[FloatArray, FloatArray], ...], tuple[str, tuple[str, ...]] | None]
+Keep = Callable[[str, Callable[[], Begun]], Begun]  # by the name of the meshes; what a run begun before has found
 TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
-def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | JoinedMeshes:
+def extrapolated(
+    model: Any, start: FloatArray | None = None, keep: Keep = lambda name, begin: begin()
+) -> FinerMeshes | JoinedMeshes:
     """Return a body on finer meshes; these are made when they are first solved on.
 
     Parameters
@@ -47,6 +52,8 @@ def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | J
         The body: a specimen, one with outputs, or mapped models that are joined, each of which is looked at by itself.
     start
         Parameters (d,) that are solved for first.
+    keep
+        Where the states there are kept and found.
 
     Raises
     ------
@@ -57,7 +64,13 @@ def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | J
         parts: Any = model.models
         starts = [None if start is None else part.by.values(start[None])[0] for part in parts]
         pairs = [(part.model, own) for part, own in zip(parts, starts, strict=True)]
-        return JoinedMeshes(tuple(None if one.space is None else extrapolated(one, own) for one, own in pairs))
+
+        def part(k: int, one: Any, own: FloatArray | None) -> Any:
+            return extrapolated(one, own, lambda name, begin: keep(f"{name} of part {k}", begin))
+
+        return JoinedMeshes(
+            tuple(None if one.space is None else part(k, one, own) for k, (one, own) in enumerate(pairs))
+        )
     spec = model.spec
     fine, beside = finer(spec), graded(spec)
     otherwise = None
@@ -67,10 +80,12 @@ def extrapolated(model: Any, start: FloatArray | None = None) -> FinerMeshes | J
         equal, less = (_hurried(one, spec.solver.minimum_load_step) for one in both)
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)
-        otherwise = FinerMeshes(OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start)
+        otherwise = FinerMeshes(
+            OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start, partial(keep, "equal")
+        )
         fine, beside = _hurried(fine, LOAD_STEP), None if beside is None else _hurried(beside, LOAD_STEP)
     coarse = None if beside is None else OtherMesh(model, beside)
-    return FinerMeshes(OtherMesh(model, fine), coarse, share(spec), start, otherwise)
+    return FinerMeshes(OtherMesh(model, fine), coarse, share(spec), start, partial(keep, "finer"), otherwise)
 
 
 def _hurried(spec: Any, smallest: float) -> Any:
@@ -137,6 +152,8 @@ class FromStart(OfOne):
         The models.
     start
         Parameters (d,) that are solved for first; None: every solve begins at rest.
+    keep
+        As of `extrapolated`.
     begun
         States there, and their derivatives, once they are known, and why there are none; models of the same meshes
         share it.
@@ -146,6 +163,7 @@ class FromStart(OfOne):
 
     model: Joined
     start: FloatArray | None = None
+    keep: Callable[[Callable[[], Begun]], Begun] = lambda begin: begin()
     begun: list[Begun] = field(default_factory=list)
     needed: bool = False
 
@@ -159,18 +177,16 @@ class FromStart(OfOne):
         """
         if self.start is None:
             return self.model.solve(parameters)
+        here: list[CombinedSolution] = []
+        at_start = not self.begun and np.array_equal(parameters, self.start)
         if not self.begun:
-            at_start = np.array_equal(parameters, self.start)
-            try:
-                here = self._begin(self.start)
-            except SolveError as error:
-                self.begun.append(((), error))
-                if at_start:
-                    raise
-            else:
-                if at_start:
-                    return here
-        begun, unanswered = self.begun[0]
+            self.begun.append(self.keep(partial(self._begin, self.start, here)))
+        begun, reason = self.begun[0]
+        unanswered = None if reason is None else SolveError(*reason)
+        if at_start and unanswered is not None:
+            raise unanswered
+        if at_start:  # where states were kept, this solve was not: it is done as it was begun
+            return here[0] if here else self.model.solve(parameters)
         if unanswered is None:
             step = parameters - self.start
             guesses = [Guess(state + step @ slopes if slopes.size else state) for state, slopes in begun]
@@ -179,13 +195,18 @@ class FromStart(OfOne):
             raise unanswered
         return self.model.solve(parameters)
 
-    def _begin(self, start: FloatArray) -> CombinedSolution:
-        """Solve at the start, once, and keep the states with their derivatives."""
-        d, found = len(start), self.model.solve(start)
-        few = d <= TANGENTS and self.differentiable
-        kept = ((one.state, one.state_tangent(np.eye(d)) if few else np.zeros((d, 0))) for one in found.solutions)
-        self.begun.append((tuple(kept), None))
-        return found
+    def _begin(self, start: FloatArray, here: list[CombinedSolution]) -> Begun:
+        """Solve at the start, for all to begin from."""
+        try:
+            found = self.model.solve(start)
+        except SolveError as error:
+            return (), (error.reason, tuple(error.history))
+        here.append(found)
+        few = len(start) <= TANGENTS and self.differentiable
+        slopes = (
+            one.state_tangent(np.eye(len(start))) if few else np.zeros((len(start), 0)) for one in found.solutions
+        )
+        return tuple((one.state, by) for one, by in zip(found.solutions, slopes, strict=True)), None
 
 
 @dataclass(frozen=True)
@@ -196,7 +217,7 @@ class FinerMeshes:
     ----------
     fine, coarse
         On the finest, and on the other one; None where that is its own.
-    share, start, otherwise
+    share, start, keep, otherwise
         As of `limit` and `FromStart`, and what takes their place (`Otherwise`).
     begun
         As of `FromStart`.
@@ -206,6 +227,7 @@ class FinerMeshes:
     coarse: OtherMesh | None
     share: float
     start: FloatArray | None = None
+    keep: Callable[[Callable[[], Begun]], Begun] = lambda begin: begin()
     otherwise: FinerMeshes | None = None
     begun: list[Begun] = field(default_factory=list)
 
@@ -220,7 +242,7 @@ class FinerMeshes:
         body, weights = sums_of(observed)
         fine, coarse = (body if mesh is None else mesh.of(body) for mesh in (self.fine, self.coarse))
         both = Joined((fine, coarse), (*body.outputs, *(f"{name} (coarse)" for name in body.outputs)))
-        begun = FromStart(both, self.start, self.begun, self.otherwise is not None)
+        begun = FromStart(both, self.start, self.keep, self.begun, self.otherwise is not None)
         found = limit(begun, weights, observed.outputs, self.share)
         return found if self.otherwise is None else Otherwise(found, self.otherwise.of(observed))
 

@@ -21,6 +21,7 @@ from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
+from forward.phases import phase
 from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
@@ -261,6 +262,7 @@ class FiniteElementSolution:
             self.work = kept
         return found._replace(work=Work(*work.tolist()))
 
+    @phase("estimating the error of the mesh")
     def mesh_error(self) -> MeshError:
         """Estimate the error of the mesh in outputs and state (`forward.fem.enriched`); collective.
 
@@ -277,6 +279,7 @@ class FiniteElementSolution:
             errors, change, found.energy, found.relative, found.work, nonlinearity=far, stored=found.stored
         )
 
+    @phase("calibrating the error of the mesh")
     def saturation(self, spare: float = math.inf, finer: Calibrating[Self] | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 

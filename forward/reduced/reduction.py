@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
+from forward.phases import phase
 from forward.reduced.data import ReducedData
 from forward.reduced.integrands import Integrand, of_form
 from forward.reduced.modes import AtRest, boxes, enough
@@ -115,6 +116,7 @@ class Reduction:
 
     # --- modes -------------------------------------------------------------------------------------------------------
 
+    @phase("reducing")
     def reduced(self, snapshots: Snapshots, sizes: Sizes) -> ReducedData:
         """Return the reduced model of snapshots."""
         rest, every = self._held(snapshots)
@@ -158,6 +160,7 @@ class Reduction:
         size, found = np.array([of_unit[unit] for unit in units]), snapshots.outputs.std(axis=0)
         return np.maximum(np.where(found > ROUNDING * size, found, size), LEAST_SPREAD)
 
+    @phase("enriching")
     def enriched(self, data: ReducedData, answers: Snapshots, sizes: Sizes) -> ReducedData:
         """Return a reduced model of this body that holds further solutions too, with a mode more for each of them.
 

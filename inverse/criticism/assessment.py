@@ -32,6 +32,7 @@ from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.surrogate import operations
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.inputs.sampling import sobol_points
 
 Source = Literal["laplace", "points", "chains"]
@@ -105,30 +106,38 @@ def assess(
     chains: Kind | None = None,
     model: ForwardModel | None = None,
     seed: int = 0,
+    steps: Steps = ALL_AGAIN,
 ) -> Assessment:
     """Correct Laplace's Gaussian by so many solves for weighted points, and by chains if they are asked for.
 
-    Those by "hmc" follow the gradients of the model, point by point.
+    Those by "hmc" follow the gradients of the model, point by point. `steps` keep points, gradients and chains.
 
     Raises
     ------
     SolveError
         If the model has no answer at any of the points.
     """
-    found = evidence(posterior, gaussian, samples or LEAST, seed=seed)
-    return Assessment(gaussian, found, _run(posterior, gaussian, found, chains, model, seed))
+    found = steps("points", lambda: evidence(posterior, gaussian, samples or LEAST, seed=seed))
+    if chains is None:
+        return Assessment(gaussian, found)
+    run = partial(_run, posterior, gaussian, found, chains, model, seed, steps)
+    return Assessment(gaussian, found, steps("chains", run))
 
 
 def _run(
-    posterior: Posterior, gaussian: Laplace, found: Evidence, kind: Kind | None, model: ForwardModel | None, seed: int
-) -> Chains | None:
+    posterior: Posterior,
+    gaussian: Laplace,
+    found: Evidence,
+    kind: Kind,
+    model: ForwardModel | None,
+    seed: int,
+    steps: Steps,
+) -> Chains:
     match kind:
-        case None:
-            return None
         case "hmc":
             if model is None:
                 raise ValueError("chains = 'hmc' follow the gradients of a model itself, which is not given")
-            return gradient_chains(posterior, gaussian, model, seed=seed)
+            return gradient_chains(posterior, gaussian, model, seed=seed, kept=steps.rows("gradients"))
         case "emcee":
             return ensemble(posterior, gaussian, seed=seed)
         case "pcn":

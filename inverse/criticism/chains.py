@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -148,6 +149,7 @@ def _arviz() -> Any:
     return imported("R̂ and effective sizes of chains need", "arviz")
 
 
+@phase("running chains")
 def crank_nicolson(
     place: Place,
     size: int,
@@ -240,6 +242,7 @@ def in_units(posterior: Posterior, chains: Chains) -> Chains:
     return replace(chains, draws=values, x=x)
 
 
+@phase("running chains")
 def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = None, *, seed: int = 0) -> Chains:
     """Run emcee's ensemble for few parameters, kept in physical units; its walkers are the chains.
 

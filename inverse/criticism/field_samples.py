@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from forward.model import FloatArray, Guess, ReferenceSolution, SolveError
+from forward.phases import phase
 from inverse.criticism.chains import FIELD, Chains, Lengths, Map, Place, crank_nicolson
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
 from inverse.fields.field_posterior import Point
@@ -118,6 +119,7 @@ class FieldWeights:
         return float(w.std(ddof=1) / np.sqrt(len(w)))
 
 
+@phase("weighting points around the mode")
 def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed: int = 0) -> FieldWeights:
     """Draw samples of the low-rank Gaussian, bent, and weigh them by the posterior: two solves for each.
 

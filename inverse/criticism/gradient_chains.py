@@ -19,11 +19,14 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.phases import phase
 from inverse.criticism.chains import SPREAD, Chains, Lengths, in_units
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.optional import imported
 
+# A point x (c,) and what solves there for −ln of the density and its gradient → these.
+Kept = Callable[[FloatArray, Callable[[], tuple[float, FloatArray]]], tuple[float, FloatArray]]
 DEPTH = 6  # doublings of a path
 GRADIENTS = Lengths(2, 300, 100, 1)
 STEERED = 0.8  # mean probability of acceptance for which the step is chosen
@@ -41,8 +44,8 @@ def most(lengths: Lengths = GRADIENTS, burn: int | None = None) -> int:
 class _Potential:
     """−ln of the posterior and its gradient by whitened coordinates z (c,), which remembers the last point."""
 
-    def __init__(self, posterior: Posterior, gaussian: Laplace, model: ForwardModel) -> None:
-        self._posterior, self._model = posterior, model
+    def __init__(self, posterior: Posterior, gaussian: Laplace, model: ForwardModel, kept: Kept) -> None:
+        self._posterior, self._model, self._kept = posterior, model, kept
         self._mode, self._root = gaussian.mode, gaussian.root
         self._last: tuple[bytes, float, FloatArray] = (b"", 0.0, np.zeros(0))
         self.count = 0
@@ -51,11 +54,13 @@ class _Potential:
         key = z.tobytes()
         if key != self._last[0]:
             self.count += 1
-            value, gradient = self._posterior.potential(self._mode + self._root @ z, self._model)
+            x = self._mode + self._root @ z
+            value, gradient = self._kept(x, lambda: self._posterior.potential(x, self._model))
             self._last = key, value, self._root.T @ gradient
         return self._last[1:]
 
 
+@phase("running chains")
 def gradient_chains(
     posterior: Posterior,
     gaussian: Laplace,
@@ -64,12 +69,13 @@ def gradient_chains(
     lengths: Lengths = GRADIENTS,
     budget: int = BUDGET,
     seed: int = 0,
+    kept: Kept = lambda x, solve: solve(),
 ) -> Chains:
     """Run chains for few parameters, kept in physical units, with the evidence that follows from them.
 
     The model is solved for values and adjoints, one point after another; collective over its ranks. As many draws again
     follow until the chains have mixed, as long as the budget of gradients allows for them: only the first may exceed
-    it.
+    it. What was `kept` of an interrupted run is not solved again.
 
     Raises
     ------
@@ -79,7 +85,7 @@ def gradient_chains(
         If there is no answer at the start of a chain.
     """
     mici = imported("chains that follow gradients need", "mici")
-    potential = _Potential(posterior, gaussian, model)
+    potential = _Potential(posterior, gaussian, model, kept)
     rng = np.random.default_rng(seed)
 
     def value(z: FloatArray) -> float:  # a function: a method would be copied, with what it counts

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from forward.model import FloatArray
+from forward.phases import phase
 from inverse.fields.field_posterior import BLOCK, Point, Prior
 
 CUTOFF = 0.1  # λ below which pairs are neglected: they change a variance by at most λ/(1+λ)
@@ -77,6 +78,7 @@ class Spectrum:
         return whitened + (whitened @ self.vectors.T * ((1 + self.values) ** -0.5 - 1)) @ self.vectors
 
 
+@phase("finding what the data determine")
 def leading_pairs(
     jvp: Map,
     vjp: Map,

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray, Guess, SolveError
+from forward.phases import phase
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import Spectrum, leading_pairs
 
@@ -93,6 +94,7 @@ class Mode:
         return 1 + sum(row.solves for row in self.iterations)
 
 
+@phase("searching for the mode")
 def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tolerance: float = CLOSE) -> Mode:
     """Find the mode of a posterior whose model has derivatives, from ξ (N,) or the centre of the prior.
 

@@ -37,6 +37,7 @@ from typing import Literal
 import numpy as np
 
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from inverse.criticism.weights import FEWEST, TRUSTED, normalised, quality, trustworthy
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
@@ -128,6 +129,7 @@ class Evidence:
         return float(self.log_evidence + top + np.log(ratio)), float(np.hypot(self.error, scatter))
 
 
+@phase("weighting points around the mode")
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
     """Estimate the evidence by `samples` solves around a Gaussian, by the route that the first of them suggest.
 
@@ -314,8 +316,11 @@ def _by_surrogate(
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))
 
 
-def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[float, float]:
-    """Return ln Z and its standard error by nested sampling with `live` live points.
+@phase("nested sampling")
+def nested(
+    posterior: Posterior, *, seed: int = 0, live: int = LIVE, kept: Callable[..., float] = lambda x, solve: solve()
+) -> tuple[float, float]:
+    """Return ln Z and its standard error by nested sampling with `live` live points; what was `kept` is not solved.
 
     It shares only the likelihood with the other routes (J. Skilling, Bayesian Anal. 1 (2006) 833–860; by dynesty: J. S.
     Speagle, Mon. Not. R. Astron. Soc. 493 (2020) 3132–3158), and takes ten thousand solves or more: for cheap models.
@@ -329,7 +334,7 @@ def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[fl
     from scipy.special import ndtri
 
     def log_likelihood(x: FloatArray) -> float:
-        return max(float(posterior.at(x[None, :]).log_likelihood[0]), NOTHING)
+        return max(kept(x, lambda: float(posterior.at(x[None, :]).log_likelihood[0])), NOTHING)
 
     sampler = dynesty.NestedSampler(
         log_likelihood,

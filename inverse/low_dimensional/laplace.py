@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.inputs.sampling import sobol_points
 
@@ -92,6 +93,7 @@ class Laplace:
         return np.asarray(root @ root.T)
 
 
+@phase("searching for the mode")
 def laplace(
     posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool = True, first: FloatArray | None = None
 ) -> Laplace:

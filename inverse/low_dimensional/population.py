@@ -32,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
+from forward.phases import phase
 from uq.inputs.draws import effective
 
 STRETCH = 2.0  # a of the stretch move
@@ -208,6 +209,7 @@ def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> F
     return np.asarray(one.kernels.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
 
 
+@phase("fitting the population")
 def fitted(
     specimens: Sequence[Specimen],
     prior: Hyperprior,

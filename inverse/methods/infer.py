@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.assessment import Assessment, Kind, assess
@@ -17,6 +18,7 @@ from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
@@ -72,6 +74,7 @@ def infer(
     chains: Kind | None = None,
     model: ForwardModel | None = None,
     say: Callable[[str], None] = lambda line: None,
+    steps: Steps = ALL_AGAIN,
 ) -> Inferred:
     """Find the mode of a posterior, and what stands for it around there.
 
@@ -91,6 +94,8 @@ def infer(
         What errors the data share, at parameters (d,); None if they are independent.
     say
         Shows the user a line before the search.
+    steps
+        What keeps the mode, weighted points and chains; by default they are found again after an interruption.
 
     Raises
     ------
@@ -104,7 +109,7 @@ def infer(
         with suppress(SolveError):  # or else every solve begins at zero
             posterior = replace(posterior, start=start(posterior.inputs.mean))
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
-    searched = gaussian = laplace(posterior, starts=starts, seed=seed)
+    searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
     if shared is not None:  # which depends on the displacements
         posterior = _sharing(posterior, shared(posterior.physical(gaussian.mode[None])[0, :d]))
         gaussian = laplace(posterior, starts=1, first=gaussian.mode)
@@ -112,7 +117,7 @@ def infer(
     if look is not None:
         treatment = look.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
-    one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed)
+    one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed, steps=steps)
     return Inferred(posterior, searched, one, mesh, before)
 
 

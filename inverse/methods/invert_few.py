@@ -7,7 +7,7 @@ hand (`Nearby`), or all groups solve at different points of one posterior.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -130,6 +130,7 @@ def invert_few(
         chains=method.chains,
         model=model,
         say=problem.say,
+        steps=replace(problem.steps, recorder=counted),
     )
     posterior, searched, one, mesh = inferred.posterior, inferred.searched, inferred.assessment, inferred.mesh
     gaussian, found, chains = one.gaussian, one.evidence, one.chains

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from forward.phases import phase
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
 from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
@@ -71,6 +72,7 @@ def told(error: FloatArray, count: float, say: Callable[[str], None]) -> float:
     return size
 
 
+@phase("solving on finer meshes")
 def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -> float:
     """Hold the error of the mesh at the mean of the prior against the noise, before the search; its size.
 
@@ -152,6 +154,7 @@ def _rounds(
         here = again(here, error)
 
 
+@phase("correcting the error of the mesh")
 def corrected_few(
     posterior: Posterior, gaussian: Laplace, finer: Finer, data: Measurements, treatment: Treatment
 ) -> tuple[Posterior, Laplace, MeshFound]:
@@ -216,6 +219,7 @@ def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
     return evidence_moved(A, residual + A @ at.x[0, :d], noise.whitened(error / noise.scale), noise.factor)
 
 
+@phase("correcting the error of the mesh")
 def corrected_field(
     posterior: FieldPosterior,
     solve: Callable[[FieldPosterior, FloatArray | None], SolvedField],

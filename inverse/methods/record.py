@@ -25,6 +25,7 @@ from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
 from uq.estimators.estimate import BAND, part
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -98,6 +99,8 @@ class Problem:
         What errors the data share, at parameters (d,) or values of a field (N,); None if they are independent.
     say
         Shows the user a line before the search.
+    steps
+        What keeps what is found of few parameters.
     """
 
     data: Measurements
@@ -106,6 +109,7 @@ class Problem:
     finer: Finer | None = NOT_LOOKED
     shared: Shared | None = None
     say: Callable[[str], None] = field(default=lambda line: None)
+    steps: Steps = ALL_AGAIN
 
     @property
     def noise(self) -> Noise:

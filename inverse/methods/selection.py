@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.phases import phase
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, solves_of
 from inverse.criticism.comparison import Candidate, Compared, comparison
@@ -30,6 +31,7 @@ from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
 from inverse.methods.mesh_correction import MeshTreatment
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
 
@@ -159,6 +161,7 @@ class Select(MeshTreatment, Settings):
         say: Callable[[str], None] = lambda line: None,
         shared: Mapping[tuple[str, str], Shared] | None = None,
         model: Callable[[str, str], ForwardModel] | None = None,
+        steps: Callable[[str, str], Steps] = lambda name, group: ALL_AGAIN,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -180,6 +183,8 @@ class Select(MeshTreatment, Settings):
             What errors the data share, by candidate and group; by default they are independent.
         model
             The model of a candidate for a group itself, whose gradients chains follow.
+        steps
+            What keeps what is found of a candidate for a group; by default an interrupted comparison begins again.
 
         Returns
         -------
@@ -210,14 +215,22 @@ class Select(MeshTreatment, Settings):
                     chains=self.chains,
                     model=None if model is None else model(name, group),
                     say=lambda line, name=name: say(f"{name}: {line}"),  # type: ignore[misc]
+                    steps=steps(name, group).of(STATED),
                 )
         posteriors = {pair: one.posterior for pair, one in found.items()}
         stated = {pair: one.assessment for pair, one in found.items()}
 
-        def value(changed: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
+        def value(changed: Posterior, pair: tuple[str, str], label: str) -> tuple[float, float]:
+            def found() -> tuple[float, float]:
+                again = infer(changed, starts[pair], self.samples, starts=self.starts, seed=self.seed, steps=parts)
+                return again.assessment.log_evidence
+
+            parts = steps(*pair).of(label)
             with _of(pair):
-                again = infer(changed, starts[pair], self.samples, starts=self.starts, seed=self.seed)
-            return again.assessment.log_evidence
+                return parts("evidence", found)
+
+        def checked(one: Posterior, parts: Steps) -> tuple[float, float]:
+            return parts("nested", lambda: nested(one, seed=self.seed, kept=parts.rows("likelihoods")))
 
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: one.log_evidence for pair, one in stated.items()}
@@ -229,28 +242,30 @@ class Select(MeshTreatment, Settings):
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
-                pair: value(replace(one, noise=noise.of(data_groups[pair[1]].seen(), one.noise)), pair)
+                pair: value(replace(one, noise=noise.of(data_groups[pair[1]].seen(), one.noise)), pair, label)
                 for pair, one in posteriors.items()
             }
 
-        def some(wanted: Callable[[tuple[str, ...]], set[str]]) -> dict[tuple[str, str], tuple[float, float]]:
+        def some(
+            label: str, wanted: Callable[[tuple[str, ...]], set[str]]
+        ) -> dict[tuple[str, str], tuple[float, float]]:
             """Return ln Z and errors by the data of wanted ones of the tests of a group, in groups that have any."""
             tests = {pair: wanted(data_groups[pair[1]].measured_tests) for pair in pairs}
             return {
-                pair: value(_only(posteriors[pair], data_groups[pair[1]], those), pair)
+                pair: value(_only(posteriors[pair], data_groups[pair[1]], those), pair, label)
                 for pair, those in tests.items()
                 if those
             }
 
         for label, tests in self.subsets.items():
-            variants[label] = some(set(tests).intersection)
+            variants[label] = some(label, set(tests).intersection)
         checks = {}
         if self.check is not None:
             source = free or evaluate
-            checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
+            checks = {pair: checked(replace(posteriors[pair], evaluate=source(*pair)), steps(*pair)) for pair in pairs}
         tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
         left_out = {
-            test: some(lambda those, test=test: {*those} - {test} if test in those else set())  # type: ignore[misc]
+            test: some(f"without {test}", lambda those, test=test: {*those} - {test} if test in those else set())  # type: ignore[misc]
             for test in dict.fromkeys(tests_of)
         }
         compared = {
@@ -295,8 +310,9 @@ def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatAr
 
 @contextmanager
 def _of(pair: tuple[str, str]) -> Iterator[None]:
-    """Say of which candidate a model has no answer."""
+    """Say which candidate is looked at, and of which one a model has no answer."""
     try:
-        yield
+        with phase(pair[0]):
+            yield
     except SolveError as error:
         raise SolveError(f"candidate '{pair[0]}': {error.reason}", error.history) from None

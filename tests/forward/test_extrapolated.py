@@ -87,3 +87,37 @@ def test_a_start_without_an_answer_is_none():
     with pytest.raises(SolveError, match="not there"):
         first.solve(np.array([1.0, 1.0]))
     assert tried == [1.0]  # a search without an answer takes minutes, and is not repeated
+
+
+def test_the_start_is_solved_once_by_runs_one_after_the_other():
+    """What is kept of it is all that later solves need; where there is no answer, that is kept too."""
+    start = np.array([0.9, 1.1])
+    kept = {}
+
+    def keep(begin):
+        return kept.setdefault("begun", begin()) if not kept else kept["begun"]
+
+    def made(fine, start):
+        both = Joined((fine, on(0.3)), ("y", "z", "coarse y", "coarse z"))
+        return FromStart(both, start, keep)
+
+    tried = []
+
+    def counted(p):
+        tried.append(p.tolist())
+        return on(0.2).function(p)
+
+    whole = made(FunctionModel(counted, NAMES, ("y", "z"), on(0.2).jacobian), start)
+    first = [whole.solve(start).outputs, whole.solve(POINT).outputs]
+    tried.clear()
+    again = made(FunctionModel(counted, NAMES, ("y", "z"), on(0.2).jacobian), start)
+    np.testing.assert_array_equal(again.solve(POINT).outputs, first[1])
+    assert tried == [POINT.tolist()]
+    np.testing.assert_array_equal(again.solve(start).outputs, first[0])
+    kept.clear()
+    lost, tried = without_answer_at_one()
+    for _ in range(2):
+        model = made(lost, np.array([1.0, 1.0]))
+        with pytest.raises(SolveError, match="not there"):
+            model.solve(np.array([1.0, 1.0]))
+    assert tried == [1.0]

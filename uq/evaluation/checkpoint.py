@@ -12,7 +12,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -51,6 +51,29 @@ class Block(Protocol):
 
     def image(self, note: str) -> bytes:
         """Return the bytes of an HDF5 file with an attribute `note`; the first `HEAD` are left free."""
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A block of bytes."""
+
+    data: bytes
+
+    def image(self, note: str) -> bytes:
+        """Return the bytes of its file."""
+        with in_memory(creation(HEAD)) as file:
+            file.attrs["note"] = note
+            file["found"] = np.frombuffer(self.data, dtype=np.uint8)
+            return image(file)
+
+    @staticmethod
+    def read(path: Path) -> bytes:
+        """Return the bytes; a `DamagedError` if there are none."""
+        try:
+            with h5py.File(path, "r") as file:
+                return bytes(np.asarray(file["found"]).data)
+        except (OSError, KeyError, ValueError) as error:
+            raise DamagedError(path) from error
 
 
 class Checkpoint:

@@ -19,6 +19,7 @@ import numpy as np
 
 from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.phases import phase
 from forward.pointwise import OfModel
 from uq.evaluation.block import BlockSolver, Merger
 from uq.evaluation.checkpoint import Checkpoint, read
@@ -328,7 +329,7 @@ class _Worker:
 
     def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""
-        with abort_all(self._ensemble.world):
+        with abort_all(self._ensemble.world), phase(f"making {model}"):
             self._ensemble.told((model, None))
             self.models[model]
 
@@ -344,7 +345,7 @@ class _Worker:
                 progress(len(block.points), len(block.failures))
             receive(i, block)
 
-        with abort_all(self._ensemble.world):
+        with abort_all(self._ensemble.world), phase(f"solving {order.request.model}".rstrip()):
             self._ensemble.told((order.request.model, order))
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 

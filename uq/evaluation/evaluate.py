@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations, Request
 if TYPE_CHECKING:
     from uq.evaluation.kept import Kept
 
+T = TypeVar("T")
 BLOCKS = 16  # into which a request of one rank group is cut: an interruption costs at most one of them
 LEAST = 4  # points in such a block, unless a request has fewer
 LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers must not overflow or underflow
@@ -157,6 +158,13 @@ class Recorder(OfEvaluate):
         """Return the evaluation of another of the models, with the same log."""
         return Recorder(self._evaluate.on(model), self, model)
 
+    def add(self, log: Sequence[Evaluations], models: Sequence[str]) -> None:
+        """Take what was returned before an interruption for what is not asked again."""
+        self.log += log
+        self.models += models
+        if isinstance(self._evaluate, Recorder):
+            self._evaluate.add(log, models)
+
     @property
     def solves(self) -> int:
         """Number of points so far."""
@@ -166,6 +174,56 @@ class Recorder(OfEvaluate):
     def seconds(self) -> float:
         """Processor time (s) of all points so far."""
         return float(sum(evaluations.seconds.sum() for evaluations in self.log))
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of a method whose results are kept with what was evaluated on the way; without `kept`, none is.
+
+    Parameters
+    ----------
+    kept, recorder
+        Where they are kept and found, and what records their evaluations.
+    name
+        Of the part of the study whose steps these are.
+    count
+        Told how many solves, and how many of them failed, a step that was found had taken.
+    """
+
+    kept: Kept | None = None
+    recorder: Recorder | None = None
+    name: str = ""
+    count: Callable[[int, int], None] = lambda done, failed: None
+
+    def of(self, name: str) -> Steps:
+        """Return the steps of a part of these."""
+        return replace(self, name=f"{self.name}/{name}")
+
+    def __call__(self, name: str, compute: Callable[[], T]) -> T:
+        """Return what a step of a name has found, plain data, which is computed once; collective over the group."""
+        if self.kept is None or self.recorder is None:
+            return compute()
+        log, models = self.recorder.log, self.recorder.models
+        before = len(log)
+
+        def made() -> tuple[T, list[Evaluations], list[str]]:
+            return compute(), log[before:], models[before:]
+
+        (found, more, names), new = self.kept.value(f"{self.name}/{name}", made)
+        if not new:
+            self.recorder.add(more, names)
+            for one in more:
+                self.count(len(one.points), len(one.failures))
+        return found
+
+    def rows(self, name: str) -> Callable[[FloatArray, Callable[[], T]], T]:
+        """Return what keeps answers to questions that a step asks; collective over the group."""
+        if self.kept is None:
+            return lambda asked, answer: answer()
+        return self.kept.rows(f"{self.name}/{name}")
+
+
+ALL_AGAIN = Steps()
 
 
 def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:

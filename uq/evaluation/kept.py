@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, is_dataclass, replace
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -21,11 +23,16 @@ from forward.model import (
     scattered,
 )
 from forward.pointwise import Known
-from uq.evaluation.checkpoint import read
+from uq.evaluation.checkpoint import Plain, read
 from uq.evaluation.request import Evaluations, Failure
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
+
+T = TypeVar("T")
+SECONDS_BETWEEN_STRETCHES = 10.0  # of answers that are written together
+OWN = {"forward", "inverse", "uq"}
+OF_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
 
 
 @dataclass(frozen=True)
@@ -76,11 +83,86 @@ class Kept:
             self.checkpoint.save(key, block)
         return block, True
 
+    def value(self, name: str, compute: Callable[[], T]) -> tuple[T, bool]:
+        """Return what a step of a name has found, plain data, and whether it is new; as `found`.
+
+        New or not, it is what can be read from disk, to the layout of its arrays, which sums may depend on.
+        """
+        data = self._step(name)
+        new = data is None
+        if data is None:
+            data = pickle.dumps(compute())
+            self._save(name, data)
+        return _Reader(BytesIO(data)).load(), new
+
+    def rows(self, name: str) -> Rows:
+        """Return the answers that were kept under a name; collective."""
+        return Rows(self, name)
+
+    def _step(self, name: str) -> bytes | None:
+        self.keys.append(self._key(name))
+        found = self.checkpoint.find(self.keys[-1], Plain.read) if self.group.rank == 0 else None
+        data: bytes | None = self.group.bcast(found)
+        return data
+
+    def _save(self, name: str, data: bytes) -> None:
+        if self.group.rank == 0:
+            self.checkpoint.save(self._key(name), Plain(data))
+
+    def _key(self, name: str) -> str:
+        return self.checkpoint.key(_Block(self.label, ("step", name)))
+
     def forget(self) -> None:
         """Remove the blocks, once their results are stored."""
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()
+
+
+class Rows:
+    """Answers of a few numbers to questions that are asked in the same order by every run, kept in stretches."""
+
+    def __init__(self, kept: Kept, name: str) -> None:
+        self._kept, self._name, self._stretches = kept, name, 0
+        self._known: list[tuple[bytes, Any]] = []
+        while (data := kept._step(self._stretch)) is not None:
+            self._known += _Reader(BytesIO(data)).load()
+            self._stretches += 1
+        self._known.reverse()
+        self._new: list[tuple[bytes, Any]] = []
+        self._saved = time.monotonic()
+
+    @property
+    def _stretch(self) -> str:
+        return f"{self._name}, stretch {self._stretches}"
+
+    def __call__(self, asked: FloatArray, answer: Callable[[], T]) -> T:
+        """Return the answer, plain data, to numbers that determine it."""
+        if self._known:
+            before, found = self._known.pop()
+            if before == asked.tobytes():
+                return found  # type: ignore[no-any-return]
+            self._known.clear()  # of a run that went on otherwise
+        made = answer()
+        self._new.append((asked.tobytes(), made))
+        if time.monotonic() - self._saved > SECONDS_BETWEEN_STRETCHES:
+            self._kept._save(self._stretch, pickle.dumps(self._new))
+            self._stretches += 1
+            self._new, self._saved = [], time.monotonic()
+        return made
+
+
+class _Reader(pickle.Unpickler):
+    """Reads plain data: numbers, arrays, and dataclasses and named tuples of them; a file can do nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return one of the few things that plain data are made of."""
+        package = module.partition(".")[0]
+        if package in OWN or (package == "numpy" and name in OF_ARRAYS):  # nothing else is even imported
+            found = super().find_class(module, name)
+            if package == "numpy" or (isinstance(found, type) and (is_dataclass(found) or issubclass(found, tuple))):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no plain data")
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from forward.model import SolveError
+from forward.phases import phase
 from uq.evaluation.block import merge
 from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, read, write
 from uq.evaluation.hdf5 import File, holds, netcdf
@@ -134,7 +135,8 @@ def run_tasks(
         solved: list[Evaluations] = []
         dataset, reason = None, ""
         try:
-            dataset = work(number, solved)
+            with phase(names[number]):
+                dataset = work(number, solved)
         except SolveError as error:
             reason = error.reason or "no reason was given"
         evaluations = merge(solved) if solved else None

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
+from forward.phases import phase
 from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, on_group
@@ -290,6 +291,7 @@ def among(terms: NDArray[np.int64], which: NDArray[np.int64], coefficients: Floa
     return found
 
 
+@phase("evaluating polynomials of fields")
 def estimates_of_field(
     evaluations: Evaluations,
     centre: Linearisation,

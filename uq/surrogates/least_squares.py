@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import FULL, ROWS_PER_TERM, Basis, Candidate, Candidates, IntArray
@@ -171,6 +172,7 @@ class _Folds:
     errors: FloatArray
 
 
+@phase("fitting polynomials")
 def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 

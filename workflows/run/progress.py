@@ -1,24 +1,33 @@
-"""Progress on rank 0: a bar in a terminal, elsewhere a plain line a minute."""
+"""Progress on rank 0: a bar in a terminal, elsewhere a plain line a minute, whatever the run is doing.
+
+The line comes from a process beside it (`workflows.run.watch`), which reads what is written here.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections import deque
+from contextlib import ExitStack, suppress
+from typing import Any, Self
+
+from forward.phases import Phases, listeners
+from workflows.run import watch
 
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_MARKS = 1.0  # that the rate is computed between
-UNKNOWN = "time left not known yet"
 BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} solves [{elapsed}{postfix}]"
 
 
 class Progress:
-    """Counts finished and failed solves and shows rate and time left.
+    """Counts finished and failed solves, and shows rate, time left and what is done, from its beginning to its end.
 
     Parameters
     ----------
-    planned
-        Number of solves expected; it grows when a method asks for more.
     quiet
         Show only a line a minute, and on a terminal not even that.
     silent
@@ -34,70 +43,84 @@ class Progress:
     known. What was read from disk, in no time, is before.
     """
 
-    def __init__(self, planned: int, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
-        self.done = 0
-        self.failed = 0
-        self._planned = planned
+    def __init__(self, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
+        self._done = self._failed = self._planned = 0
         self._failures = failures
-        self._begin = time.monotonic()
-        self._shown = self._begin  # when the last line was printed
+        self._begin = self._now = time.monotonic()
         self._marks: deque[tuple[float, int]] = deque()  # times, and the counts then, of this phase
-        self._bar = None
-        terminal = sys.stderr.isatty()
-        self._quiet = quiet or silent
-        self._lines = not silent and not terminal
-        if terminal and not self._quiet:
+        self._phases: Phases = ()
+        self._bar: Any = None
+        self._file = -1  # that the watch reads, if there is one
+        self._held = ExitStack()
+        self._quiet, self._terminal = quiet or silent, sys.stderr.isatty()
+        self._lines = not silent and not self._terminal
+
+    def __enter__(self) -> Self:
+        """Begin to print lines."""
+        if self._lines:
+            file = self._held.enter_context(tempfile.TemporaryFile()).fileno()
+            command = [sys.executable, "-I", "-S", watch.__file__, str(SECONDS_BETWEEN_LINES), str(file)]
+            with suppress(OSError):  # no room for another process
+                self._held.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[file]))
+                self._file = file
+                listeners.append(self._doing)
+                self._held.callback(listeners.remove, self._doing)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End that."""
+        self._held.close()
+
+    def expect(self, planned: int) -> None:
+        """Count towards so many solves; they grow when a method asks for more."""
+        self._planned = planned
+        if self._terminal and not self._quiet:
             from tqdm import tqdm
 
             self._bar = tqdm(total=planned, dynamic_ncols=True, bar_format=BAR)
+        self._write()
 
     def __call__(self, done: int, failed: int) -> None:
         """Count solves that were finished, and how many of them failed; none at all: a phase begins."""
         if not done:
             self._marks.clear()
             return
-        self.done += done
-        self.failed += failed if self._failures else 0
-        now = time.monotonic()
+        self._done += done
+        self._failed += failed if self._failures else 0
+        self._now = now = time.monotonic()
         if not self._marks or now - self._marks[-1][0] >= SECONDS_BETWEEN_MARKS:
-            self._marks.append((now, self.done))
+            self._marks.append((now, self._done))
         while len(self._marks) > 1 and now - self._marks[1][0] >= SECONDS_BETWEEN_LINES:
             self._marks.popleft()
         if self._bar is not None:
-            self._bar.set_postfix_str(self._pace(now) + self._failures_so_far(), refresh=False)
+            self._bar.set_postfix_str(watch.pace(self.state, now), refresh=False)
             self._bar.update(done)
-        elif self._lines and now - self._shown >= SECONDS_BETWEEN_LINES:
-            self._print(self._pace(now))
-            self._shown = now
+        self._write()
 
     def close(self) -> None:
-        """Show the last state."""
+        """Show the last count."""
         if self._bar is not None:
-            self._bar.total = self.done
+            self._bar.total = self._done
             self._bar.close()
         elif not self._quiet:
-            self._planned = self.done
-            seconds = time.monotonic() - self._begin
-            self._print(f"{self.done / seconds if seconds > 0 else 0.0:.3g} per second, 0:00 left")
+            took = time.monotonic() - self._begin
+            self._planned, rate = self._done, self._done / took if took > 0 else 0.0
+            sys.stderr.write(f"{watch.line({**self.state, 'rate': rate, 'phases': ()}, self._now)}\n")
+            sys.stderr.flush()
 
-    def _pace(self, now: float) -> str:
-        """Solves per second since the first of the marks, and the time left by that."""
-        then, before = self._marks[0]
-        if now <= then:
-            return UNKNOWN
-        rate = (self.done - before) / (now - then)
-        return f"{rate:.3g} per second, {_clock(max(self._planned - self.done, 0) / rate)} left"
+    @property
+    def state(self) -> dict[str, Any]:
+        """What `workflows.run.watch.line` makes a line of: counts, rate (1/s) and its time, phases."""
+        then, before = self._marks[0] if self._marks else (self._now, self._done)
+        rate = (self._done - before) / (self._now - then) if self._now > then else 0.0
+        counts = {"done": self._done, "planned": max(self._planned, self._done), "failed": self._failed}
+        return {**counts, "rate": rate, "at": self._now, "phases": self._phases}
 
-    def _print(self, pace: str) -> None:
-        line = f"{self.done}/{max(self._planned, self.done)} solves, {pace}{self._failures_so_far()}"
-        sys.stderr.write(f"{line}\n")
-        sys.stderr.flush()
+    def _doing(self, phases: Phases) -> None:
+        self._phases = phases
+        self._write()
 
-    def _failures_so_far(self) -> str:
-        return f", {self.failed} failed" if self.failed else ""
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    def _write(self) -> None:
+        if self._file >= 0:
+            with suppress(OSError):  # a full disk
+                os.pwrite(self._file, json.dumps(self.state).encode().ljust(watch.SIZE), 0)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
+from forward.phases import phase
 from uq.findings import add
 from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
@@ -112,33 +113,33 @@ def _run(
     finished = _agreed(world, lambda: _prepare(study, directory, world.size, held))
     if finished is not None:
         with alone(world):
-            if world.rank == 0:
-                if report and not (directory / "report.html").exists():
-                    _report(directory)
-                if not quiet:
-                    sys.stdout.write(f"{directory}: finished before, nothing to do\n")
+            if world.rank == 0 and report and not (directory / "report.html").exists():
+                _report(directory)
+            if world.rank == 0 and not quiet:
+                sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
 
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
-    ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
+    shown = Progress(quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
+    progress, ensemble = held.enter_context(shown), Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
     ensemble.say = _say if world.rank == 0 and not quiet else lambda _: None
     checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
     try:
-        study = study.prepared(ensemble, directory, ensemble.say)
-        progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
+        study = phase("preparing")(study.prepared)(ensemble, directory, ensemble.say)
+        progress.expect(study.solves)
         checkpoint = Checkpoint(directory, own_code.identity(study), loaded)
-        job = ensemble.together(lambda: study.job(ensemble, name, directory, checkpoint))
+        job = ensemble.together(phase("making the model")(lambda: study.job(ensemble, name, directory, checkpoint)))
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
-        dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
+        dataset = phase(study.method.kind)(job.run)(ensemble, checkpoint, progress, study.parallel.blocks)
     except BaseException as error:
         if world.rank == 0:
             _withdraw(directory, error, checkpoint)
         raise
-    with alone(world):
+    with alone(world), phase("writing results"):
         if dataset is None:
             return DONE
         progress.close()
@@ -216,6 +217,7 @@ def _leave(
     checkpoint.clear()
 
 
+@phase("drawing the report")
 def _report(directory: Path) -> None:
     from workflows.report.page import write_report
 

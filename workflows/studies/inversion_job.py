@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from forward.combine import Recorded
-from forward.fem.finer import extrapolated
+from forward.fem.finer import Keep, extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
@@ -20,7 +21,7 @@ from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
@@ -36,7 +37,7 @@ from workflows.studies.inversion_results import (
     judged,
     table_of_finished,
 )
-from workflows.studies.job import MOVED, MethodJob, TasksJob
+from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 
@@ -58,11 +59,17 @@ There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or wh
 
 def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
-    made = _outputs(study, ensemble) if study.specimen is None else _specimen(study, study.specimen, ensemble)
+    keep = kept_starts(checkpoint, ensemble.group)
+    specimen = study.specimen
+    made = _outputs(study, ensemble, keep) if specimen is None else _specimen(study, specimen, ensemble, keep)
     derivable(made.model, study.model.kind)
     if study.predict is not None:
         made = replace(made, predicted=study.predicted.build(ensemble.group, study.acting))
-    return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
+    return (
+        _one(study, made, ensemble, checkpoint)
+        if study.together
+        else _many(study, made, ensemble, directory, checkpoint)
+    )
 
 
 @dataclass(frozen=True)
@@ -109,23 +116,23 @@ class _Made:
     predicted: ForwardModel | None = None
 
 
-def _outputs(study: InversionBlocks, ensemble: Ensemble) -> _Made:
+def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a model with outputs, of which the data tell which were measured; collective."""
     model, there = study.spec.build(ensemble.group, study.inputs.names), None
     if has_mesh(study.spec):
-        meshes, why = _meshes(study, model, study.inputs.mean)
+        meshes, why = _meshes(study, model, study.inputs.mean, keep)
         there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
     return _Made(model, lambda number: _Observed(model, there))
 
 
-def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
+def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
     model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
-    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean)
+    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
@@ -145,13 +152,13 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble) -> _Made:
 
 
 def _meshes(
-    study: InversionBlocks, model: ForwardModel, start: FloatArray
+    study: InversionBlocks, model: ForwardModel, start: FloatArray, keep: Keep
 ) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     if study.method.treatment is None:
         return None, study.method.unchecked
     try:
-        return extrapolated(model, start), ""
+        return extrapolated(model, start, keep), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
         return None, one_line(str(error))
 
@@ -174,14 +181,15 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
-def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, say: Callable[[str], None]) -> Problem:
-    """Return what is inverted of a data set, by its number."""
+def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensemble: Ensemble, kept: Kept) -> Problem:
+    """Return what is inverted of a data set, by its number; with a reduced model, steps are done more than once."""
     finer = None
     if seen.there is not None:
         model, why = seen.there
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, say)
+    steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
+    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, ensemble.say, steps)
 
 
 def _inverted(
@@ -254,7 +262,7 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
                 solved += log
             return _by_expansion(study, found, number, ensemble.say)
         seen = made.observed(number)
-        problem = _problem(study, number, seen, on, ensemble.say)
+        problem = _problem(study, number, seen, on, ensemble, kept(names[number]))
         if invert_field is not None:
             return invert_field(names[number], Recorded(seen.model, KeptSolves(kept(names[number]), solved)), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
@@ -343,7 +351,7 @@ def _reduced(study: InversionBlocks) -> Callable[[Any], ForwardModel | None]:
     return lambda observed: observed_by(observed, models)
 
 
-def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
+def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     seen, predicted = made.observed(0), made.predicted
     recorders: dict[str, Recorder] = {}
@@ -361,7 +369,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble) -> MethodJob:
             # Values at moved points and errors of meshes are not kept.
             return full.on(name) if name == FINER else evaluate.on(name.partition(",")[0])
 
-        found = _inverted(study, made, seen, _problem(study, 0, seen, on, ensemble.say), full, cheap, None)
+        problem = _problem(study, 0, seen, on, ensemble, Kept(checkpoint, MPI.COMM_SELF, "steps"))
+        found = _inverted(study, made, seen, problem, full, cheap, None)
         if predicted is not None:
             from workflows.studies.predicted import prior_band
 

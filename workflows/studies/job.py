@@ -6,10 +6,11 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
+from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate, Evaluations
 
 if TYPE_CHECKING:
@@ -20,11 +21,17 @@ if TYPE_CHECKING:
     from forward.model import FloatArray, ForwardModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble, EnsembleEvaluate
-    from uq.evaluation.kept import Kept
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.work_queue import Progress
 
+T = TypeVar("T")
 MOVED = "moved points"  # in names of models
+
+
+def kept_starts(checkpoint: Checkpoint, group: Any, label: str = "") -> Callable[[str, Callable[[], T]], T]:
+    """Return what keeps where solves on finer meshes start; not of ranks that share a model, each with its part."""
+    kept = Kept(checkpoint, group, f"{label}, starts")
+    return lambda name, begin: begin() if group.size > 1 else kept.value(name, begin)[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +92,7 @@ class MethodJob(Job):
     recorders
         What was evaluated, by the name under which it is stored.
     costly
-        Whether solves are worth storing: if not, an interrupted study starts again.
+        Whether solves are worth storing: if not, an interrupted study finds only the steps that its method keeps.
     node_volumes
         Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
     passing

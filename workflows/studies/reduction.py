@@ -70,7 +70,7 @@ class ReductionStudy(Study):
         """Make the body; collective."""
         from workflows.studies.reduction_job import job
 
-        return job(self.method, self.spec, self.inputs, ensemble, directory)
+        return job(self.method, self.spec, self.inputs, ensemble, directory, checkpoint)
 
 
 def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:

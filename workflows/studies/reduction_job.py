@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from mpi4py import MPI
 
 from forward.findings import Finding
 from forward.model import SolveError
@@ -18,7 +20,8 @@ from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
 from forward.reduced.spec import without_answer
-from uq.evaluation.evaluate import Recorder
+from uq.evaluation.evaluate import Recorder, Steps
+from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -31,6 +34,7 @@ from workflows.studies.reduction_blocks import FILE, Reduce
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, Solution
+    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
@@ -74,15 +78,13 @@ class KeptStates(FieldSum):
         return rows
 
 
-def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: Path) -> Job:
+def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> Job:
     """Make the body on every group; collective over the group."""
     model: HyperelasticModel = spec.build(ensemble.group, inputs.names)
     recorders: dict[str, Recorder] = {}
     told: dict[str, Any] = {}
 
     def alone() -> HyperelasticModel:
-        from mpi4py import MPI
-
         if ensemble.group.size == 1:
             return model
         made: HyperelasticModel = spec.build(MPI.COMM_SELF, inputs.names)
@@ -90,7 +92,8 @@ def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        made = _Making(method, inputs, recorders["/"], alone(), ensemble.say)
+        steps = Steps(Kept(checkpoint, MPI.COMM_SELF, "steps"), recorders["/"], count=ensemble.count)
+        made = _Making(method, inputs, recorders["/"], alone(), ensemble.say, steps)
         data, found = made.run()
         save(data, directory / FILE)
         kept = {key: value for key, value in data.about.items() if key not in {"spread", "lowest", "highest"}}
@@ -113,8 +116,10 @@ class _Making:
         evaluate: Recorder,
         model: HyperelasticModel,
         say: Callable[[str], None],
+        steps: Steps,
     ) -> None:
         self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
+        self._steps = steps
         self._start = linearise(inputs, evaluate).prediction
         more = method.more
         if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
@@ -141,12 +146,12 @@ class _Making:
                 continue
             begin = time.process_time()
             candidates = inputs.points(sobol_points(method.seed, 1 + number, 0, CANDIDATES * few, d))
-            worst = self._worst(reduction.reduced(snapshots, rough), candidates, few)
+            worst = self._steps(f"round {number}", partial(self._worst, reduction, snapshots, rough, candidates, few))
             seconds += time.process_time() - begin
             more = self._solved(worst) if len(worst) else None
             snapshots = snapshots if more is None else snapshots.with_others(more)
         begin = time.process_time()
-        data = reduction.reduced(snapshots, self._sizes)
+        data = self._steps("model", partial(reduction.reduced, snapshots, self._sizes))
         seconds += time.process_time() - begin
         solving = float(sum(one.seconds.sum() for one in self._evaluate.log))
         self.seconds = {"snapshots": solving, "reduction": seconds}
@@ -167,20 +172,23 @@ class _Making:
         adjoints, tangents = rows[:, 1 : 1 + m].reshape(-1, size), rows[:, 1 + m :].reshape(-1, size)
         return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
 
-    def _worst(self, data: ReducedData, candidates: FloatArray, few: int) -> FloatArray:
+    def _worst(
+        self, reduction: Reduction, snapshots: Snapshots, sizes: Sizes, candidates: FloatArray, few: int
+    ) -> FloatArray:
         """Return the candidates (few, d) where the model and the larger one differ most, in any output."""
+        data = reduction.reduced(snapshots, sizes)
         both = (
             ReducedModel(data, data.parameters, alone=alone, tested=False, unbalanced=UNBALANCED)
             for alone in (False, True)
         )
         outputs = [[_outputs(one, len(self._model.outputs)) for one in model.solve_many(candidates)] for model in both]
-        sizes = np.abs((np.array(outputs[1]) - np.array(outputs[0])) / np.array(data.about["spread"])).max(axis=1)
-        known = np.isfinite(sizes)
+        gaps = np.abs((np.array(outputs[1]) - np.array(outputs[0])) / np.array(data.about["spread"])).max(axis=1)
+        known = np.isfinite(gaps)
         lost = np.flatnonzero(~known)[: few // LOST]
-        worst = np.argsort(np.where(known, -sizes, np.inf), kind="stable")[: min(few - len(lost), known.sum())]
+        worst = np.argsort(np.where(known, -gaps, np.inf), kind="stable")[: min(few - len(lost), known.sum())]
         said = f"{len(data.snapshots)} snapshots, {data.about['modes']} modes, {data.about['points']} points"
         if known.any():
-            largest = 100 * sizes[known].max()
+            largest = 100 * gaps[known].max()
             self._say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
         return np.asarray(candidates[np.sort(np.concatenate([lost, worst]))])
 

@@ -174,7 +174,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         """Make the candidates, each for each group of data; collective."""
         from workflows.studies.selection_job import job
 
-        return job(self, ensemble)
+        return job(self, ensemble, checkpoint)
 
     # --- what is said ------------------------------------------------------------------------------------------------
 

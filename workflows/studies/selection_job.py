@@ -6,35 +6,40 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 from forward.combine import sums_of
-from forward.fem.finer import extrapolated
+from forward.fem.finer import Keep, extrapolated
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel
 from inverse.criticism.finer import Finer
-from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate, Steps
+from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
-from workflows.studies.job import MOVED, MethodJob
+from workflows.studies.job import MOVED, MethodJob, kept_starts
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.selection_blocks import SelectionBlocks
 
 Make = Callable[[], Any]
 
 
-def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
+def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> MethodJob:
     """Make the candidates, each for each group of data; collective."""
     method, why = study.method, study.unchecked
     makers: dict[tuple[str, str], Make] = {
         pair: cache(partial(study.build, *pair, ensemble.group)) for pair in study.pairs
     }
     recorders: dict[str, Recorder] = {}
+    kept = Kept(checkpoint, MPI.COMM_SELF, "steps")  # of the method, which runs on the first rank
     checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
     motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
 
@@ -63,6 +68,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
             ensemble.say,
             shared or None,
             lambda *pair: makers[pair](),
+            lambda *pair: Steps(kept, recorders["/".join(pair)], "/".join(pair), ensemble.count),
         )
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
@@ -80,7 +86,10 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
         return judged
 
     finer_ones = {
-        f"{n}/{g}/{FINER}": partial(build_finer, makers[n, g], study.models[n].inputs.mean) for n, g in checked
+        f"{n}/{g}/{FINER}": partial(
+            build_finer, makers[n, g], study.models[n].inputs.mean, kept_starts(checkpoint, ensemble.group, f"{n}/{g}")
+        )
+        for n, g in checked
     }
     moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
     return MethodJob(
@@ -90,16 +99,16 @@ def job(study: SelectionBlocks, ensemble: Ensemble) -> MethodJob:
         recorders,
         labelled=labelled,
         arviz_groups=partial(comparison.arviz_groups, study.models, method.noise.factor, method.seed),
-        costly=study.model is not None,
+        costly=study.model is not None or method.chains in {"pcn", "emcee"},  # whose one step may take minutes
         passing=frozenset(finer_ones),
     )
 
 
-def build_finer(make: Make, start: FloatArray) -> ForwardModel:
+def build_finer(make: Make, start: FloatArray, keep: Keep) -> ForwardModel:
     """Make, on finer meshes, the specimen or the measured outputs of a body that `make` returns; collective."""
     own = make()
     body, _ = sums_of(own)
-    return extrapolated(body, start).of(own)
+    return extrapolated(body, start, keep).of(own)
 
 
 def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:

@@ -18,6 +18,7 @@ from dolfinx import fem
 from forward.fem.dolfinx import version
 from forward.machine import StopError, compiled_forms
 from forward.native import FLAGS, processor
+from forward.phases import phase
 
 T = TypeVar("T")
 
@@ -84,7 +85,8 @@ def compiled(name: str, make: Callable[[Path], T], comm: Any, beside: str = "") 
             place = Path(tempfile.mkdtemp(dir=_CACHE))
         place = comm.bcast(place)
         try:
-            made = make(place)
+            with phase("compiling forms"):
+                made = make(place)
             comm.barrier()  # everyone has loaded it
             if comm.rank == 0 and place != folder:
                 with suppress(OSError):  # without locks another process may have been faster

@@ -18,6 +18,7 @@ from forward.fem.dolfinx.spaces import owned_nodes
 from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
+from forward.phases import phase
 from forward.solvers.system import TIGHT
 from forward.terms.acting import Entries
 
@@ -258,6 +259,7 @@ class DirectSolver:
             )
         raise SolveError(f"the factorisation failed (MUMPS error {status})")
 
+    @phase("factorising")
     def _try(self) -> int:
         """Factorise; return MUMPS's status, negative if it failed."""
         self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve

@@ -1,25 +1,29 @@
 """Progress: what is shown on a terminal and off it, quiet or not, as a clock goes on."""
 
 import re
+import subprocess
 import sys
+import time
 
 import pytest
 
-from tests.launch import run_script
-from workflows.run import progress
+from forward.phases import listeners, phase
+from tests.launch import HANGS, run_script
+from workflows.run import progress, watch
 from workflows.run.progress import Progress
 
+# One solve takes long, in a library that holds Python's lock.
 MODEL = """
-import time
+import ctypes
 
 def value(p):
-    time.sleep(0.02)
+    ctypes.PyDLL(None).usleep(1_500_000 if p[0] == 0.5 else 20_000)
     return [p[0]]
 """
 STUDY = """
 model = { kind = "python", function = "waiting.value", parameters = { a = 0.5 }, outputs = ["y"] }
 parameters = { a = { kind = "uniform", lower = 0.0, upper = 1.0 } }
-method = { kind = "monte-carlo", samples = 100, seed = 1 }
+method = { kind = "monte-carlo", samples = 40, seed = 1 }
 """
 # A minute in a fifth of a second.
 HASTE = """
@@ -48,88 +52,139 @@ def clock(monkeypatch):
     return found
 
 
-def lines(capsys, clock, **settings):
-    """What a study of 100 solves shows that takes 3 s for each and fails once."""
-    shown = Progress(100, **settings)
-    for number in range(100):
-        clock.now += 3.0
-        shown(1, int(number == 50))
+def expecting(planned, **settings):
+    found = Progress(**settings)
+    found.expect(planned)
+    return found
+
+
+def counted(shown, clock, *solves):
+    """What is printed after solves that took so many seconds: their number, and how many of them failed."""
+    for seconds, done, failed in solves:
+        clock.now += seconds
+        shown(done, failed)
+    return watch.line(shown.state, clock.now)
+
+
+@pytest.mark.unit
+def test_rate_and_time_left(capsys, clock):
+    shown = expecting(100)
+    assert counted(shown, clock) == "0/100 solves, time left not known yet"
+    assert counted(shown, clock, *[(3.0, 1, 0)] * 20) == "20/100 solves, 0.333 per second, 4:00 left"
+    assert counted(shown, clock, *[(3.0, 1, 1)], *[(3.0, 1, 0)] * 79).startswith("100/100 solves, 0.333 per second")
     shown.close()
-    return capsys.readouterr().err.splitlines()
+    assert capsys.readouterr().err == "100/100 solves, 0.333 per second, 0:00 left, 1 failed\n"
 
 
 @pytest.mark.unit
-def test_a_line_a_minute_off_the_terminal(capsys, clock):
-    minutes = lines(capsys, clock)
-    assert minutes[0] == "20/100 solves, 0.333 per second, 4:00 left"
-    assert [line.split("/")[0] for line in minutes] == ["20", "40", "60", "80", "100", "100"]
-    assert minutes[-1] == "100/100 solves, 0.333 per second, 0:00 left, 1 failed"
+def test_time_left_falls_while_nothing_ends(clock):
+    shown = expecting(100)
+    counted(shown, clock, *[(3.0, 1, 0)] * 20)
+    assert watch.line(shown.state, clock.now + 60) == "20/100 solves, 0.333 per second, 3:00 left"
+    assert watch.line(shown.state, clock.now + 600) == "20/100 solves, 0.333 per second, 0:00 left"
 
 
 @pytest.mark.unit
-def test_the_first_solve_does_not_spoil_the_time_left(capsys, clock, monkeypatch):
+def test_the_first_solve_does_not_spoil_the_time_left(clock, monkeypatch):
     """It compiles and factorises, which is not repeated: 80 s here, and half a second for each of the others."""
-    shown = Progress(1001)
-    for number in range(400):
-        clock.now += 80.0 if number == 0 else 0.5
-        shown(1, 0)
-    first, *others = capsys.readouterr().err.splitlines()
-    assert first == "1/1001 solves, time left not known yet"
-    left = [int(line.split()[0].partition("/")[0]) for line in others]
-    assert [line.split(", ")[2] for line in others] == [
-        f"{minutes}:{seconds:02d} left" for minutes, seconds in (divmod(round((1001 - n) / 2), 60) for n in left)
-    ]
-    assert len(others) >= 3
+    shown = expecting(1001)
+    assert counted(shown, clock, (80.0, 1, 0)) == "1/1001 solves, time left not known yet"
+    for done in (101, 201, 301):
+        seconds = (1001 - done) // 2
+        left = f"{seconds // 60}:{seconds % 60:02d} left"
+        assert counted(shown, clock, *[(0.5, 1, 0)] * 100) == f"{done}/1001 solves, 2 per second, {left}"
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     clock.now = 0.0
-    shown = Progress(81)
-    for number in range(2):
-        clock.now += 80.0 if number == 0 else 0.5
-        shown(1, 0)
+    shown = expecting(81)
+    counted(shown, clock, (80.0, 1, 0), (0.5, 1, 0))
     assert shown._bar.postfix == "2 per second, 0:40 left"  # not the 53 minutes of 40 s for each
     shown.close()
 
 
 @pytest.mark.unit
-def test_each_phase_has_its_own_rate(capsys, clock):
+def test_each_phase_has_its_own_rate(clock):
     """One solve alone; sixteen together after ten minutes that prepare them, 80 s for the next; two that are read."""
-    shown = Progress(100)
-    clock.now = 70.0
-    shown(1, 0)
-    for seconds, solves in ((0.0, 0), (600.0, 16), (80.0, 16), (80.0, 16), (0.0, 2), (0.0, 0), (300.0, 1), (75.0, 1)):
-        clock.now += seconds
-        shown(solves, 0)
-    assert capsys.readouterr().err.splitlines() == [
+    shown = expecting(100)
+    steps = ((70.0, 1, 0), (0.0, 0, 0), (600.0, 16, 0), (80.0, 16, 0), (80.0, 16, 0), (0.0, 2, 0), (0.0, 0, 0))
+    assert [counted(shown, clock, step) for step in (*steps, (300.0, 1, 0), (75.0, 1, 0))] == [
+        "1/100 solves, time left not known yet",
         "1/100 solves, time left not known yet",
         "17/100 solves, time left not known yet",
         "33/100 solves, 0.2 per second, 5:35 left",
         "49/100 solves, 0.2 per second, 4:15 left",
+        "51/100 solves, 0.225 per second, 3:38 left",
+        "51/100 solves, time left not known yet",
         "52/100 solves, time left not known yet",
         "53/100 solves, 0.0133 per second, 58:45 left",
     ]
 
 
 @pytest.mark.unit
-def test_quiet_runs_still_show_life(capsys, clock):
-    assert lines(capsys, clock, quiet=True) == lines(capsys, clock)[:-1]
-    assert lines(capsys, clock, silent=True) == []
+def test_what_is_done_is_named_with_its_time():
+    states = []
+    listeners.append(states.append)
+    try:
+        with phase("searching"), phase("factorising"):
+            (_, outer), (_, inner) = states[-1]
+        assert states[-1] == ()
+    finally:
+        listeners.pop()
+    assert inner >= outer
+    state = {"done": 0, "planned": 0, "failed": 0, "rate": 0.0, "at": 0.0}
+    assert watch.line(state | {"phases": [["searching", 10.0], ["factorising", 95.0]]}, 100.0) == (
+        "searching (1:30): factorising (0:05)"
+    )
+    ended = state | {"done": 5, "planned": 5, "failed": 1, "phases": [["drawing the report", 40.0]]}
+    assert watch.line(ended, 100.0) == "5/5 solves, 1 failed; drawing the report (1:00)"
+    assert watch.line(state | {"phases": []}, 100.0) == "at work"
 
 
 @pytest.mark.unit
-def test_quiet_runs_show_nothing_on_a_terminal(capsys, clock, monkeypatch):
+@pytest.mark.parametrize(
+    ("terminal", "settings", "lines"),
+    [(False, {}, True), (False, {"quiet": True}, True), (False, {"silent": True}, False), (True, {}, False)],
+)
+def test_lines_are_printed_off_the_terminal_only(monkeypatch, capfd, terminal, settings, lines):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.1)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    with Progress(**settings), phase("waiting"):
+        begin, shown = time.monotonic(), ""
+        while time.monotonic() - begin < (HANGS if lines else 0.3) and "waiting" not in shown:
+            time.sleep(0.02)
+            shown += capfd.readouterr().err
+    assert ("waiting (0:0" in shown) == lines
+    assert listeners == []
+
+
+@pytest.mark.unit
+def test_quiet_runs_show_nothing_on_a_terminal(capfd, clock, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert lines(capsys, clock, quiet=True) == []
+    with expecting(100, quiet=True) as shown:
+        counted(shown, clock, *[(3.0, 1, 0)] * 100)
+        shown.close()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.unit
+def test_the_watch_ends_with_the_run_however_that_ends(tmp_path):
+    with (tmp_path / "state").open("w+b") as file:
+        command = [sys.executable, watch.__file__, "100", str(file.fileno())]
+        begun = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[file.fileno()])
+        begun.stdin.close()  # as a kill does
+        assert begun.wait(HANGS) == 0
 
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_the_command_shows_life_though_quiet(tmp_path, ranks):
-    """By the first rank, of the solves of all."""
+    """By the first rank, of the solves of all, and within the first of them, which holds Python's lock."""
     (tmp_path / "waiting.py").write_text(MODEL)
     (tmp_path / "study.toml").write_text(STUDY)
     done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     assert (done.returncode, done.stdout) == (0, "")
-    shown = re.compile(r"(\d+)/10\d solves, (.* per second, .* left|time left not known yet)")
-    counts = [shown.fullmatch(line) for line in done.stderr.splitlines()]
-    assert len(counts) >= 2
-    assert all(counts), done.stderr
+    of_solves = r"(\d+)/4\d solves(, (.* per second, .* left|time left not known yet))?"
+    shown = re.compile(rf"({of_solves}; )?(\D+ \(0:\d\d\)(: )?)+|({of_solves}|at work)")
+    lines = done.stderr.splitlines()
+    assert all(shown.fullmatch(line) for line in lines), done.stderr
+    within = re.compile(r"\d/4\d solves, time left not known yet; monte-carlo \(0:0\d\): solving \(0:0[01]\)")
+    assert len([line for line in lines if within.fullmatch(line)]) >= 3, done.stderr
