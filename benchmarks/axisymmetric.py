@@ -7,7 +7,7 @@ Nothing is shared with the program.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -16,15 +16,32 @@ from scipy.sparse.linalg import spsolve
 STEP = 1e-30
 
 
-def indented(  # noqa: PLR0915 - one problem, solved from end to end
-    b: float, height: float, radius: float, depth: float, c1: float, d1: float, cells: int = 20
-) -> float:
-    """Return the force (N) that presses a sphere into a cylinder of radius b (m), bonded below, by a depth (m).
+class Indented(NamedTuple):
+    """Force (N) on a sphere, and the area (m²) of the deformed top that it touches."""
 
-    The energy is c1 (Ī1 − 3) + d1 (J − 1)².
+    force: float
+    area: float
+
+
+def thin(cells: int, end: float, growth: float = 1.25) -> np.ndarray[Any, Any]:
+    """Return ends of cells from 0 to 1: so many of equal length up to `end`, and longer ones from there."""
+    lengths = [end / cells]
+    while sum(lengths) < 1 - end:
+        lengths.append(lengths[-1] * growth)
+    beyond = np.cumsum(lengths[1:])
+    return np.append(np.linspace(0, end, cells + 1), end + beyond * (1 - end) / beyond[-1])
+
+
+def indented(  # noqa: PLR0915 - one problem, solved from end to end
+    b: float, height: float, radius: float, depth: float, c1: float, d1: float, ends: np.ndarray[Any, Any] | None = None
+) -> Indented:
+    """Press a sphere into a cylinder of radius b (m), bonded below, by a depth (m).
+
+    The energy is c1 (Ī1 − 3) + d1 (J − 1)². `ends` are those of cells from the axis and from the top, over the size.
     """
-    grid = 1.15 ** np.arange(cells)
-    ends = np.concatenate([[0], np.cumsum(grid)]) / grid.sum()
+    if ends is None:
+        ends = np.append(0, np.cumsum(1.15 ** np.arange(20)) / (1.15 ** np.arange(20)).sum())
+    cells = len(ends) - 1
     ticks = np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
     n = len(ticks)
     R, Z = np.meshgrid(b * ticks, height * (1 - ticks), indexing="ij")  # fine at the axis and at the top
@@ -101,7 +118,12 @@ def indented(  # noqa: PLR0915 - one problem, solved from end to end
         else:
             message = "the other code does not converge"
             raise RuntimeError(message)
-    return abs(force)
+    x = X[top] + u.reshape(-1, 2)[top]
+    rings = np.pi * (x[1:, 0] + x[:-1, 0]) * np.linalg.norm(np.diff(x, axis=0), axis=1)
+    within, last = np.append(0, np.cumsum(rings)), int(np.flatnonzero(push)[-1])
+    before, there = (push[last - 1 : last + 1] / area[top][last - 1 : last + 1]) ** 2  # falls to 0 like a line
+    beyond = (within[last] - within[last - 1]) * there / (before - there) if before > there else 0.0
+    return Indented(abs(force), float(within[last] + min(beyond, rings[last])))
 
 
 def _quadratic(s: float) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks.axisymmetric import indented
+from benchmarks.axisymmetric import indented, thin
 from benchmarks.half_spaces import C1, CONTACT, D1, DEPTH, MESHES, TOOLS, Mesh, closed_forms
 from benchmarks.indentations import random
 from benchmarks.organ_indentation import phases
@@ -82,15 +82,23 @@ def rough(cells: int = 5) -> None:
 
 def large_strains() -> None:
     """A sphere of 3 mm pressed 0.5, 1 and 1.5 mm into a block of 12 mm, and into a cylinder of equal area."""
-    side, radius = 12e-3, 3e-3
-    spec = quarter(side, (8, 8, 6), 16.0, {"shape": "sphere", "radius": radius, "depth": 1e-3})
-    model = spec.build(MPI.COMM_SELF, ("loads.indenter.depth",))
-    sys.stdout.write("Sphere of 3 mm, large strains: depth, force (mN), by an axisymmetric code, ratio\n")
+    side, radius, across = 12e-3, 3e-3, 2 / math.sqrt(math.pi)
+    outputs = [{"name": "force", "kind": "force", "times": 4}, {"name": "area", "kind": "contact-area"}]
+    meshes = (((8, 8, 6), 16.0), *(((n,) * 3, 6.0) for n in (4, 5, 6, 8)))
+    models = {
+        cells: quarter(
+            side, cells, grading, {"shape": "sphere", "radius": radius, "depth": 1e-3}, outputs=outputs
+        ).build(MPI.COMM_SELF, ("loads.indenter.depth",))
+        for cells, grading in meshes
+    }
+    sys.stdout.write("Sphere of 3 mm, large strains: force (mN) and area (mm²) by an axisymmetric code; ratios to it\n")
     for depth in (0.5e-3, 1e-3, 1.5e-3):
-        force = 4 * model.solve(np.array([depth])).outputs[0]
-        other = indented(2 * side / math.sqrt(math.pi), side, radius, depth, C1, D1)
-        sys.stdout.write(f"{1e3 * depth:.1f} mm  {1e3 * force:.4f}  {1e3 * other:.4f}  {force / other:.4f}\n")
-        sys.stdout.flush()
+        other = indented(across * side, side, radius, depth, C1, D1, thin(16, 0.21))
+        sys.stdout.write(f"{1e3 * depth:.1f} mm  {1e3 * other.force:.4f}  {1e6 * other.area:.3f}\n")
+        for cells, model in models.items():
+            force, area = model.solve(np.array([depth])).outputs
+            sys.stdout.write(f"    {cells}: {force / other.force:.4f}  {4 * area / other.area:.4f}\n")
+            sys.stdout.flush()
 
 
 def cost(draws: int = 12) -> None:

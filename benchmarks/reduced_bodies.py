@@ -27,7 +27,6 @@ BODY = {
     "loads": [BALL | {"depth": 0.004, "radius": 0.015}],
     "outputs": [
         {"name": "force", "kind": "force"},
-        {"name": "area", "kind": "contact-area"},
         {"name": "beside", "kind": "displacement", "at": [0.05, 0.048, 0.03], "component": "z"},
         {"name": "energy", "kind": "strain-energy"},
         {"name": "stress", "kind": "max-von-mises"},

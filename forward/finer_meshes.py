@@ -4,7 +4,8 @@ Cells are smaller everywhere, and smaller still at the faces that are held, wher
 mesh that is refined equally shares most of the error there. Finer meshes are quadratic, with as many nodes where the
 body is linear, and never coarser than a few cells: the differences of linear or very coarse meshes tell neither how
 fast the error falls nor what is left of it (docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are
-halved, and graded as those of the body: the edge of the contact may be anywhere. A mesh that does not contain the
+halved, and graded as those of the body: the edge of the contact may be anywhere. Errors change their sign there as that
+edge passes lines of nodes, so that two meshes show no order: nothing is extrapolated. A mesh that does not contain the
 vertices of a random field has another field: cells of boxes and blocks with fields are divided, and again at the rims
 of what is held (`forward.bodies.tetrahedra`).
 """
@@ -56,20 +57,20 @@ def graded(spec: AnyBody) -> Any | None:
 
 
 def share(spec: AnyBody) -> float:
-    """Return what the finer mesh still misses, over its difference from the coarser one."""
+    """Return what the finer mesh still misses, over its difference from the coarser one; 0 where no order is known."""
+    if _touched(spec):
+        return 0.0
     if not spec.body.structured:
         return OF_LINEAR if spec.body.degree == 1 else HALVED
-    if spec.fields and not _touched(spec):
+    if spec.fields:
         layers = _layers(spec)
         if _parts(spec.body) == 2:
             return 1 / (2**3 - 1)
         return 1 / (RATIO ** (-OF_EQUAL * layers) - 1) if layers else OF_LINEAR
-    if spec.fields or (_touched(spec) and spec.body.degree == 2):
-        return HALVED
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
     times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
     # Displacements converge like h^(degree + 1) where meshes are graded as singular stresses want it.
-    return float(1 / (times ** (OF_EQUAL if _touched(spec) else fine.degree + 1) - 1))
+    return float(1 / (times ** (fine.degree + 1) - 1))
 
 
 def held(spec: AnyBody) -> tuple[str, ...]:

@@ -82,7 +82,7 @@ class LoadedBody(Refinable):
     @property
     def linear(self) -> Linear:
         """What its linear systems are solved with."""
-        if self.mixed or self.body.degree < 2 or self.unestimated_with:
+        if self.mixed or self.body.degree < 2 or self.unenriched_with:
             return Linear.FACTOR
         if self.solver.linear != "auto":
             return Linear(self.solver.linear)
@@ -115,10 +115,20 @@ class LoadedBody(Refinable):
         return {f"loads.{label}.friction": why for label in smooth}
 
     @property
-    def unestimated_with(self) -> str:
-        """With what no error of its mesh is estimated: friction, and loads that are no forms; empty without."""
+    def unenriched_with(self) -> str:
+        """What it has no place for in other elements: friction, and loads that are no forms; empty without."""
         rubbing = ["friction"] if any(load.contact and load.remembers for load in self.loads) else []
         return " and ".join((*rubbing, *(f"'{load.label}'" for load in self.loads if not load.written)))
+
+    @property
+    def unestimated_with(self) -> str:
+        """With what no error of its mesh is estimated: that, and tools of which the area in contact has an edge.
+
+        Elements of one degree more enter such a tool between the points where the body touches it: errors of forces
+        came out larger than the forces, mostly ten times and more.
+        """
+        tools = [f"the tool '{load.label}', whose area in contact has an edge" for load in self.loads if load.edged]
+        return self.unenriched_with or " and ".join(tools)
 
     @property
     def touched(self) -> bool:
@@ -376,8 +386,8 @@ class LoadedBody(Refinable):
             objection = "multigrid needs cells of degree 2, between which and linear ones it goes to and fro"
         elif self.formulation == "mixed":
             objection = "multigrid solves for displacements only, and the form is mixed"
-        elif self.unestimated_with:
-            objection = f"multigrid is not available with {self.unestimated_with}"
+        elif self.unenriched_with:
+            objection = f"multigrid is not available with {self.unenriched_with}"
         elif self.solver.kind == "newton":
             objection = "the textbook solver has a factor for every step"
         if objection:

@@ -166,9 +166,14 @@ class ModelSpec(Settings):
         return {}
 
     @property
-    def unestimated_with(self) -> str:
-        """With what errors of its mesh are not estimated: what remembers, or is no form; empty if none."""
+    def unenriched_with(self) -> str:
+        """What it has no place for on other meshes: what remembers, or is no form; empty if none."""
         return ""
+
+    @property
+    def unestimated_with(self) -> str:
+        """With what errors of its mesh are not estimated; empty if none."""
+        return self.unenriched_with
 
     @property
     def hidden(self) -> str:

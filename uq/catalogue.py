@@ -113,9 +113,6 @@ TABLE: dict[str, str | Words] = {
     "solver-tolerance": "The solver's tolerance of {tolerance:g} may leave larger errors than the mesh in {about}: "
     "the error of the mesh is not known to better than that. Take a smaller model.solver.tolerance.",
     "mesh-estimates-failed": "{lost} of {n} estimates of the error of the mesh failed ({reason}); {rest}.",
-    "mesh-estimates-failed-in-contact": "{lost} of {n} estimates of the error of the mesh failed, as they mostly do "
-    "in contact, where the edge of the area that is touched moves; {rest}. Compare with a finer mesh, and set "
-    "accuracy.mesh_error = false to save their time.",
     "mesh-never-estimated": "The error of the mesh is not estimated of {about}: such outputs need not converge as "
     "cells become smaller (the largest stress at an edge that is held grows without limit).",
     "mesh-estimates-missing": "There is no estimate of the error of the mesh at some points of {about}, and so none "

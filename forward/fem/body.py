@@ -94,8 +94,8 @@ class DiscreteBody(Generic[S]):
         SolveError
             If something acts on it that has no place there.
         """
-        if self.spec.unestimated_with:
-            raise not_estimated(self.spec.unestimated_with)
+        if self.spec.unenriched_with:
+            raise not_estimated(self.spec.unenriched_with)
         if 1 not in self._richer:
             self._richer[1] = Enriched(self.equations, self.spec.enriched(), self.functionals)
         return self._richer[1]

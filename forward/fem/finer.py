@@ -2,7 +2,8 @@
 
 Its own grading with as many cells as the body has tells how fast the error falls: as h^p, and where the cells of the
 finer mesh are t times smaller, it still misses the difference ψ_f − ψ_c times 1/(t^p − 1) (L. F. Richardson, Phil.
-Trans. R. Soc. A 226 (1927) 299–361). The difference itself is an output too: it says how far that may be wrong. Where
+Trans. R. Soc. A 226 (1927) 299–361). The difference itself is an output too: it says how far that may be wrong, and
+where no order is known it counts as a whole (`WHOLE`) and nothing is extrapolated. Where
 thin cells at a rim are squeezed until there is no equilibrium, meshes without them take their place. Random fields are
 those of the mesh itself, interpolated.
 """
@@ -37,6 +38,7 @@ ITERATIONS, LOAD_STEP = 12, 1 / 16
 # States with their derivatives; or none, and why: the reason, and the history of the solver.
 Begun = tuple[tuple[tuple[FloatArray, FloatArray], ...], tuple[str, tuple[str, ...]] | None]
 Keep = Callable[[str, Callable[[], Begun]], Begun]  # by the name of the meshes; what a run begun before has found
+WHOLE = 2.0  # times the difference between meshes that show no order, of which nearly a half counts otherwise
 TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
@@ -108,17 +110,17 @@ def limit(model: ForwardModel, observed: csr_matrix, outputs: tuple[str, ...], s
     observed, outputs
         Weights (n, m) of the outputs in what is observed, and its names.
     share
-        1/(t^p − 1).
+        1/(t^p − 1); 0 where p is not known.
 
     Returns
     -------
     Rows
-        With 2n outputs: ψ_f + share (ψ_f − ψ_c), and then ψ_f − ψ_c.
+        With 2n outputs: ψ_f + share (ψ_f − ψ_c), and then ψ_f − ψ_c, times `WHOLE` where the share is 0.
     """
     names = (*outputs, *(f"{name} (between the meshes)" for name in outputs))
     one = identity(len(outputs))
     gaps = Rows(model, kron([[1, 0], [1, -1]], observed, format="csr"), names)
-    return Rows(gaps, kron([[1, share], [0, 1]], one, format="csr"), names)
+    return Rows(gaps, kron([[1, share], [0, 1.0 if share else WHOLE]], one, format="csr"), names)
 
 
 @dataclass(frozen=True)

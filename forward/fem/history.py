@@ -298,7 +298,7 @@ class HistorySolution:
 
     def mesh_error(self, spare: float = math.inf) -> Never:
         """There is no estimate with memory: the states before differ in elements of another degree too."""
-        raise not_estimated(self._model.spec.unestimated_with)
+        raise not_estimated(self._model.spec.unenriched_with)
 
     saturation = mesh_error
 

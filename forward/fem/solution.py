@@ -301,8 +301,8 @@ class FiniteElementSolution:
         """
         if self._model.rows is not None:
             return self._by_degrees()
-        if self._model.spec.unestimated_with:
-            raise not_estimated(self._model.spec.unestimated_with)
+        if self._model.spec.unenriched_with:
+            raise not_estimated(self._model.spec.unenriched_with)
         finer = finer or self._model.finer_mesh(spare)
         return replace(self._calibrated(spare, finer), hidden=finer.hidden(self))
 

@@ -98,7 +98,7 @@ OUTPUTS = Kinds(
         "volume-change": "forward.observables.integrals:VolumeChange",
         "max-von-mises": "forward.observables.largest:MaxVonMises",
         "force": "forward.observables.integrals:Force",
-        "contact-area": "forward.observables.integrals:ContactArea",
+        "contact-area": "forward.observables.contact:ContactArea",
         "max-pressure": "forward.observables.largest:MaxPressure",
     },
     Observable,

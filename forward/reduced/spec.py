@@ -319,7 +319,7 @@ def mistakes(spec: LoadedBody) -> Iterator[str]:
     for load in (load for load in spec.loads if not load.written):
         yield f"the load '{load.label}' is no form and cannot be reduced, expected loads that are written as forms"
     known = {"displacement", "mean-displacement", "max-displacement", "reaction", "strain-energy", "volume-change"}
-    known |= {"max-von-mises", "force", "contact-area"}
+    known |= {"max-von-mises", "force"}
     for output in spec.outputs:
         kind = str(getattr(output, "kind"))  # noqa: B009 - every output has a kind
         if kind not in known and "." not in kind:

@@ -232,6 +232,11 @@ class Indenter(Term):
         """Whether it has no friction, which has no potential."""
         return not self.friction
 
+    @property
+    def edged(self) -> bool:
+        """Whether it is no plane."""
+        return self.shape != "plane"
+
     def rubbing(self, at: Place) -> Any | None:
         """Virtual work ∫ t·v dS of the tractions t of friction; None without friction."""
         if not self.friction:

@@ -181,6 +181,11 @@ class Term(Named):
         """Whether it depends on what earlier steps left, as friction does."""
         return self.contact and not self.symmetric
 
+    @property
+    def edged(self) -> bool:
+        """Whether what it touches ends where it parts from the body, and not at an edge of the body."""
+        return False
+
     def acting(self, equations: Any) -> Acting:
         """Return what it is on the nodes of a discrete body (`forward.fem.equations`); collective.
 

@@ -95,8 +95,24 @@ def error_of(
     if tangents is not None and look.tangents is not None:
         slopes = look.tangents - tangents
     error = look.outputs - outputs
-    root, apart = uncertain(error, look.between, data), OF_DATUM * np.abs(look.between)
+    root, apart = uncertain(error, look.between, data), OF_DATUM * beside(look.between, data)
     return ModelError(point, error, slopes, root, apart)
+
+
+def beside(between: FloatArray, data: Measurements) -> FloatArray:
+    """Return the sizes (m,) of differences between finer meshes, of outputs as root mean squares along their curves.
+
+    Of a datum and those before and after it, over their noise: where the difference changes its sign it is small, and
+    errors need not be.
+    """
+    squares = (between / data.sigma) ** 2
+    curves = ~np.isfinite(data.places).all(axis=1)
+    for axis in np.unique(data.axes[curves]):
+        rows = np.flatnonzero(curves & (data.axes == axis))
+        rows = rows[np.argsort(data.cases[rows], kind="stable")]
+        pairs = np.pad(squares[rows], 1, constant_values=np.nan)
+        squares[rows] = np.nanmean([pairs[:-2], pairs[1:-1], pairs[2:]], axis=0)
+    return np.asarray(np.sqrt(squares) * data.sigma)
 
 
 def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> FloatArray:

@@ -42,14 +42,11 @@ class Told(NamedTuple):
         Outputs whose error of the mesh is not estimated at all.
     tolerance
         Of its solver, relative.
-    contact
-        Whether tools touch the body.
     """
 
     units: Mapping[str, str]
     never: frozenset[str] = frozenset()
     tolerance: float = 0.0
-    contact: bool = False
 
 
 def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[Finding]:
@@ -128,9 +125,8 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
         reason = estimates.failures[0].reason
         known = ok >= FEWEST_ANSWERS
         rest = "the others are used" if known else "so that nothing is known of the error of the mesh"
-        code = "mesh-estimates-failed-in-contact" if told.contact else "mesh-estimates-failed"
         values = {"lost": n - ok, "n": n, "reason": reason, "rest": rest}
-        yield Finding(code, "warning" if known else "error", values)
+        yield Finding("mesh-estimates-failed", "warning" if known else "error", values)
     if ok < FEWEST_ANSWERS:
         return
     assert estimates.mesh_errors is not None

@@ -189,7 +189,7 @@ def keep_unknown_meshes(study: InversionBlocks, dataset: xr.Dataset) -> None:
     predicted = estimate_of(dataset, "prediction_mean")
     solved, error = np.isfinite(dataset["prediction_std"].to_numpy()), np.isfinite(predicted.mesh)
     unknown = [str(goal) for goal in goals[(solved & ~error).any(axis=0)]]
-    looked = study.method.treatment is not None and not spec.unestimated_with and not spec.hidden
+    looked = study.method.treatment is not None and not spec.unenriched_with and not spec.hidden
     keep_unknown(dataset, unknown, set(unknown) - set(never_estimable(spec, unknown)) if looked else ())
 
 

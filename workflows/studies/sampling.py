@@ -96,7 +96,7 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         if self.accuracy.tolerance is None and 0 < self.estimates < FEWEST:  # a tolerance takes as many as it needs
             yield Finding("mesh-estimates-few", "note", {"points": self.estimates})
         if self.accuracy.mesh_error and self.spec.meshed and self.spec.unestimated_with:
-            yield Finding("mesh-with-memory", "note", {"what": self.spec.unestimated_with})
+            yield Finding("mesh-with-memory", "warning", {"what": self.spec.unestimated_with})
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""

@@ -112,9 +112,7 @@ class SamplingBlocks(Sourced):
         from uq.accuracy.doubts import Told
 
         units = {one.name: one.unit for one in self.spec.returned}
-        return Told(
-            units, frozenset(never_estimable(self.spec)), self.spec.solver_tolerance or 0.0, contact=self.spec.touched
-        )
+        return Told(units, frozenset(never_estimable(self.spec)), self.spec.solver_tolerance or 0.0)
 
 
 S = TypeVar("S", bound=SamplingBlocks)

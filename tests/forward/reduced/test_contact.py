@@ -22,7 +22,6 @@ BODY = {
     "loads": [BALL | {"depth": 0.003, "radius": 0.02}],
     "outputs": [
         {"name": "force", "kind": "force"},
-        {"name": "area", "kind": "contact-area"},
         {"name": "beside", "kind": "displacement", "at": [0.05, 0.045, 0.03], "component": "z"},
         {"name": "below", "kind": "reaction", "on": "z-min", "component": "z"},
     ],
@@ -42,7 +41,6 @@ def test_under_a_tool_that_moves_it_follows_the_body():
     found, truth = [model.solve(point) for point in points], np.array([full.solve(point).outputs for point in points])
     errors = truth - np.array([one.outputs for one in found])
     relative = np.sqrt((errors**2).mean(axis=0)) / truth.std(axis=0)
-    assert (relative[[0, 2, 3]] < 0.03).all(), relative
-    np.testing.assert_allclose([one.outputs[0] for one in found], [one.outputs[3] for one in found], rtol=0.01)
-    smooth = ReducedModel(data, NAMES, ("force", "beside", "below"))
-    check_derivatives(smooth, NOMINAL, 0.1 * SPREAD, steps=STEPS).require()
+    assert (relative < 0.03).all(), relative
+    np.testing.assert_allclose([one.outputs[0] for one in found], [one.outputs[2] for one in found], rtol=0.01)
+    check_derivatives(model, NOMINAL, 0.1 * SPREAD, steps=STEPS).require()

@@ -71,6 +71,26 @@ def test_any_number_of_ranks(tmp_path):
 
 
 @pytest.mark.fem
+def test_no_error_of_the_mesh_is_estimated_where_that_is_known_to_fail(tmp_path, capsys):
+    """Elements of one degree more enter a ball between the points that touch it; a plane they follow."""
+    text = STUDY.replace("mesh_error = false", "mesh_error = true").replace(
+        "sensitivity-monte-carlo", "local-sensitivity"
+    )
+    text = text.replace("samples = 5", "")
+    study = tmp_path / "ball.toml"
+    study.write_text(text)
+    planned = load(study)
+    assert planned.estimates == 0
+    assert [one.severity for one in planned.findings if one.code == "mesh-with-memory"] == ["warning"]
+    plane = text.replace('shape = "sphere"\nradius = 5e-3', 'shape = "plane"')
+    assert parse(tomllib.loads(plane)).estimates > 0
+    assert main(["run", str(study), "--out", str(tmp_path / "out"), "--no-report"]) == 0
+    said = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert any("not estimated with the tool 'indenter'" in one["text"] for one in said["findings"])
+    assert "mesh not known" in capsys.readouterr().out
+
+
+@pytest.mark.fem
 def test_the_map_of_pressures_begins_where_the_mean_was_solved():
     """Another solve at the mean would cost as much as the first; without its state the map is the same."""
     study = parse(tomllib.loads(STUDY))
