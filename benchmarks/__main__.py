@@ -48,6 +48,7 @@ NAMES = (
     "sizes",
     "skewed",
     "coverage",
+    "quantiles",
     "meshes",
     "pgd",
     "multifidelity",

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.estimate import Variables
-from uq.estimators.moments import Z, student
-from uq.estimators.quantiles import Quantiles, quantiles
+from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request
@@ -326,7 +326,7 @@ def expansion_dataset(
         terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
     indices = regression.largest.indices[terms]
     coefficients = among(terms, fit.chosen.which, fit.coefficients)
-    dataset = dataset.assign_coords(quantile=list(probabilities)).assign(
+    dataset = dataset.assign(
         {
             **{name: (by_pair if v.ndim > 1 else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
@@ -348,7 +348,7 @@ def expansion_dataset(
     )
     dataset = dataset.assign(_of_joint(basis))
     if probabilities:
-        dataset = dataset.assign(_distribution(seed, probabilities, regression))
+        dataset = _distribution(dataset, seed, probabilities, regression)
     add(dataset, *regression.doubts(evaluate.outputs))
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
     add(dataset, *of_centre(evaluate.outputs, centre.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
@@ -382,34 +382,41 @@ def _of_joint(basis: Basis) -> Variables:
     }
 
 
-def _distribution(seed: int, probabilities: tuple[float, ...], regression: Regression) -> Variables:
-    """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
+def _distribution(
+    dataset: xr.Dataset, seed: int, probabilities: tuple[float, ...], regression: Regression
+) -> xr.Dataset:
+    """Return results with quantiles and densities, from many points of the expansion, or from the samples.
 
-    If the moments are those of the samples, so are the quantiles; densities are those of the expansion plus its errors
-    at unseen samples, drawn independently.
+    Quantiles are those of the samples where their intervals are the shorter ones. If the moments are those of the
+    samples, so are they, and densities are those of the expansion plus its errors at unseen samples, drawn apart.
     """
-    inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
-    uniforms = np.split(sobol_points(seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
-    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
-    central = np.quantile(drawn, probabilities, axis=0)
-    # No quantile moves by more than the function does. Each quarter of the points is a set of Sobol' points too.
-    quarters = [np.quantile(part, probabilities, axis=0) for part in np.split(drawn, QUARTERS)]
-    factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
-    error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
-    found = Quantiles(central, central - Z * error, central + Z * error, error)
-    if regression.controlled.any():
-        rough = regression.controlled
-        if np.ptp(data.weights) == 0:
-            of_samples = quantiles(data.values, probabilities)
-            found = Quantiles(*(np.where(rough, *pair) for pair in zip(of_samples, found, strict=True)))
+    inputs, fit, data = regression.inputs, regression.fit, regression.data
+    drawn, part = predictions(inputs, seed, regression.basis, fit.coefficients)
+    seen = data.values - fit.unseen
+    found = quantiles_of_predictions(drawn, part, seen, fit.unseen, data.weights, probabilities, regression.missing())
+    rough = regression.controlled
+    if np.ptp(data.weights) == 0:
+        found = quantiles(data.values, probabilities).or_shorter(found, ~rough)
+    if rough.any():
         which = np.random.default_rng(seed).choice(len(data.values), len(drawn), p=data.weights / data.weights.sum())
         drawn = np.where(rough, drawn + fit.unseen[which], drawn)
     counts = [_density(column) for column in drawn.T]
-    return {
-        **found.variables,
-        "density": (("output", "bin"), np.array([density for density, _ in counts])),
-        "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
-    }
+    return found.on(dataset, probabilities).assign(
+        density=(("output", "bin"), np.array([density for density, _ in counts])),
+        density_edge=(("output", "edge"), np.array([edges for _, edges in counts])),
+    )
+
+
+def predictions(
+    inputs: Inputs, seed: int, functions: Basis, coefficients: FloatArray
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return functions times coefficients at many points of the distribution (N, m), and the part (N,) of each.
+
+    Each part of the points is a set of Sobol' points too.
+    """
+    uniforms = np.split(sobol_points(seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
+    drawn = np.concatenate([functions.values(inputs.points(some)) @ coefficients for some in uniforms])
+    return drawn, np.repeat(np.arange(QUARTERS), 2**DRAWN // QUARTERS)
 
 
 def _density(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -278,12 +278,10 @@ class Rows:
         indices = {each * self._parts * K: self.indices(each) for each in rounds}
         of_field, doubts = self.field()
         dataset = local_dataset(self._inputs, self._evaluate, centre, fields=self._fields)
-        dataset = dataset.assign_coords(
-            quantile=list(probabilities), round=list(indices), index_round=list(indices)
-        ).assign(
+        dataset = dataset.assign_coords(round=list(indices), index_round=list(indices))
+        dataset = of_quantiles.on(dataset, probabilities).assign(
             {
                 **moments[self.each].variables(),
-                **of_quantiles.variables,
                 **by_output(found),
                 "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
                 "values": (("sample", "output"), values),
