@@ -49,7 +49,7 @@ from uq.surrogates.field_regression import (
 from uq.surrogates.gate import repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import TRUSTED, Regression
+from uq.surrogates.regression import HIGHEST, ORDER, TRUSTED, Regression
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -75,7 +75,8 @@ class Chaos(Amount):
     tolerance
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
     max_order
-        Largest order that is tried; the order of the projection.
+        Largest order that is tried; the order of the projection. By default that is 6, and without `fields` a
+        regression goes on to higher ones, up to 20, as long as functions of the highest are chosen and explain more.
     gradients
         Whether derivatives are fitted too, if the model has them.
     fit
@@ -91,7 +92,7 @@ class Chaos(Amount):
     """
 
     kind: Literal["chaos"] = "chaos"
-    max_order: Annotated[int, Field(ge=1, le=20)] = 6
+    max_order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
     gradients: bool = True
     fit: Literal["regression", "projection"] = "regression"
     seed: Annotated[int, Field(ge=0)] = 0
@@ -110,8 +111,13 @@ class Chaos(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.fit == "projection":
-            return int(1 + (self.max_order + 2) ** dimension)
+            return int(1 + (self.order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
+
+    @property
+    def order(self) -> int:
+        """Largest order that is tried first."""
+        return self.max_order or ORDER
 
     def with_tangents(self, samples: int) -> int:
         """All samples, if gradients are fitted."""
@@ -190,13 +196,13 @@ class Chaos(Amount):
         rows = rows_of(inputs, gradients=gradients)
         most = ROWS_PER_TERM * FIELD_DICTIONARY if limit is not None else np.inf  # of a basis that may grow
         limit = limit or self.planned(len(inputs.names)) - 1
-        grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
+        grid, weights = gauss(inputs, self.order + 2) if projection else (None, None)
         expand_fields = self.fields and centre.state.size > 0
         if projection:
-            bases = whole(inputs, self.max_order)
+            bases = whole(inputs, self.order)
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
-            bases = candidates_of(inputs, self.max_order, int(min(limit * rows, most)), dictionary)
+            bases = candidates_of(inputs, self.order, int(min(limit * rows, most)), dictionary)
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
@@ -215,9 +221,10 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            yield Expanded(
-                centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
-            )
+            regression = Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
+            if self.max_order is None and not projection and not expand_fields:
+                regression = regression.higher()
+            yield Expanded(centre, evaluations, regression)
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             growth = GROWTH if wanted is None else max(LEAST_GROWTH, min(GROWTH, wanted() / count))
             target = int(min(limit, np.ceil(growth * count), paid))
