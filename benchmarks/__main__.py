@@ -49,6 +49,7 @@ NAMES = (
     "skewed",
     "coverage",
     "quantiles",
+    "small_indices",
     "meshes",
     "pgd",
     "multifidelity",

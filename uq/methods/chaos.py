@@ -76,7 +76,8 @@ class Chaos(Amount):
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
     max_order
         Largest order that is tried; the order of the projection. By default that is 6, and without `fields` a
-        regression goes on to higher ones, up to 20, as long as functions of the highest are chosen and explain more.
+        regression goes on to higher ones, up to 20, as long as functions of the highest are chosen and explain far
+        more.
     gradients
         Whether derivatives are fitted too, if the model has them.
     fit

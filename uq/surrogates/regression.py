@@ -37,8 +37,10 @@ from uq.surrogates.outside_samples import Beyond, beyond
 
 BoolArray = NDArray[np.bool_]
 ORDER, HIGHEST = 6, 20  # orders: what is tried first, and at most
-ENOUGH = 1e-3  # of the standard deviation: left by a fit of which no higher order is tried
-EXPLAINS = 1.25  # times less is left by a fit that explains more
+ENOUGH = 1e-4  # of the standard deviation: left by a fit of which no higher order is tried
+EXPLAINS = (
+    8.0  # times less is left by half as high an order again of what is smooth; of kinks and poles at ends, 2 or 3
+)
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
 CLOSE = 0.03  # relative leave-one-out error above which the tails of the samples matter
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
@@ -94,7 +96,11 @@ class Regression:
         return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
 
     def higher(self) -> Regression:
-        """Return the fit of half as high an order again, as long as the highest is chosen, and it explains more."""
+        """Return the fit of half as high an order again, as long as the highest is chosen, and it explains far more.
+
+        What is left of smooth functions falls geometrically. Of kinks, or poles next to an end, it falls slowly where
+        samples are and hardly between them: with higher orders 8 to 18 % of such runs missed the mean in silence.
+        """
         found, data = self, self.data
         rows = len(data.points) * rows_of(self.inputs, gradients=data.slopes is not None)
         while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
