@@ -143,9 +143,9 @@ def quantiles_of_predictions(
     """Quantiles of a function by predictions of it at many points, which no solve takes.
 
     No quantile moves by more than the function does where it has that value: by what predictions leave of those samples
-    that are nearest to it, as many as the root of their number. Of a quantile with less than one sample beyond it, the
-    mean square there may be that of the outermost samples in all of the part that they stand for. A function of norm τ
-    that no sample shows has in a part of probability a at most the root mean square τ/√a.
+    that are nearest to it, as many as the root of their number. Of a quantile with less than one sample beyond it, what
+    is missed there may be the largest square of these in all of the part that one sample stands for. A function of norm
+    τ that no sample shows has in a part of probability a at most the root mean square τ/√a.
 
     Parameters
     ----------
@@ -176,7 +176,10 @@ def quantiles_of_predictions(
     squares = nearby(each * left**2) / nearby(each)
     p = np.array(probabilities)[:, None]
     beyond = np.minimum(p, 1 - p)
-    squares = np.maximum(squares, 0) / np.minimum(weights.sum() ** 2 / (weights**2).sum() * beyond, 1)
+    out = np.minimum(weights.sum() ** 2 / (weights**2).sum() * beyond, 1)
+    outwards = np.take_along_axis(left**2, order, axis=0)
+    low, high = outwards[:near].max(axis=0), outwards[-near:].max(axis=0)
+    squares = np.where(out < 1, np.where(p < 0.5, low, high) / out, np.maximum(squares, 0))
     if missing is not None:
         squares = squares + missing**2 / beyond
     further = Z * np.sqrt(squares)
