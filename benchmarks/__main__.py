@@ -49,6 +49,8 @@ NAMES = (
     "skewed",
     "skewed_posteriors",
     "coverage",
+    "quantiles",
+    "small_indices",
     "meshes",
     "pgd",
     "multifidelity",

@@ -29,6 +29,8 @@ TABLE: dict[str, str | Words] = {
     "tails-of-difference": "The standard deviation of {about} rests on few of the {n} samples of the difference "
     "between meshes {coarser} and {level}, which count as {worth:.0f}: its 95 % interval may contain the true value "
     "less often, since larger differences may be missing. Take more samples, or a finer coarsest mesh.",
+    "quantiles-endless": "So few solves do not tell the quantiles of {levels} of {about}: less than one is expected "
+    "beyond them, and their intervals have no end on that side. Take more solves, or quantiles less far out.",
     "constant": "All {n} samples of {about} are {value:.6g}. If it is no constant, its mean and standard deviation "
     "leave out what happens in up to {unmet:.2g} of all cases, and so do their errors.",
     "tails-of-field": "The standard deviation of the displacements rests on few of the {n} samples in {share:.0%} of "
@@ -43,6 +45,8 @@ TABLE: dict[str, str | Words] = {
     "expansion-rough": "The error of the expansion of {about} is {error:.3g} of the standard deviation at samples "
     "left out of the fit. Mean, standard deviation and quantiles are those of the {samples} samples, with the "
     "expansion as control; Sobol' indices and the expansion itself are rough.",
+    "expansion-order": "The expansion of {about} has functions of order {order}, the highest that was tried, and "
+    "leaves more than a few percent of the standard deviation: a higher max_order may explain more.",
     "expansion-shape": "According to the expansion, the standard deviation of {about} is decided in a small part of "
     "the range (where the variance counts as if it came from 1 of {kappa:.2g} samples), and its error at samples left "
     "out of the fit is {error:.2g} of the standard deviation: there it may be off by more than its error says. Take "

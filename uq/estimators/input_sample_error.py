@@ -18,10 +18,13 @@ import numpy as np
 
 from forward.findings import Finding, entries
 from forward.model import FloatArray
-from uq.estimators.quantiles import quantiles
+from uq.estimators.quantiles import Quantiles, quantiles
 from uq.estimators.tails import kurtosis
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.surrogates.expansion import Expansion
+from uq.surrogates.regression import POINTS, TRUSTED
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,7 +53,7 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
     taken = max(in_turn, len(draws.values)) if in_turn and draws.equal else np.inf
     left = max(1 / draws.effective - 1 / taken, 0.0)
     ok = dataset["ok"].to_numpy()
-    values, points = dataset["values"].to_numpy()[ok], dataset["points"].to_numpy()[ok]
+    points, values = _values(dataset, inputs, dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
     share = _share(inputs, points, values)
     std = dataset["std"].to_numpy()
     added = {
@@ -65,7 +68,14 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
         )
         dominated.append((error**2 > SHARE * (known**2 + error**2)) & (error > 0))
     if "quantiles" in dataset and left > 0:
-        dataset = dataset.assign(_quantiles(dataset, values, share, 1 / left))
+        probabilities = dataset["quantile"].to_numpy().tolist()
+        worth = min(1 / left, len(values))  # order statistics of few samples do not tell less than these err
+        of_draws = quantiles(values, tuple(probabilities), worth)
+        scale = np.sqrt(share * left * worth)
+        sides = of_draws.central - of_draws.lower, of_draws.upper - of_draws.central
+        central, *ends, error = (dataset[f"quantiles{one}"].to_numpy() for one in ("", "_lower", "_upper", "_error"))
+        found = Quantiles(central, ends[0], ends[1], error)
+        dataset = found.wider(*(np.where(side > 0, scale * side, 0.0) for side in sides)).on(dataset, probabilities)
     if "field_mean_error" in dataset:
         whole = float(share.max(initial=0.0)) * left
         spread = dataset["field_std"].to_numpy()
@@ -108,17 +118,16 @@ def _share(inputs: Inputs, points: FloatArray, values: FloatArray) -> FloatArray
     return np.where(variance > 0, left.var(axis=0) / np.where(variance > 0, variance, 1.0), 0.0)
 
 
-def _quantiles(dataset: xr.Dataset, values: FloatArray, share: FloatArray, worth: float) -> dict[str, object]:
-    """Intervals of quantiles, wider by those of as many independent samples as the draws are worth."""
-    probabilities = dataset["quantile"].to_numpy()
-    of_draws = quantiles(values, tuple(probabilities), worth)
-    central = dataset["quantiles"].to_numpy()
-    lower = np.hypot(
-        central - dataset["quantiles_lower"].to_numpy(), np.sqrt(share) * (of_draws.central - of_draws.lower)
-    )
-    upper = np.hypot(
-        dataset["quantiles_upper"].to_numpy() - central, np.sqrt(share) * (of_draws.upper - of_draws.central)
-    )
-    error = np.hypot(dataset["quantiles_error"].to_numpy(), np.sqrt(share) * of_draws.error)
-    found = {"quantiles_lower": central - lower, "quantiles_upper": central + upper, "quantiles_error": error}
-    return {name: (("quantile", "output"), one) for name, one in found.items()}
+def _values(
+    dataset: xr.Dataset, inputs: Inputs, points: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (N, d) and outputs there (N, m): by an expansion at all draws, where it is trusted, or of samples.
+
+    Few samples of many draws tell less of their ends than an expansion does, and nothing beyond their own.
+    """
+    if "multi_index" not in dataset:
+        return points, values
+    every, known = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names))), Expansion.of(dataset)
+    again = values[np.arange(POINTS) * len(values) // POINTS]
+    trusted = dataset["loo_error"].to_numpy() <= TRUSTED
+    return every, np.where(trusted, known.basis.values(every) @ known.coefficients, again)

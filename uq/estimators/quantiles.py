@@ -12,20 +12,25 @@ sample more is counted. Where model 0 has no answer, F(t) stands for its indicat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
-from uq.estimators.estimate import Variables
 from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
 from uq.estimators.subsampled_difference import Chosen, Pooled
+from uq.findings import add
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 THRESHOLDS = 129
 FEWER = 0.5  # samples that may differ unseen
+NEAR = 4  # samples at least that tell what predictions miss at a quantile
 EQUIVALENT = 2001  # values that stand for the distribution
 
 
@@ -45,16 +50,48 @@ class Quantiles(NamedTuple):
     upper: FloatArray
     error: FloatArray
 
-    @property
-    def variables(self) -> Variables:
-        """The quantiles as variables of results."""
-        by = ("quantile", "output")
-        return {
-            "quantiles": (by, self.central),
-            "quantiles_error": (by, self.error),
-            "quantiles_lower": (by, self.lower),
-            "quantiles_upper": (by, self.upper),
-        }
+    def on(self, dataset: xr.Dataset, probabilities: Sequence[float]) -> xr.Dataset:
+        """Return results with these quantiles, and say which of their intervals have no end."""
+        by, found = ("quantile", "output"), self._rising(probabilities)
+        dataset = dataset.assign_coords(quantile=list(probabilities)).assign(
+            quantiles=(by, found.central),
+            quantiles_error=(by, found.error),
+            quantiles_lower=(by, found.lower),
+            quantiles_upper=(by, found.upper),
+        )
+        endless = np.isinf(found.error)
+        if endless.any():
+            levels = ", ".join(f"{100 * p:g} %" for p in np.array(probabilities)[endless.any(axis=1)])
+            names = dataset["output"].to_numpy()[endless.any(axis=0)].tolist()
+            add(dataset, Finding("quantiles-endless", "note", {"levels": levels}, about=entries(names)))
+        return dataset
+
+    def wider(self, below: FloatArray, above: FloatArray) -> Quantiles:
+        """Return the same with further independent errors, the sides (k, m) of their 95 % intervals."""
+        lower, upper = np.hypot(self.central - self.lower, below), np.hypot(self.upper - self.central, above)
+        error = np.hypot(self.error, np.maximum(below, above) / Z)
+        return Quantiles(self.central, self.central - lower, self.central + upper, error)
+
+    def moved(self, by: FloatArray) -> Quantiles:
+        """Return those of the quantities plus numbers (m,)."""
+        return Quantiles(self.central + by, self.lower + by, self.upper + by, self.error)
+
+    def or_shorter(self, other: Quantiles, usable: NDArray[np.bool_]) -> Quantiles:
+        """Return quantiles with the shorter one of two intervals; the other is usable for some quantities (m,)."""
+        which = usable & (other.upper - other.lower < self.upper - self.lower)
+        return Quantiles(*(np.where(which, *pair) for pair in zip(other, self, strict=True)))
+
+    def _rising(self, probabilities: Sequence[float]) -> Quantiles:
+        """Return quantiles that rise with the probability, between ends that do: each end bounds its neighbours too."""
+        order = np.argsort(probabilities)
+        back = np.argsort(order)
+        central = np.sort(self.central[order], axis=0)[back]
+        lower = np.maximum.accumulate(self.lower[order])[back]
+        upper = np.minimum.accumulate(self.upper[order][::-1])[::-1][back]
+        before, after = (np.maximum(up - at, at - low) for at, low, up in (self[:3], (central, lower, upper)))
+        known = np.isfinite(before) & (before > 0)
+        error = np.where(known, self.error / np.where(known, before, 1.0), 1 / Z) * after
+        return Quantiles(central, lower, upper, error)
 
 
 def quantiles(values: FloatArray, probabilities: tuple[float, ...], worth: float | None = None) -> Quantiles:
@@ -62,7 +99,8 @@ def quantiles(values: FloatArray, probabilities: tuple[float, ...], worth: float
 
     X_(a) lies below the p-quantile with probability I_p(a, n + 1 − a), which is also defined for a between whole
     numbers (A. D. Hutson, J. Appl. Stat. 26 (1999) 343–353). If a < 1 the interval extends beyond the samples: there
-    the tail is assumed exponential, with the mean distance of the outermost quarter.
+    the tail is assumed exponential, with the mean distance of the outermost quarter. A quantile with less than one
+    sample beyond it, by its probability, may be anywhere there: its interval has no end on that side.
     """
     counts = np.full((len(probabilities), values.shape[1]), len(values) if worth is None else worth)
     return _between(values, np.array(probabilities), counts, Z)
@@ -76,7 +114,8 @@ def quantiles_from_replicates(
     As `quantiles`, with n replaced by the number of independent samples that give the share of values below the
     quantile as accurately: p(1 − p) over the variance of this share by the replicates, times (1.96/t)², since the
     scatter of R replicates has R − 1 degrees of freedom (E. L. Korn, B. I. Graubard, Surv. Methodol. 24 (1998)
-    193–201). A share of n/R values has at least a rounding error of 1/√12 of R/n.
+    193–201). A share of n/R values has at least a rounding error of 1/√12 of R/n. Where less than one value of each
+    replicate is beyond the quantile, replicates tell nothing of their own scatter, and values count as independent.
     """
     p = np.array(probabilities)
     central = np.quantile(values, p, axis=0)
@@ -87,7 +126,64 @@ def quantiles_from_replicates(
     floor = R / len(values) / np.sqrt(12 * R)
     spread = np.maximum(shares.std(axis=0, ddof=1) / np.sqrt(R), floor)
     t = student(R - 1)
-    return _between(values, p, (p * (1 - p))[:, None] / spread**2 * (Z / t) ** 2, t)
+    worth = (p * (1 - p))[:, None] / spread**2 * (Z / t) ** 2
+    few = np.minimum(p, 1 - p)[:, None] * len(values) < R
+    return _between(values, p, np.where(few, len(values), worth), t)
+
+
+def quantiles_of_predictions(
+    drawn: FloatArray,
+    part: NDArray[np.int64],
+    predicted: FloatArray,
+    left: FloatArray,
+    weights: FloatArray,
+    probabilities: tuple[float, ...],
+    missing: FloatArray | None = None,
+) -> Quantiles:
+    """Quantiles of a function by predictions of it at many points, which no solve takes.
+
+    No quantile moves by more than the function does where it has that value: by what predictions leave of those samples
+    that are nearest to it, as many as the root of their number. Of a quantile with less than one sample beyond it, what
+    is missed there may be the largest square of these in all of the part that one sample stands for. A function of norm
+    τ that no sample shows has in a part of probability a at most the root mean square τ/√a.
+
+    Parameters
+    ----------
+    drawn, part
+        Predictions (N, m), and to which replicate (N,) of the distribution each belongs.
+    predicted, left
+        Predictions (n, m) at samples, and the outputs there minus these.
+    weights
+        Of the samples (n,).
+    probabilities
+        Of the quantiles.
+    missing
+        Norms τ (m,), if there are any.
+    """
+    found = quantiles_from_replicates(drawn, part, probabilities)
+    n, m = left.shape
+    near = min(n, max(NEAR, round(n**0.5)))
+    order = np.argsort(predicted, axis=0)
+    ordered = np.take_along_axis(predicted, order, axis=0)
+    places = np.column_stack([np.searchsorted(one, at) for one, at in zip(ordered.T, found.central.T, strict=True)])
+    first = np.clip(places - near // 2, 0, n - near)
+
+    def nearby(summands: FloatArray) -> FloatArray:
+        sums = np.concatenate([np.zeros((1, m)), np.cumsum(np.take_along_axis(summands, order, axis=0), axis=0)])
+        return np.asarray(np.take_along_axis(sums, first + near, axis=0) - np.take_along_axis(sums, first, axis=0))
+
+    each = np.broadcast_to(weights[:, None], left.shape)
+    squares = nearby(each * left**2) / nearby(each)
+    p = np.array(probabilities)[:, None]
+    beyond = np.minimum(p, 1 - p)
+    out = np.minimum(weights.sum() ** 2 / (weights**2).sum() * beyond, 1)
+    outwards = np.take_along_axis(left**2, order, axis=0)
+    low, high = outwards[:near].max(axis=0), outwards[-near:].max(axis=0)
+    squares = np.where(out < 1, np.where(p < 0.5, low, high) / out, np.maximum(squares, 0))
+    if missing is not None:
+        squares = squares + missing**2 / beyond
+    further = Z * np.sqrt(squares)
+    return found.wider(further, further)
 
 
 def quantiles_of_shares(values: FloatArray, probabilities: tuple[float, ...], errors: FloatArray) -> Quantiles:
@@ -104,11 +200,15 @@ def _between(values: FloatArray, p: FloatArray, counts: FloatArray, factor: floa
     """Quantiles of values (n, m), with intervals as from these numbers of independent samples (k, m)."""
     ordered = np.sort(values, axis=0)
     central = np.quantile(values, p, axis=0)
-    lower = _order_statistic(ordered, _level(p[:, None], counts))
-    upper = -_order_statistic(-ordered[::-1], _level(1 - p[:, None], counts))
+    shares = p[:, None], 1 - p[:, None]
+    lower, upper = (
+        np.where(np.minimum(counts, len(values)) * share < 1, -np.inf, _order_statistic(one, share, counts))
+        for one, share in zip((ordered, -ordered[::-1]), shares, strict=True)
+    )
     # Quantiles of few samples are interpolated in another way, and may lie outside.
-    lower, upper = np.minimum(lower, central), np.maximum(upper, central)
-    return Quantiles(central, lower, upper, np.maximum(upper - central, central - lower) / factor)
+    lower, upper = np.minimum(lower, central), np.maximum(-upper, central)
+    error = np.maximum(upper - central, central - lower) / factor
+    return Quantiles(central, lower, upper, error)
 
 
 def _level(p: FloatArray, n: FloatArray) -> FloatArray:
@@ -123,19 +223,22 @@ def _level(p: FloatArray, n: FloatArray) -> FloatArray:
     return np.asarray(low / (n + 1))
 
 
-def _order_statistic(ordered: FloatArray, share: FloatArray) -> FloatArray:
-    """Return X_(a) (k, m) with a = share·(n + 1), between order statistics (n, m) or below all of them."""
+def _order_statistic(ordered: FloatArray, p: FloatArray, counts: FloatArray) -> FloatArray:
+    """Return X_(a) (k, m) of as many samples, of order statistics (n, m), that lies below the p-quantile with 97.5 %.
+
+    Between order statistics, or below all of them.
+    """
     n, m = ordered.shape
-    place = share * (n + 1) - 1
-    below = np.clip(np.floor(place).astype(int), 0, n - 1)
-    above = np.minimum(below + 1, n - 1)
+    share, first = _level(p, counts), 1 / (np.minimum(counts, n) + 1)
+    place = np.clip(np.maximum(share, first) * (n + 1) - 1, 0, n - 1)
+    below = np.minimum(place.astype(int), max(n - 2, 0))
     columns = np.arange(m)
-    at = ordered[below, columns]
-    inside = at + np.clip(place - below, 0, 1) * (ordered[above, columns] - at)
+    inside = ordered[below, columns]
+    inside = inside + (place - below) * (ordered[np.minimum(below + 1, n - 1), columns] - inside)
     few = min(max(2, n // 4), n - 1)
     # The relative error of the mean of so few is one over the root of their number.
     tail = (1 + few**-0.5) * (ordered[few] - ordered[:few].mean(axis=0))
-    return np.asarray(np.where(place < 0, ordered[0] + tail * np.log(np.maximum(place + 1, 1e-12)), inside))
+    return np.asarray(inside + tail * np.log(np.clip(share / first, 1e-12, 1)))
 
 
 def quantiles_of_groups(

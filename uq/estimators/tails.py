@@ -223,6 +223,28 @@ def missed(moved: FloatArray) -> FloatArray:
     return np.where(size > 0, np.maximum(total, 0.0), 0.0)
 
 
+def of_squares(found: FloatArray, error: FloatArray, moved: FloatArray, factor: float) -> FloatArray:
+    """Return errors of shares of a variance (q,) that are means of squares, from their errors by scatter.
+
+    Where few samples with large squares decide a share, sets that miss them have a small share with a small error: such
+    a share is known in proportion, to factors of exp(± c e/T) for intervals of c errors e, whose upper side counts. And
+    what n samples do not show of squares that seem to go on (`missed`) is no more than one of them that varies as much
+    as all of the output does.
+
+    Parameters
+    ----------
+    found, error
+        The shares T (q,) and their errors e by scatter (q,).
+    moved
+        Influences (n, q) of the samples on them.
+    factor
+        c.
+    """
+    relative = factor * np.minimum(ratio(error, found, empty=1.0), 1.0)
+    grown = np.where(relative > 0, np.expm1(relative) / np.where(relative > 0, relative, 1.0), 1.0)
+    return np.hypot(error * grown, np.minimum(missed(moved - moved.mean(axis=0)), 1 / len(moved)))
+
+
 def _covered(n: int) -> float:
     """Part of E[z²], z normal, beyond the two quantiles of probability 1/n together, over the error √(2/n) of n."""
     from scipy.special import ndtr, ndtri

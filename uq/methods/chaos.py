@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.estimate import Variables
-from uq.estimators.moments import Z, student
-from uq.estimators.quantiles import Quantiles, quantiles
+from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request
@@ -49,7 +49,7 @@ from uq.surrogates.field_regression import (
 from uq.surrogates.gate import repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import TRUSTED, Regression
+from uq.surrogates.regression import HIGHEST, ORDER, TRUSTED, Regression
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -75,7 +75,9 @@ class Chaos(Amount):
     tolerance
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
     max_order
-        Largest order that is tried; the order of the projection.
+        Largest order that is tried; the order of the projection. By default that is 6, and without `fields` a
+        regression goes on to higher ones, up to 20, as long as functions of the highest are chosen and explain far
+        more.
     gradients
         Whether derivatives are fitted too, if the model has them.
     fit
@@ -91,7 +93,7 @@ class Chaos(Amount):
     """
 
     kind: Literal["chaos"] = "chaos"
-    max_order: Annotated[int, Field(ge=1, le=20)] = 6
+    max_order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
     gradients: bool = True
     fit: Literal["regression", "projection"] = "regression"
     seed: Annotated[int, Field(ge=0)] = 0
@@ -110,8 +112,13 @@ class Chaos(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.fit == "projection":
-            return int(1 + (self.max_order + 2) ** dimension)
+            return int(1 + (self.order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
+
+    @property
+    def order(self) -> int:
+        """Largest order that is tried first."""
+        return self.max_order or ORDER
 
     def with_tangents(self, samples: int) -> int:
         """All samples, if gradients are fitted."""
@@ -190,13 +197,13 @@ class Chaos(Amount):
         rows = rows_of(inputs, gradients=gradients)
         most = ROWS_PER_TERM * FIELD_DICTIONARY if limit is not None else np.inf  # of a basis that may grow
         limit = limit or self.planned(len(inputs.names)) - 1
-        grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
+        grid, weights = gauss(inputs, self.order + 2) if projection else (None, None)
         expand_fields = self.fields and centre.state.size > 0
         if projection:
-            bases = whole(inputs, self.max_order)
+            bases = whole(inputs, self.order)
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
-            bases = candidates_of(inputs, self.max_order, int(min(limit * rows, most)), dictionary)
+            bases = candidates_of(inputs, self.order, int(min(limit * rows, most)), dictionary)
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
@@ -215,9 +222,10 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            yield Expanded(
-                centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
-            )
+            regression = Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
+            if self.max_order is None and not projection and not expand_fields:
+                regression = regression.higher()
+            yield Expanded(centre, evaluations, regression)
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             growth = GROWTH if wanted is None else max(LEAST_GROWTH, min(GROWTH, wanted() / count))
             target = int(min(limit, np.ceil(growth * count), paid))
@@ -326,7 +334,7 @@ def expansion_dataset(
         terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
     indices = regression.largest.indices[terms]
     coefficients = among(terms, fit.chosen.which, fit.coefficients)
-    dataset = dataset.assign_coords(quantile=list(probabilities)).assign(
+    dataset = dataset.assign(
         {
             **{name: (by_pair if v.ndim > 1 else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
@@ -348,7 +356,7 @@ def expansion_dataset(
     )
     dataset = dataset.assign(_of_joint(basis))
     if probabilities:
-        dataset = dataset.assign(_distribution(seed, probabilities, regression))
+        dataset = _distribution(dataset, seed, probabilities, regression)
     add(dataset, *regression.doubts(evaluate.outputs))
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
     add(dataset, *of_centre(evaluate.outputs, centre.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
@@ -382,34 +390,41 @@ def _of_joint(basis: Basis) -> Variables:
     }
 
 
-def _distribution(seed: int, probabilities: tuple[float, ...], regression: Regression) -> Variables:
-    """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
+def _distribution(
+    dataset: xr.Dataset, seed: int, probabilities: tuple[float, ...], regression: Regression
+) -> xr.Dataset:
+    """Return results with quantiles and densities, from many points of the expansion, or from the samples.
 
-    If the moments are those of the samples, so are the quantiles; densities are those of the expansion plus its errors
-    at unseen samples, drawn independently.
+    Quantiles are those of the samples where their intervals are the shorter ones. If the moments are those of the
+    samples, so are they, and densities are those of the expansion plus its errors at unseen samples, drawn apart.
     """
-    inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
-    uniforms = np.split(sobol_points(seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
-    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
-    central = np.quantile(drawn, probabilities, axis=0)
-    # No quantile moves by more than the function does. Each quarter of the points is a set of Sobol' points too.
-    quarters = [np.quantile(part, probabilities, axis=0) for part in np.split(drawn, QUARTERS)]
-    factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
-    error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
-    found = Quantiles(central, central - Z * error, central + Z * error, error)
-    if regression.controlled.any():
-        rough = regression.controlled
-        if np.ptp(data.weights) == 0:
-            of_samples = quantiles(data.values, probabilities)
-            found = Quantiles(*(np.where(rough, *pair) for pair in zip(of_samples, found, strict=True)))
+    inputs, fit, data = regression.inputs, regression.fit, regression.data
+    drawn, part = predictions(inputs, seed, regression.basis, fit.coefficients)
+    seen = data.values - fit.unseen
+    found = quantiles_of_predictions(drawn, part, seen, fit.unseen, data.weights, probabilities, regression.missing())
+    rough = regression.controlled
+    if np.ptp(data.weights) == 0:
+        found = quantiles(data.values, probabilities).or_shorter(found, ~rough)
+    if rough.any():
         which = np.random.default_rng(seed).choice(len(data.values), len(drawn), p=data.weights / data.weights.sum())
         drawn = np.where(rough, drawn + fit.unseen[which], drawn)
     counts = [_density(column) for column in drawn.T]
-    return {
-        **found.variables,
-        "density": (("output", "bin"), np.array([density for density, _ in counts])),
-        "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
-    }
+    return found.on(dataset, probabilities).assign(
+        density=(("output", "bin"), np.array([density for density, _ in counts])),
+        density_edge=(("output", "edge"), np.array([edges for _, edges in counts])),
+    )
+
+
+def predictions(
+    inputs: Inputs, seed: int, functions: Basis, coefficients: FloatArray
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return functions times coefficients at many points of the distribution (N, m), and the part (N,) of each.
+
+    Each part of the points is a set of Sobol' points too.
+    """
+    uniforms = np.split(sobol_points(seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
+    drawn = np.concatenate([functions.values(inputs.points(some)) @ coefficients for some in uniforms])
+    return drawn, np.repeat(np.arange(QUARTERS), 2**DRAWN // QUARTERS)
 
 
 def _density(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -339,10 +339,9 @@ class _Samples(Sets):
         local = self._centre.output_slopes**2
         logarithmic = inputs.coordinates.logarithmic
         dataset = local_dataset(inputs, self._evaluate, self._centre, fields=method.fields)
-        dataset = dataset.assign_coords(quantile=list(method.quantiles), round=list(moments)).assign(
+        dataset = of_quantiles.on(dataset.assign_coords(round=list(moments)), method.quantiles).assign(
             {
                 **last.variables(),
-                **of_quantiles.variables,
                 "points": (("sample", "parameter"), points),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),

@@ -59,7 +59,7 @@ class MonteCarlo(Amount):
     seed
         Seed of the random points; sample z of a seed is the same in every study.
     quantiles
-        Probabilities of the quantiles of the outputs.
+        Probabilities of the quantiles of the outputs. One with less than one sample beyond it has no end there.
     fields
         Whether mean and standard deviation of the displacement field are computed at each node.
     """
@@ -240,11 +240,9 @@ def _dataset(
     ok = evaluations.ok
     of_quantiles = quantiles(evaluations.outputs[ok], method.quantiles)
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
-    dataset = dataset.assign_coords(quantile=list(method.quantiles))
-    dataset = dataset.assign(
+    dataset = of_quantiles.on(dataset, method.quantiles).assign(
         {
             **scalars.variables(),
-            **of_quantiles.variables,
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
             "ok": (("sample",), ok),

@@ -212,8 +212,7 @@ class Multifidelity(Amount):
         stopped = self.why_stopped(reached, f"relative error {reached:.3g}", 1 - int(poor), 1, amount)
         dataset = described(team, way, models, expansion)
         if self.quantiles:
-            dataset = dataset.assign_coords(quantile=list(self.quantiles))
-            dataset = dataset.assign(way.quantiles(self.quantiles).variables)
+            dataset = way.quantiles(self.quantiles).on(dataset, self.quantiles)
         add(dataset, *told, *way.doubts())
         dataset.attrs["stopped"] = stopped
         return dataset

@@ -16,14 +16,14 @@ from pydantic import Field, model_validator
 from forward.model import ModelError, SolveError
 from uq.estimators.doubts import of_control, of_tails
 from uq.estimators.moments import Coefficient, Estimates, estimate, monomials, ratio, running, student
-from uq.estimators.quantiles import quantiles_from_replicates
+from uq.estimators.quantiles import quantiles_from_replicates, quantiles_of_predictions
 from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
-from uq.methods.chaos import objection
+from uq.methods.chaos import objection, predictions
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.methods.scrambles import Scrambles
 from uq.surrogates.basis import FULL, ROWS_PER_TERM
@@ -76,8 +76,9 @@ class QuasiMonteCarlo(MonteCarlo):
         "one", or "optimal": estimated by regression over the scrambles, of which there must be 4; it has a bias of
         order 1/R, a fraction of its error (seen with 4 points per scramble, for the standard deviation).
     quantiles, fields
-        As in `MonteCarlo`. With `fields`, scrambles are evaluated one after the other, so that at most as many groups
-        of ranks as points in a scramble have work.
+        As in `MonteCarlo`. With an expansion as control, quantiles are those of it at many points where their intervals
+        are the shorter ones so. With `fields`, scrambles are evaluated one after the other, so that at most as many
+        groups of ranks as points in a scramble have work.
     """
 
     in_turn: ClassVar[bool] = False  # Sobol' points lead to draws by their weights
@@ -214,17 +215,25 @@ class QuasiMonteCarlo(MonteCarlo):
     ) -> xr.Dataset:
         values, ok, scramble = in_order(samples.outputs), in_order(samples.ok), samples.scramble
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
+        if fitted is not None and inputs.draws is None:  # errors of draws are found by samples
+            drawn, part = predictions(inputs, self.seed, fitted.basis, fitted.outputs)
+            predicted = fitted.basis.values(in_order(samples.points)[ok]) @ fitted.outputs
+            left = values[ok] - centre.outputs - predicted
+            found = quantiles_of_predictions(
+                drawn, part, predicted, left, np.ones(len(left)), self.quantiles, fitted.rest
+            )
+            stands = (scalars.coefficient != 0) & ~samples.held(samples.each)
+            of_quantiles = of_quantiles.or_shorter(found.moved(centre.outputs), stands)
         # What plain Monte Carlo would claim from as many independent samples.
         plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
         plain = counted(plain, inputs, values[ok])
         rounds = [(each, samples.scalars(each)) for each in samples.rounds]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
-        dataset = dataset.assign_coords(quantile=list(self.quantiles), round=[samples.scrambles * n for n, _ in rounds])
-        dataset = dataset.assign(
+        dataset = dataset.assign_coords(round=[samples.scrambles * n for n, _ in rounds])
+        dataset = of_quantiles.on(dataset, self.quantiles).assign(
             {
                 **scalars.variables(),
-                **of_quantiles.variables,
                 "points": (("sample", "parameter"), in_order(samples.points)),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),

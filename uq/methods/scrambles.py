@@ -283,7 +283,7 @@ class Scrambles(Sets):
         which have 1 − b of the variance; for the second moment, to which tails matter more, it is at least the norm of
         what an expansion misses, by the samples of its fit. A tangent does not grow faster than what it stands for.
         """
-        control, held = self._control, self._which_held(each)
+        control, held = self._control, self.held(each)
         assert control is not None
         points = self._all_points(each)
         share, of_mean = self._beyond(control, points)
@@ -358,7 +358,7 @@ class Scrambles(Sets):
     def _mixed(self, control: Control, held_one: Control | None, each: int) -> tuple[Pair, Pair]:
         """Return the same of a control, and of one that is held in place of it where this is to be."""
         controls, expected = self._of(control, each)
-        held = self._which_held(each)
+        held = self.held(each)
         if held_one is not None and held.any():
             (C, D), (C_mean, D_mean) = self._of(held_one, each)
             controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
@@ -371,7 +371,7 @@ class Scrambles(Sets):
         return controls, control.expected(control.outputs)
 
     @_once
-    def _which_held(self, each: int) -> NDArray[np.bool_]:
+    def held(self, each: int) -> NDArray[np.bool_]:
         """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own.
 
         By samples that tell the two apart: one hardly beyond says nothing, and what is held wrongly errs where no
@@ -421,7 +421,7 @@ class Scrambles(Sets):
         replicates = np.stack(means, axis=1)
         found = self.scalars(self.each)
         refused = (found.coefficient == 0) & (found.second_coefficient == 0) & (self._fitted is not None)
-        if self._which_held(self.each).any() or refused.any():
+        if self.held(self.each).any() or refused.any():
             # What is known of the field is where the samples of the expansion are not: it controls nothing.
             replicates, expected = replicates[:2], None
         return estimate_from_replicates(replicates, self._centre.state, expected, self._coefficient)

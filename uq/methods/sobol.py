@@ -30,7 +30,7 @@ from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
 from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Rows, by_output, by_round, with_maps
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
-from uq.surrogates.regression import Regression
+from uq.surrogates.regression import HIGHEST, Regression
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -84,7 +84,7 @@ class Sobol(Amount):
     groups: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
     source: str | None = None
     scrambles: Annotated[int, Field(ge=4)] = 16
-    max_order: Annotated[int, Field(ge=1, le=20)] = 6
+    max_order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
     gradients: bool = True
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)

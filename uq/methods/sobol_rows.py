@@ -33,9 +33,9 @@ from uq.estimators.indices import (
     partial_variances,
     shares,
 )
-from uq.estimators.moments import Estimates, estimate_from_replicates, running
+from uq.estimators.moments import Estimates, estimate_from_replicates, running, student
 from uq.estimators.quantiles import quantiles_from_replicates
-from uq.estimators.tails import counted
+from uq.estimators.tails import counted, of_squares
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -218,7 +218,26 @@ class Rows:
         drawn = self._indices(self.products.variances(bootstrap(sums, counts, self._seed)))
         for name, values in drawn.items():
             found[f"{name}_error"] = bootstrap_error(values, len(counts), axis=0)
+        d = len(self._inputs.names)
+        moved = self._influences(each)
+        for name, these in (("sobol_total", moved[:, :d]), ("sobol_group_total", moved[:, d:-1])):
+            if name in found:
+                total, error = found[name].T, found[f"{name}_error"].T
+                further = these - total * moved[:, -1:]
+                counted = of_squares(
+                    total.ravel(), error.ravel(), further.reshape(len(further), -1), student(len(counts) - 1)
+                )
+                found[f"{name}_error"] = counted.reshape(total.shape).T
         return found
+
+    def _influences(self, each: int) -> FloatArray:
+        """Squares (n, G + 1, m) of what rows have of V_g^T over the variance, and last of the variance itself."""
+        rows = self._parts * each
+        values = self.outputs[:rows][self.ok[:rows]]
+        A, B, AB = values[:, :1], values[:, 1:2], values[:, 2 : 2 + self.products.groups]
+        middle = values[:, :2].mean(axis=(0, 1))
+        varied = ((A - middle) ** 2 + (B - middle) ** 2) / 2
+        return shares(np.concatenate([(A - AB) ** 2 / 2, varied], axis=1), varied.mean(axis=0))
 
     def _indices(self, parts: ExchangedVariances) -> dict[str, FloatArray]:
         """Shares (…, m, d) of variances by parameter (d, …, m)."""
@@ -278,12 +297,10 @@ class Rows:
         indices = {each * self._parts * K: self.indices(each) for each in rounds}
         of_field, doubts = self.field()
         dataset = local_dataset(self._inputs, self._evaluate, centre, fields=self._fields)
-        dataset = dataset.assign_coords(
-            quantile=list(probabilities), round=list(indices), index_round=list(indices)
-        ).assign(
+        dataset = dataset.assign_coords(round=list(indices), index_round=list(indices))
+        dataset = of_quantiles.on(dataset, probabilities).assign(
             {
                 **moments[self.each].variables(),
-                **of_quantiles.variables,
                 **by_output(found),
                 "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
                 "values": (("sample", "output"), values),

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
-from uq.inputs.random_parameters import Inputs
+from uq.inputs.random_parameters import LARGEST_DEGREE, Inputs
 
 if TYPE_CHECKING:
     from uq.inputs.draws import Draws
@@ -360,10 +360,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Sets of functions to choose from; `all` (P, d) is their union."""
+    """Sets of functions to choose from, of up to the order `limit`; `all` (P, d) is their union."""
 
     all: IntArray
     sets: tuple[Candidate, ...]
+    limit: int = LARGEST_DEGREE
 
 
 def whole(inputs: Inputs, order: int) -> Candidates:
@@ -401,4 +402,4 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
         Candidate(order, q, np.array([number[index.tobytes()] for index in indices]), sparse)
         for (sparse, _), (indices, order, q) in found.items()
     ]
-    return Candidates(union, tuple(sets))
+    return Candidates(union, tuple(sets), max_order)

@@ -164,9 +164,8 @@ def fit_deviations(
     wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    return deviations(
-        Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data)), evaluations, centre
-    )
+    regression = Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+    return deviations(regression.higher() if wanted is None else regression, evaluations, centre)
 
 
 def _deviating(basis: Basis, coefficients: FloatArray, outputs: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.findings import Finding
+from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_shape, of_tails
 from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
@@ -36,6 +36,11 @@ from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.outside_samples import Beyond, beyond
 
 BoolArray = NDArray[np.bool_]
+ORDER, HIGHEST = 6, 20  # orders: what is tried first, and at most
+ENOUGH = 1e-4  # of the standard deviation: left by a fit of which no higher order is tried
+EXPLAINS = (
+    8.0  # times less is left by half as high an order again of what is smooth; of kinks and poles at ends, 2 or 3
+)
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
 CLOSE = 0.03  # relative leave-one-out error above which the tails of the samples matter
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
@@ -69,9 +74,9 @@ class Regression:
 
     @classmethod
     def of(
-        cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int
+        cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int | None
     ) -> Regression:
-        """Fit values (n, m) and, if given, tangents (n, m, d) at points (n, d).
+        """Fit values (n, m) and, if given, tangents (n, m, d) at points (n, d), as `higher` does without a `max_order`.
 
         Raises
         ------
@@ -80,14 +85,38 @@ class Regression:
         """
         data = Data.at(points, values, tangents, inputs)
         rows = len(points) * rows_of(inputs, gradients=tangents is not None)
-        candidates = candidates_of(inputs, max_order, rows, DICTIONARY)
+        candidates = candidates_of(inputs, max_order or ORDER, rows, DICTIONARY)
         largest = orthonormal(inputs, candidates.all)
-        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+        found = cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+        return found if max_order else found.higher()
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as in `of`."""
         data = self.data.some(slice(count))
         return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
+
+    def higher(self) -> Regression:
+        """Return the fit of half as high an order again, as long as the highest is chosen, and it explains far more.
+
+        What is left of smooth functions falls geometrically. Of kinks, or poles next to an end, it falls slowly where
+        samples are and hardly between them: with higher orders 8 to 18 % of such runs missed the mean in silence.
+        """
+        found, data = self, self.data
+        rows = len(data.points) * rows_of(self.inputs, gradients=data.slopes is not None)
+        while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
+            order = min(found.candidates.limit * 3 // 2, HIGHEST)
+            candidates = candidates_of(self.inputs, order, rows, DICTIONARY)
+            largest = orthonormal(self.inputs, candidates.all)
+            again = replace(found, candidates=candidates, largest=largest, fit=fit_best(candidates, largest, data))
+            if EXPLAINS * again.fit.relative.max() > found.fit.relative.max():
+                break
+            found = again
+        return found
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether functions of the highest order that may be tried are part of the fit."""
+        return int(self.basis.indices.sum(axis=1).max()) == self.candidates.limit
 
     @property
     def basis(self) -> Basis:
@@ -311,6 +340,9 @@ class Regression:
         n = len(self.data.points)
         yield from of_constants(names, self.data.values)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
+        rough = [name for name, left in zip(names, self.fit.relative.tolist(), strict=True) if left > CLOSE]
+        if rough and self.at_limit:
+            yield Finding("expansion-order", "note", {"order": self.candidates.limit}, about=entries(rough))
         rest = self.rest()
         whole = self.fit.relative if rest is None else shares(rest, self.data.values.std(axis=0))
         yield from of_reach(names, self.beyond().share, self.fit.relative, whole, n)

@@ -37,7 +37,7 @@ from uq.estimators.moments import (
 from uq.estimators.quantiles import quantiles, quantiles_from_replicates, quantiles_of_shares
 from uq.estimators.scores import rate as rate_of_errors
 from uq.estimators.scores import score
-from uq.estimators.tails import _share_beyond, by_chance, concentration, influences, shown, skewed
+from uq.estimators.tails import _share_beyond, by_chance, concentration, influences, of_squares, shown, skewed
 from uq.inputs.draws import effective
 from uq.methods.method import seconds_per_solve
 from uq.methods.multilevel_meshes import bias, rate
@@ -190,6 +190,17 @@ def test_quantiles_of_replicates_are_worth_what_their_shares_say(replicates):
     worth = quantiles(values, (0.3,), 0.21 / error**2 * (1.96 / t) ** 2)
     np.testing.assert_allclose([found.lower, found.upper], [worth.lower, worth.upper])
     np.testing.assert_allclose(found.error, worth.error * 1.96 / t)
+
+
+@pytest.mark.unit
+def test_small_shares_are_known_in_proportion():
+    """An interval to T exp(2 e/T); of 50 rows of which three have nearly all, one more may be missing."""
+    even = np.tile([[1.0], [-1.0]], (25, 1))
+    found = of_squares(np.array([0.5]), np.array([0.1]), even, 2.0)
+    assert found[0] == pytest.approx(0.5 * (math.exp(2 * 0.1 / 0.5) - 1) / 2)
+    assert of_squares(np.zeros(1), np.zeros(1), 0 * even, 2.0)[0] == 0
+    rare = np.append([20.0, 4.0, 1.0], np.zeros(47))[:, None]
+    assert of_squares(np.array([0.5]), np.zeros(1), rare, 2.0)[0] == pytest.approx(1 / 50)
 
 
 # --- Sobol' indices --------------------------------------------------------------------------------------------------
