@@ -43,6 +43,8 @@ TABLE: dict[str, str | Words] = {
     "locking-measured": Words(
         "At the mean of the inputs, against {form} on the same mesh, which lock less: {about}.", between="; "
     ),
+    "passes-through-itself": "{where}, the body passes through itself: at ({place}), before it is deformed, by {deep}. "
+    "Parts of a body do not feel each other here, so that answers are those of a body that cannot be.",
     "solves-inadmissible": "{lost:,} of {solves:,} solves were of parameters for which there is no model, as for the "
     "first of them ({reason}): their likelihood is zero, and they count as answered.",
     "constants-changed": "Constants are not those with which {source} was calibrated: {changed}.",

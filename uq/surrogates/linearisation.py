@@ -123,11 +123,15 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     SolveError
         If the model has no answer at the point.
     """
+    centre = inputs.mean if point is None else point
+    return linearised(inputs, evaluate, evaluate(linearise_request(evaluate, centre)), point)
+
+
+def linearise_request(evaluate: Evaluate, point: FloatArray) -> Request:
+    """Return what `linearise` asks for at a point (d,)."""
     derivatives = evaluate.differentiable
     slopes = derivatives and len(evaluate.parameters) <= MANY
-    centre = inputs.mean if point is None else point
-    found = evaluate(Request(centre[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
-    return linearised(inputs, evaluate, found, point)
+    return Request(point[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes))
 
 
 def linearised(

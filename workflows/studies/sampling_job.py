@@ -25,7 +25,7 @@ from workflows.results.directory import label, read_dataset, with_random_fields,
 from workflows.results.norms import node_volumes
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.predictions import never_estimable
-from workflows.studies.solves import measured, of_answers, stressed, with_contact, with_stresses
+from workflows.studies.solves import crossings, measured, of_answers, stressed, with_contact, with_stresses
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -101,6 +101,10 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         settled(found, units)
         add(found, *locking)
+        if of_body:
+            log = [one.points for one in recorders["/"].log if one.points.shape[1] == len(inputs.names)]
+            corners = 4 if model.spec.body.cell == "tetrahedron" else 8
+            add(found, *crossings(recorders["/"].first, np.concatenate(log), model.space.coordinates, cells, corners))
         if "step" in found.coords:
             once_for_steps(found)
         found = with_regions(found, model.spec.body.regions, regions)

@@ -7,16 +7,18 @@ changes outputs. Of any model: whether it contradicts itself, and how many param
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from forward.bodies.crossing import deepest
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
 from forward.model import FloatArray, ReferenceSolution, SolveError
-from forward.readable import number, with_unit
+from forward.readable import number, place, told, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Prediction, Request
@@ -177,6 +179,37 @@ def measured(model: HyperelasticModel, mean: FloatArray, reach: Mapping[str, tup
     ]
     form = "quadratic cells and pressures" if better.mixed else "quadratic cells"
     return [Finding("locking-measured", "warning", {"form": form}, about=tuple(said))]
+
+
+def crossings(
+    first: Evaluations | None, points: FloatArray, nodes: FloatArray, cells: NDArray[np.int64], corners: int
+) -> Iterator[Finding]:
+    """Say where a body passes through itself, in the mean state and where its displacement is predicted as largest.
+
+    Parameters
+    ----------
+    first
+        At the mean parameters, with the state and its derivatives as fields.
+    points
+        Solved parameters (n, d).
+    nodes, cells, corners
+        Nodes (N, 3) (m), the nodes of cells in VTK's order, and how many of them are corners.
+    """
+    if first is None or not first.fields.size or not first.ok[0]:
+        return
+    state, *slopes = first.fields[:, : nodes.size]
+    states = {"At the mean parameters": state}
+    if len(slopes) == points.shape[1] and len(points):
+        moves, along = points - first.points[0], np.array(slopes)
+        sizes = 2 * moves @ (along @ state) + np.einsum("ni,ij,nj->n", moves, along @ along.T, moves)
+        states["Where the displacement is predicted to be largest"] = state + moves[sizes.argmax()] @ along
+    for where, moved in states.items():
+        cell: Any = "tetrahedron" if corners == 4 else "hexahedron"
+        found = deepest(nodes + moved.reshape(-1, 3), cells[:, :corners], cell)
+        if found is not None:
+            at, deep = place(nodes[found.vertex].tolist()), told(found.depth, "m")
+            yield Finding("passes-through-itself", "warning", {"where": where, "place": at, "deep": deep})
+            return
 
 
 def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations] = ()) -> tuple[Finding, ...]:

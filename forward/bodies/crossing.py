@@ -1,0 +1,85 @@
+"""Where a deformed body passes through itself: contact of a body with itself is not modelled, and no solver sees it.
+
+Every cell keeps its orientation in an equilibrium, so that a vertex of the surface that lies in a cell which is not its
+own is where two parts of the body are at once. How deep says the distance to the surface in front of it, of which the
+vertex is no part. Cells count with straight edges.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from forward.bodies.mesh import TETRAHEDRA, IntArray, surface_of
+from forward.bodies.surface import Surface
+from forward.model import FloatArray
+
+OUTSIDE = -1e-3  # least barycentric coordinate: where meshes of both sides match, vertices lie on edges of cells
+SEEN = 0.05  # of the longest edge of the cell: depths below are those of straight edges in place of curved ones
+LOOKED_AT = 64  # vertices whose depth is found, at most
+
+
+class Crossing(NamedTuple):
+    """The vertex that lies deepest in another part of the body.
+
+    Attributes
+    ----------
+    vertex
+        Its number.
+    depth
+        How far (m) it is behind the surface.
+    """
+
+    vertex: int
+    depth: float
+
+
+def deepest(points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "hexahedron"]) -> Crossing | None:
+    """Return where a body passes through itself; None where it does not.
+
+    Parameters
+    ----------
+    points
+        Places (n, 3) (m) of deformed nodes.
+    cells
+        Corners (c, 4 or 8) of the cells, in VTK's order.
+    cell
+        Their kind.
+    """
+    from scipy.spatial import cKDTree
+
+    parts = cells[:, TETRAHEDRA[cell]].reshape(-1, 4)
+    corners = points[parts]
+    middles = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+    faces, _ = surface_of(cells, cell)
+    outer = np.unique(faces)
+    near = cKDTree(points[outer]).query_ball_point(middles, reach)
+    part = np.repeat(np.arange(len(parts)), [len(found) for found in near])
+    vertex = outer[np.concatenate([np.asarray(found, dtype=np.int64) for found in near])]
+    own = (cells[part // len(TETRAHEDRA[cell])] == vertex[:, None]).any(axis=1)
+    part, vertex = part[~own], vertex[~own]
+    sides = np.moveaxis(corners[part, 1:] - corners[part, :1], 1, 2)
+    solid = np.abs(np.linalg.det(sides)) > np.finfo(float).tiny
+    part, vertex, sides = part[solid], vertex[solid], sides[solid]
+    inner = np.linalg.solve(sides, (points[vertex] - corners[part, 0])[..., None])[..., 0]
+    margin = np.minimum(inner.min(axis=1), 1 - inner.sum(axis=1))
+    order = np.argsort(-margin)[: int((margin > OUTSIDE).sum())]
+    found: Crossing | None = None
+    for k in order[:LOOKED_AT]:
+        depth = _behind(points, faces, int(vertex[k]))
+        if depth > SEEN * np.ptp(corners[part[k]], axis=0).max() and (found is None or depth > found.depth):
+            found = Crossing(int(vertex[k]), depth)
+    return found
+
+
+def _behind(points: FloatArray, faces: IntArray, vertex: int) -> float:
+    """Return the distance (m) of a vertex from the surface without the faces around it."""
+    around = np.unique(faces[(faces == vertex).any(axis=1)])
+    others = points[faces[~np.isin(faces, around).any(axis=1)]]
+    if not len(others):
+        return 0.0
+    triangles = np.concatenate([others[:, [0, k, k + 1]] for k in range(1, others.shape[1] - 1)])
+    place, _ = Surface(triangles).nearest(points[[vertex]])
+    return float(np.linalg.norm(place - points[vertex]))

@@ -1,0 +1,76 @@
+"""Bodies that pass through themselves: bent to a ring whose ends meet, and lips of a cut that are pressed."""
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from forward.bodies.crossing import deepest
+from forward.hyperelastic import Hyperelastic
+from tests.forward.bodies.test_slits import CELLS, NAMES, block
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.surrogates.linearisation import linearise_request
+from workflows.studies.solves import crossings
+
+CUBE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+SPLIT = [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
+
+
+def ring(turn, cell):
+    """A beam of 40 × 3 × 3 cells that is bent by an angle, and where it was."""
+    ends = 40, 3, 3
+    points = np.stack(np.meshgrid(*[np.arange(n + 1.0) for n in ends], indexing="ij"), axis=-1).reshape(-1, 3)
+    numbers = np.arange(len(points)).reshape([n + 1 for n in ends])
+    corners = [numbers[tuple(slice(a, n + a) for a, n in zip(at, ends, strict=True))].ravel() for at in CUBE]
+    cells = np.column_stack(corners)
+    if cell == "tetrahedron":
+        cells = cells[:, SPLIT].reshape(-1, 4)
+    radius = ends[0] / turn
+    angle, far = points[:, 0] / radius, radius + 1.5 - points[:, 1]
+    return points, np.column_stack([far * np.sin(angle), radius - far * np.cos(angle), points[:, 2]]), cells
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_ends_that_meet_are_seen(cell):
+    points, bent, cells = ring(6.0, cell)
+    assert deepest(points, cells, cell) is None
+    assert deepest(bent, cells, cell) is None  # 0.28 of an angle is left between the ends
+    _, bent, cells = ring(6.5, cell)
+    found = deepest(bent, cells, cell)
+    assert found is not None
+    assert points[found.vertex, 0] in {0.0, 40.0}  # of an end
+    # The ends overlap by 6.5 − 2π of an angle; the outer surface of a corner is nearer than the end in front of it.
+    assert 0.1 < found.depth < (6.5 - 2 * np.pi) * (40 / 6.5 + 1.5) * 1.05
+
+
+@pytest.mark.fem
+def test_lips_that_are_pressed_are_seen(tmp_path):
+    """By 3.3 mm in the middle of the cut, as without contact both lips move on."""
+    meshio.write(tmp_path / "cut.vtu", block())
+    spec = Hyperelastic.model_validate(
+        {
+            "formulation": "displacement",
+            "body": {"kind": "mesh", "file": str(tmp_path / "cut.vtu"), "names": NAMES, "degree": 1},
+            "material": {"kind": "mooney-rivlin", "C1": 1000, "C2": 500, "D1": 4000},
+            "clamp": ["held"],
+            "loads": [{"kind": "traction", "on": "pulled", "direction": [1, 0, 0], "size": 36}],
+            "outputs": [{"name": "lift", "kind": "mean-displacement", "on": "pulled", "component": "x"}],
+        }
+    )
+    inputs = Inputs({"loads.traction.size": Uniform(lower=-37, upper=-35)})
+    model = spec.build(MPI.COMM_SELF, inputs.names)
+    evaluate = SerialEvaluate(model)
+    first = evaluate(linearise_request(evaluate, inputs.mean))
+    nodes, (cells, _) = model.space.coordinates, model.space.cells()
+    assert len(cells) == np.prod(CELLS)
+    (said,) = crossings(first, inputs.mean[None], nodes, cells, 8)
+    assert said.code == "passes-through-itself"
+    assert "At the mean" in said.text
+    assert "3.3 mm" in said.text
+    pulled = evaluate(linearise_request(evaluate, np.array([6.0])))
+    assert not list(crossings(pulled, np.array([[6.0], [30.0]]), nodes, cells, 8))
+    (said,) = crossings(pulled, np.array([[6.0], [-36.0]]), nodes, cells, 8)
+    assert "predicted to be largest" in said.text
