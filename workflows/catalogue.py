@@ -45,6 +45,9 @@ TABLE: dict[str, str | Words] = {
     ),
     "passes-through-itself": "{where}, the body passes through itself: at ({place}), before it is deformed, by {deep}. "
     "Parts of a body do not feel each other here, so that answers are those of a body that cannot be.",
+    "surface-creases": "{where}, a free surface is {short:.0f} % shorter along itself, at ({place}) before it is "
+    "deformed. From 35 % on a flat surface of soft matter folds into creases, which no mesh shows: what is computed is "
+    "an equilibrium that is not observed.",
     "solves-inadmissible": "{lost:,} of {solves:,} solves were of parameters for which there is no model, as for the "
     "first of them ({reason}): their likelihood is zero, and they count as answered.",
     "constants-changed": "Constants are not those with which {source} was calibrated: {changed}.",

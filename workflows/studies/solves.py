@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.crossing import deepest
+from forward.bodies.crossing import CREASED, deepest, least_stretch
+from forward.bodies.mesh import surface_of
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
 from forward.model import FloatArray, ReferenceSolution, SolveError
@@ -184,7 +185,9 @@ def measured(model: HyperelasticModel, mean: FloatArray, reach: Mapping[str, tup
 def crossings(
     first: Evaluations | None, points: FloatArray, nodes: FloatArray, cells: NDArray[np.int64], corners: int
 ) -> Iterator[Finding]:
-    """Say where a body passes through itself, in the mean state and where its displacement is predicted as largest.
+    """Say where a body passes through itself, or its surface would crease: at the mean, and where it moves most.
+
+    That is where the derivatives predict the largest displacement.
 
     Parameters
     ----------
@@ -203,12 +206,20 @@ def crossings(
         moves, along = points - first.points[0], np.array(slopes)
         sizes = 2 * moves @ (along @ state) + np.einsum("ni,ij,nj->n", moves, along @ along.T, moves)
         states["Where the displacement is predicted to be largest"] = state + moves[sizes.argmax()] @ along
-    for where, moved in states.items():
-        cell: Any = "tetrahedron" if corners == 4 else "hexahedron"
-        found = deepest(nodes + moved.reshape(-1, 3), cells[:, :corners], cell)
+    cell: Any = "tetrahedron" if corners == 4 else "hexahedron"
+    cells = cells[:, :corners]
+    faces, _ = surface_of(cells, cell)
+    for where, one in states.items():
+        moved = nodes + one.reshape(-1, 3)
+        vertex, stretch = least_stretch(nodes, moved, faces)
+        if stretch < CREASED:
+            values = {"where": where, "place": place(nodes[vertex].tolist()), "short": 100 * (1 - stretch)}
+            yield Finding("surface-creases", "note", values)
+        found = deepest(moved, cells, cell)
         if found is not None:
             at, deep = place(nodes[found.vertex].tolist()), told(found.depth, "m")
             yield Finding("passes-through-itself", "warning", {"where": where, "place": at, "deep": deep})
+        if found is not None or stretch < CREASED:
             return
 
 

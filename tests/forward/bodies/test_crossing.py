@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.bodies.crossing import deepest
+from forward.bodies.crossing import deepest, least_stretch
+from forward.bodies.mesh import surface_of
 from forward.hyperelastic import Hyperelastic
 from tests.forward.bodies.test_slits import CELLS, NAMES, block
 from uq.evaluation.evaluate import SerialEvaluate
@@ -44,6 +45,21 @@ def test_ends_that_meet_are_seen(cell):
     assert points[found.vertex, 0] in {0.0, 40.0}  # of an end
     # The ends overlap by 6.5 − 2π of an angle; the outer surface of a corner is nearer than the end in front of it.
     assert 0.1 < found.depth < (6.5 - 2 * np.pi) * (40 / 6.5 + 1.5) * 1.05
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("stretch", [0.6, 0.7, 1.5])
+def test_the_least_stretch_of_a_free_surface(stretch):
+    """Of a block between plates: its sides are as short as it is, the plates only grow in their planes."""
+    points, _, cells = ring(1.0, "hexahedron")
+    across = stretch**-0.5
+    faces, _ = surface_of(cells, "hexahedron")
+    vertex, least = least_stretch(points, points * [stretch, across, across], faces)
+    assert least == pytest.approx(min(stretch, across))
+    assert (points[vertex, 1:] % 3 == 0).any()  # on a side
+    assert least_stretch(points, points * [stretch, 1.0, 1.0], faces)[1] == 1.0  # all sides are held in their planes
+    turned = points @ [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    assert least_stretch(points, turned, faces)[1] == pytest.approx(1.0)
 
 
 @pytest.mark.fem
