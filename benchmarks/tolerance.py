@@ -20,8 +20,8 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.coverage import CASES, Case, Vectorised, truth
-from benchmarks.mesh_error import Case as Meshes
-from benchmarks.mesh_error import at, boxed, cook, hole
+from benchmarks.mesh_problems import Case as Meshes
+from benchmarks.mesh_problems import at, boxed, cook, hole
 from forward.model import FloatArray, SolveError
 from uq.accuracy.goal import Goal
 from uq.estimators.moments import Z, half_width
