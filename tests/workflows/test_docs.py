@@ -278,7 +278,7 @@ def pages(reference):
 
 
 def test_generated_pages_tell_what_is_there(pages):
-    assert "| `max_order` | whole number ≥ 1 ≤ 20 | none | Largest order that is tried" in pages["reference/settings.md"]
+    assert "| `max_order` | whole number ≥ 1 ≤ 20 | none | Largest order" in pages["reference/settings.md"]
     assert "usage: tissuq run" in pages["reference/commands.md"]
     assert "## treloar" in pages["studies.md"]
     assert "studies.md#beam)" in pages["overview.md"]
