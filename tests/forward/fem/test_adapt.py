@@ -63,7 +63,7 @@ def bent(body, **settings):
 @pytest.mark.parametrize("degree", [1, 2])
 def test_the_errors_that_are_left_are_those_that_are_said(file, indicator, degree):
     body = {"kind": "mesh", "file": file, "degree": degree}
-    spec = bent(body, tolerance=0.04 if degree == 1 else 0.015, outputs=("near",), indicator=indicator)
+    spec = bent(body, tolerance=0.05 if degree == 1 else 0.019, outputs=("near",), indicator=indicator)
     found = adapt(spec, MPI.COMM_SELF, (), NOTHING)
     assert found.stopped is None
     last, right = found.cycles[-1], EXACT["near"] - found.cycles[-1].values[0]
@@ -76,7 +76,7 @@ def test_the_errors_that_are_left_are_those_that_are_said(file, indicator, degre
 
 
 def test_cells_are_refined_at_the_corner_and_named_boundaries_stay(file):
-    spec = bent({"kind": "mesh", "file": file}, tolerance=0.15, outputs=("near",))
+    spec = bent({"kind": "mesh", "file": file}, tolerance=0.19, outputs=("near",))
     lines = []
     found = adapt(spec, MPI.COMM_SELF, (), NOTHING, lines.append)
     assert found.stopped is None
@@ -135,7 +135,7 @@ from tests.forward.fem.test_adapt import bent
 from tests.ranks import groups
 for comm in groups():
     for indicator in ("dual-weighted", "recovery"):
-        spec = bent({{"kind": "mesh", "file": {file!r}}}, tolerance=0.25, outputs=("near", "end"), indicator=indicator)
+        spec = bent({{"kind": "mesh", "file": {file!r}}}, tolerance=0.31, outputs=("near", "end"), indicator=indicator)
         found = adapt(spec, comm, (), np.zeros(0))
         if comm.rank == 0:
             print(len(found.cycles), found.cycles[-1].unknowns, hashlib.sha256(packed(found.mesh)).hexdigest())
