@@ -88,14 +88,16 @@ class Progress:
         self._done += done
         self._failed += failed if self._failures else 0
         self._now = now = time.monotonic()
-        if not self._marks or now - self._marks[-1][0] >= SECONDS_BETWEEN_MARKS:
+        marked = not self._marks or now - self._marks[-1][0] >= SECONDS_BETWEEN_MARKS
+        if marked:
             self._marks.append((now, self._done))
         while len(self._marks) > 1 and now - self._marks[1][0] >= SECONDS_BETWEEN_LINES:
             self._marks.popleft()
         if self._bar is not None:
             self._bar.set_postfix_str(watch.pace(self.state, now), refresh=False)
             self._bar.update(done)
-        self._write()
+        elif marked:  # not of each solve, which may take less than this
+            self._write()
 
     def close(self) -> None:
         """Show the last count."""
