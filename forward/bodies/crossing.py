@@ -15,12 +15,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from forward.bodies.mesh import TETRAHEDRA, IntArray, surface_of
-from forward.bodies.surface import Surface
+from forward.bodies.location import nearest_of
+from forward.bodies.mesh import TETRAHEDRA, IntArray
+from forward.bodies.surface import fan
 from forward.model import FloatArray
 
 OUTSIDE = -1e-3  # least barycentric coordinate: where meshes of both sides match, vertices lie on edges of cells
-SEEN = 0.05  # of the longest edge of the cell: depths below are those of straight edges in place of curved ones
+SEEN = 0.05  # of the extent of the cell: depths below are those of straight edges in place of curved ones
 CREASED = 0.646  # stretch of a free surface below which creases have less energy
 FLAT = 1e-6  # of the largest displacement: what moves less out of its plane is held in it
 LOOKED_AT = 64  # vertices whose depth is found, at most
@@ -41,7 +42,9 @@ class Crossing(NamedTuple):
     depth: float
 
 
-def deepest(points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "hexahedron"]) -> Crossing | None:
+def deepest(
+    points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "hexahedron"], faces: IntArray
+) -> Crossing | None:
     """Return where a body passes through itself; None where it does not.
 
     Parameters
@@ -52,6 +55,8 @@ def deepest(points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "h
         Corners (c, 4 or 8) of the cells, in VTK's order.
     cell
         Their kind.
+    faces
+        Vertices (f, 3 or 4) of the faces of the surface.
     """
     from scipy.spatial import cKDTree
 
@@ -59,7 +64,6 @@ def deepest(points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "h
     corners = points[parts]
     middles = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-    faces, _ = surface_of(cells, cell)
     outer = np.unique(faces)
     near = cKDTree(points[outer]).query_ball_point(middles, reach)
     part = np.repeat(np.arange(len(parts)), [len(found) for found in near])
@@ -83,12 +87,11 @@ def deepest(points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "h
 def _behind(points: FloatArray, faces: IntArray, vertex: int) -> float:
     """Return the distance (m) of a vertex from the surface without the faces around it."""
     around = np.unique(faces[(faces == vertex).any(axis=1)])
-    others = points[faces[~np.isin(faces, around).any(axis=1)]]
+    others = points[fan(faces[~np.isin(faces, around).any(axis=1)])]
     if not len(others):
         return 0.0
-    triangles = np.concatenate([others[:, [0, k, k + 1]] for k in range(1, others.shape[1] - 1)])
-    place, _ = Surface(triangles).nearest(points[[vertex]])
-    return float(np.linalg.norm(place - points[vertex]))
+    places = nearest_of(others, np.broadcast_to(points[vertex], (len(others), 3)))
+    return float(np.linalg.norm(places - points[vertex], axis=1).min())
 
 
 def least_stretch(points: FloatArray, moved: FloatArray, faces: IntArray) -> tuple[int, float]:
@@ -101,7 +104,7 @@ def least_stretch(points: FloatArray, moved: FloatArray, faces: IntArray) -> tup
     faces
         Vertices (f, 3 or 4) of the faces of the surface. Those that stay in their planes are held there, and not free.
     """
-    triangles = np.concatenate([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)])
+    triangles = fan(faces)
     before, after = (one[triangles[:, 1:]] - one[triangles[:, :1]] for one in (points, moved))
     normals = np.cross(before[:, 0], before[:, 1])
     out = np.einsum("fkx,fx->fk", (moved - points)[triangles], normals)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from forward.bodies.geometry import AXES, Body
 from forward.bodies.location import nearest_of
 from forward.model import FloatArray
 
+T = TypeVar("T", bound=np.generic)
 NEAREST = 4  # triangles that are tried first
 AT_ONCE = 200_000  # pairs of a point and a triangle
 FINE = 12  # parts of the edge of a facet at which it is looked at closely
@@ -29,6 +32,11 @@ def facets(body: Body, boundary: str) -> FloatArray:
     lattice = body.place(lattice.reshape(-1, 3)).reshape(lattice.shape)
     corners = [lattice[:-1, :-1], lattice[1:, :-1], lattice[1:, 1:], lattice[:-1, 1:]]
     return np.asarray(np.stack(corners, axis=2).reshape(-1, 4, 3))
+
+
+def fan(corners: NDArray[T]) -> NDArray[T]:
+    """Return the triangles (n (k − 2), 3, …) that facets (n, k, …) are divided into around their first corners."""
+    return np.concatenate([corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)])
 
 
 def edges(corners: FloatArray) -> FloatArray:
@@ -60,8 +68,7 @@ def points(corners: FloatArray, near: FloatArray, along: FloatArray) -> FloatArr
 
 def _pierced(corners: FloatArray, start: FloatArray, along: FloatArray) -> FloatArray:
     """Return where the line through a point (3,) along a direction (3,) pierces facets, divided into triangles."""
-    fan = [corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)]
-    a, b, c = np.moveaxis(np.concatenate(fan), 1, 0)
+    a, b, c = np.moveaxis(fan(corners), 1, 0)
     sides = np.stack([b - a, c - a, np.broadcast_to(-along, a.shape)], axis=2)
     steep = np.abs(np.linalg.det(sides)) > 1e-12 * np.linalg.norm(sides, axis=1).prod(axis=1)
     s, t, far = np.linalg.solve(sides[steep], (start - a[steep])[..., None])[..., 0].T
@@ -84,8 +91,7 @@ class Surface:
     def of(cls, body: Body) -> Surface:
         """Make that of a body."""
         corners = [body.surface] if body.kind == "mesh" else [facets(body, name) for name in body.boundaries]
-        fan = [one[:, [0, k, k + 1]] for one in corners for k in range(1, one.shape[1] - 1)]
-        return cls(np.concatenate(fan))
+        return cls(np.concatenate([fan(one) for one in corners]))
 
     @property
     def middle(self) -> FloatArray:

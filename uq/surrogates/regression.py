@@ -38,9 +38,7 @@ from uq.surrogates.outside_samples import Beyond, beyond
 BoolArray = NDArray[np.bool_]
 ORDER, HIGHEST = 6, 20  # orders: what is tried first, and at most
 ENOUGH = 1e-4  # of the standard deviation: left by a fit of which no higher order is tried
-EXPLAINS = (
-    8.0  # times less is left by half as high an order again of what is smooth; of kinks and poles at ends, 2 or 3
-)
+EXPLAINS = 8.0  # times less is left of what is smooth by half as high an order again; of kinks and poles 2 or 3
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
 CLOSE = 0.03  # relative leave-one-out error above which the tails of the samples matter
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit

@@ -102,9 +102,9 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         settled(found, units)
         add(found, *locking)
         if of_body:
-            log = [one.points for one in recorders["/"].log if one.points.shape[1] == len(inputs.names)]
-            corners = 4 if model.spec.body.cell == "tetrahedron" else 8
-            add(found, *crossings(recorders["/"].first, np.concatenate(log), model.space.coordinates, cells, corners))
+            solved, kind_of_cell = recorders["/"], model.spec.body.cell
+            points = np.concatenate([one.points for one in solved.log])
+            add(found, *crossings(solved.first, points, model.space.coordinates, cells, kind_of_cell))
         if "step" in found.coords:
             once_for_steps(found)
         found = with_regions(found, model.spec.body.regions, regions)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import ForwardModel, Solution
 
+Cell = Literal["tetrahedron", "hexahedron"]
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
 SHARE, QUICK = 0.05, 1.0  # of all solves, and s: what asking a model again may take, the larger of both
 TINY = 1e-9  # s, that a solve takes at least
@@ -183,7 +184,7 @@ def measured(model: HyperelasticModel, mean: FloatArray, reach: Mapping[str, tup
 
 
 def crossings(
-    first: Evaluations | None, points: FloatArray, nodes: FloatArray, cells: NDArray[np.int64], corners: int
+    first: Evaluations | None, points: FloatArray, nodes: FloatArray, cells: NDArray[np.int64], cell: Cell
 ) -> Iterator[Finding]:
     """Say where a body passes through itself, or its surface would crease: at the mean, and where it moves most.
 
@@ -195,8 +196,8 @@ def crossings(
         At the mean parameters, with the state and its derivatives as fields.
     points
         Solved parameters (n, d).
-    nodes, cells, corners
-        Nodes (N, 3) (m), the nodes of cells in VTK's order, and how many of them are corners.
+    nodes, cells, cell
+        Nodes (N, 3) (m), the nodes of cells in VTK's order, corners first, and their kind.
     """
     if first is None or not first.fields.size or not first.ok[0]:
         return
@@ -206,8 +207,7 @@ def crossings(
         moves, along = points - first.points[0], np.array(slopes)
         sizes = 2 * moves @ (along @ state) + np.einsum("ni,ij,nj->n", moves, along @ along.T, moves)
         states["Where the displacement is predicted to be largest"] = state + moves[sizes.argmax()] @ along
-    cell: Any = "tetrahedron" if corners == 4 else "hexahedron"
-    cells = cells[:, :corners]
+    cells = cells[:, : 4 if cell == "tetrahedron" else 8]
     faces, _ = surface_of(cells, cell)
     for where, one in states.items():
         moved = nodes + one.reshape(-1, 3)
@@ -215,7 +215,7 @@ def crossings(
         if stretch < CREASED:
             values = {"where": where, "place": place(nodes[vertex].tolist()), "short": 100 * (1 - stretch)}
             yield Finding("surface-creases", "note", values)
-        found = deepest(moved, cells, cell)
+        found = deepest(moved, cells, cell, faces)
         if found is not None:
             at, deep = place(nodes[found.vertex].tolist()), told(found.depth, "m")
             yield Finding("passes-through-itself", "warning", {"where": where, "place": at, "deep": deep})

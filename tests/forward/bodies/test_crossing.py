@@ -6,7 +6,8 @@ import pytest
 from mpi4py import MPI
 
 from forward.bodies.crossing import deepest, least_stretch
-from forward.bodies.mesh import surface_of
+from forward.bodies.hexahedra import CORNERS
+from forward.bodies.mesh import TETRAHEDRA, surface_of
 from forward.hyperelastic import Hyperelastic
 from tests.forward.bodies.test_slits import CELLS, NAMES, block
 from uq.evaluation.evaluate import SerialEvaluate
@@ -15,19 +16,16 @@ from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise_request
 from workflows.studies.solves import crossings
 
-CUBE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-SPLIT = [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
-
 
 def ring(turn, cell):
     """A beam of 40 × 3 × 3 cells that is bent by an angle, and where it was."""
     ends = 40, 3, 3
     points = np.stack(np.meshgrid(*[np.arange(n + 1.0) for n in ends], indexing="ij"), axis=-1).reshape(-1, 3)
     numbers = np.arange(len(points)).reshape([n + 1 for n in ends])
-    corners = [numbers[tuple(slice(a, n + a) for a, n in zip(at, ends, strict=True))].ravel() for at in CUBE]
+    corners = [numbers[tuple(slice(a, n + a) for a, n in zip(at, ends, strict=True))].ravel() for at in CORNERS]
     cells = np.column_stack(corners)
     if cell == "tetrahedron":
-        cells = cells[:, SPLIT].reshape(-1, 4)
+        cells = cells[:, TETRAHEDRA["hexahedron"]].reshape(-1, 4)
     radius = ends[0] / turn
     angle, far = points[:, 0] / radius, radius + 1.5 - points[:, 1]
     return points, np.column_stack([far * np.sin(angle), radius - far * np.cos(angle), points[:, 2]]), cells
@@ -37,10 +35,11 @@ def ring(turn, cell):
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
 def test_ends_that_meet_are_seen(cell):
     points, bent, cells = ring(6.0, cell)
-    assert deepest(points, cells, cell) is None
-    assert deepest(bent, cells, cell) is None  # 0.28 of an angle is left between the ends
+    faces, _ = surface_of(cells, cell)
+    assert deepest(points, cells, cell, faces) is None
+    assert deepest(bent, cells, cell, faces) is None  # 0.28 of an angle is left between the ends
     _, bent, cells = ring(6.5, cell)
-    found = deepest(bent, cells, cell)
+    found = deepest(bent, cells, cell, faces)
     assert found is not None
     assert points[found.vertex, 0] in {0.0, 40.0}  # of an end
     # The ends overlap by 6.5 − 2π of an angle; the outer surface of a corner is nearer than the end in front of it.
@@ -82,11 +81,11 @@ def test_lips_that_are_pressed_are_seen(tmp_path):
     first = evaluate(linearise_request(evaluate, inputs.mean))
     nodes, (cells, _) = model.space.coordinates, model.space.cells()
     assert len(cells) == np.prod(CELLS)
-    (said,) = crossings(first, inputs.mean[None], nodes, cells, 8)
+    (said,) = crossings(first, inputs.mean[None], nodes, cells, "hexahedron")
     assert said.code == "passes-through-itself"
     assert "At the mean" in said.text
     assert "3.3 mm" in said.text
     pulled = evaluate(linearise_request(evaluate, np.array([6.0])))
-    assert not list(crossings(pulled, np.array([[6.0], [30.0]]), nodes, cells, 8))
-    (said,) = crossings(pulled, np.array([[6.0], [-36.0]]), nodes, cells, 8)
+    assert not list(crossings(pulled, np.array([[6.0], [30.0]]), nodes, cells, "hexahedron"))
+    (said,) = crossings(pulled, np.array([[6.0], [-36.0]]), nodes, cells, "hexahedron")
     assert "predicted to be largest" in said.text
