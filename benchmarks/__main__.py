@@ -60,6 +60,7 @@ NAMES = (
     "meshes_of_fields",
     "facets",
     "oddities",
+    "edges",
     "held_out",
     "others",
     "scaling",

@@ -45,6 +45,9 @@ TABLE: dict[str, str | Words] = {
     "expansion-rough": "The error of the expansion of {about} is {error:.3g} of the standard deviation at samples "
     "left out of the fit. Mean, standard deviation and quantiles are those of the {samples} samples, with the "
     "expansion as control; Sobol' indices and the expansion itself are rough.",
+    "gradients-contradict": "The derivatives of {about} contradict its values, which differ from what they say by "
+    "{share:.2g} of the standard deviation, more than the errors of the derivatives allow: the output has steps or "
+    "jumps, or its derivatives are wrong. Fit values alone (method.gradients = false), or correct the derivatives.",
     "expansion-order": "The expansion of {about} has functions of order {order}, the highest that was tried, and "
     "leaves more than a few percent of the standard deviation: a higher max_order may explain more.",
     "expansion-shape": "According to the expansion, the standard deviation of {about} is decided in a small part of "

@@ -209,6 +209,13 @@ def of_expansion(
             yield _of_output("expansion-rough", "warning", name, error=error, samples=samples)
 
 
+def of_gradients(names: Sequence[str], off: FloatArray) -> Iterator[Finding]:
+    """Find the outputs whose gradients say other values, off by these shares (m,) of their standard deviations."""
+    for name, share in zip(names, off.tolist(), strict=True):
+        if share > SEEN:
+            yield _of_output("gradients-contradict", "warning", name, share=share)
+
+
 def of_shape(names: Sequence[str], drawn: FloatArray, relative: FloatArray, samples: int) -> Iterator[Finding]:
     """Find rough expansions, of relative leave-one-out errors (m,), whose variance comes from little of the range.
 

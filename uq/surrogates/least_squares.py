@@ -243,7 +243,7 @@ def _scores(
             if size.min() > 1e-10 * size.max():
                 blocks = q.reshape(n, rows, terms)
                 residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
-                relative = data.relative(_left_out(blocks, residual, held))
+                relative = data.relative(left_out(blocks, residual, held))
                 scores.append((float(relative[judged].max()), candidate, None))
             else:
                 continue
@@ -253,7 +253,7 @@ def _scores(
     return [found for found in scores if np.isfinite(found[0])], least
 
 
-def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
+def left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
     """Errors (n, rows, m) at each sample, by the fit without those that share its number in `held` (n,).
 
     They follow from the orthonormal columns (n, rows, P) and the residuals.
@@ -417,7 +417,7 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
     coefficients = solve_triangular(triangle, rotated)
     if folds is None:
         held = np.arange(n)
-        errors = _left_out(blocks, residual, held)
+        errors = left_out(blocks, residual, held)
         terms = chosen.which.size
         moved = solve_triangular(triangle, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
         without = np.zeros((n, left.shape[2], m))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from forward.findings import Finding, entries
 from forward.model import FloatArray
-from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_shape, of_tails
+from uq.estimators.doubts import of_constants, of_expansion, of_gradients, of_reach, of_shape, of_tails
 from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.estimators.tails import influences
@@ -32,6 +32,7 @@ from uq.surrogates.basis import (
     recurrence,
     rows_of,
 )
+from uq.surrogates.edges import contradicted, roots
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.outside_samples import Beyond, beyond
 
@@ -42,6 +43,7 @@ EXPLAINS = 8.0  # times less is left of what is smooth by half as high an order 
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
 CLOSE = 0.03  # relative leave-one-out error above which the tails of the samples matter
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
+FEWEST = 10  # samples of which the outermost tell how tails begin, beside an expansion
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
 SYMMETRIC = 0.01  # share of even powers up to which a function is odd, and the reverse
 PULLS = 2.0  # times the largest effect of such a function that is claimed, since others are missing too
@@ -178,25 +180,60 @@ class Regression:
         regression they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and
         t²/(2σ). For t stands the most that the residuals allow, see `missing`.
         """
-        from scipy.linalg import solve_triangular
-
         tails, basis, data, fit = tails_of(self.inputs), self.basis, self.data, self.fit
         if tails.size > FULL or self.inputs.draws is not None:
             return missing
-        left = data.left(basis)
-        q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
         following = orthonormal(self.inputs, np.array(list(_neighbours(basis.indices, tails))))
-        columns = data.left(following).reshape(len(q), -1)
-        along = q.T @ columns
-        sizes = ((columns - q @ along) ** 2).sum(axis=0)
+        moved, sizes = self._taken_up(data.left(following))
         varying = (basis.indices != 0).any(axis=1)
-        moved = solve_triangular(triangle, along)[varying]
         c = fit.coefficients[varying]
         std = np.linalg.norm(c, axis=0)
-        pulls = np.abs(shares(moved.T @ c, std))
+        pulls = np.abs(shares(moved[varying].T @ c, std))
         norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
         largest = (norms * pulls).max(axis=0)
         return np.asarray(np.sqrt((PULLS * largest) ** 2 + (LEAST * missing) ** 2 + shares(missing**2, std) ** 2))
+
+    def edges(self) -> FloatArray:
+        """Return errors (2, m) of means and standard deviations by a root at an end of ranges, as large as may be.
+
+        That is, of the distance to either end of a bounded parameter, or of all of them along the slope of the output.
+        As in `hidden`, ψ is taken up with R⁻¹Qᵀψ, and residuals allow the norm that they have over those of ψ: here
+        what is left of ψ is known everywhere, and its mean and its product with the expansion are integrals.
+        """
+        inputs, basis, fit = self.inputs, self.basis, self.fit
+        bounded, first = ~tails_of(inputs), basis.indices.sum(axis=1) == 1
+        if not bounded.any():
+            return np.zeros((2, fit.loo.size))
+        unit, own = np.eye(bounded.size)[bounded], np.eye(fit.loo.size)
+        along = fit.coefficients[first].T @ (basis.indices[first] * bounded)
+        along = shares(along, np.linalg.norm(along, axis=1)[:, None])
+        directions = np.concatenate([unit, -unit, along, -along])
+        asked = np.concatenate([np.ones((2 * len(unit), len(own))), own, own]) * directions.any(axis=1)[:, None]
+        drawn = inputs.points(sobol_points(0, 0, 0, POINTS, bounded.size))
+        (values, slopes), (everywhere, _) = (
+            roots(inputs, basis.coordinates, points, directions) for points in (self.data.points, drawn)
+        )
+        columns = replace(self.data, values=values, slopes=None if self.data.slopes is None else slopes).right
+        taken, sizes = self._taken_up(columns)
+        functions, varying = basis.values(drawn), (basis.indices != 0).any(axis=1)
+        left, c = everywhere - functions @ taken, fit.coefficients[varying]
+        of_std = shares(left.T @ (functions[:, varying] @ c) / POINTS, np.linalg.norm(c, axis=0))
+        norms = asked * np.sqrt(shares(fit.squares, sizes[:, None]))
+        pulls = left.mean(axis=0)[:, None], of_std
+        return np.array([(norms * np.abs(pull)).max(axis=0) for pull in pulls])
+
+    def _taken_up(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what fits to other functions have for coefficients (P, K), and what they leave: sums of squares (K,).
+
+        These are given by their columns (n, rows, K), as in `Data.left`.
+        """
+        from scipy.linalg import solve_triangular
+
+        left = self.data.left(self.basis)
+        q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
+        columns = columns.reshape(len(q), -1)
+        along = q.T @ columns
+        return solve_triangular(triangle, along), ((columns - q @ along) ** 2).sum(axis=0)
 
     def _estimates(self, of: Analysis, missing: FloatArray | None, hidden: FloatArray | None) -> dict[str, FloatArray]:
         """Moments and indices by output, with standard errors by the jackknife over samples and the residual variance.
@@ -209,6 +246,8 @@ class Regression:
         mean is the geometric mean of the two: in 30 settings of five functions its 95 % intervals covered 92 to 100 %,
         those of the jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for
         each parameter it is the jackknife's.
+
+        Next to the ends of ranges few samples show little, and what a root there would do is an error too (`edges`).
 
         None of this sees what lies outside the basis. So there are other estimates too, from the samples, each with the
         fit without it as control (`_unseen`): half the distance to them counts as an error, and for the standard
@@ -239,11 +278,12 @@ class Regression:
         # The norm of what a fit may leave beyond λ, which n samples know to λ√(κ/n), κ the kurtosis of the errors at
         # samples that are left out: few of them decide λ where a function grows towards an end of a range, and there it
         # is larger still where none of few samples is.
-        squares = fit.unseen**2
+        squares, edges = fit.unseen**2, self.edges()
         unsure = np.sqrt(shares((squares**2).mean(axis=0), squares.sum(axis=0)))
         further = {
             "mean": np.sqrt(
                 np.maximum(tails, unsure) ** 2 / n
+                + edges[0] ** 2
                 + (seen["mean"] - central["mean"]) ** 2 / 4
                 + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
             ),
@@ -251,6 +291,7 @@ class Regression:
                 (beyond_samples if hidden is None else hidden) ** 2
                 + unsure**2
                 + bias**2
+                + edges[1] ** 2
                 + (seen["std"] - central["std"]) ** 2 / 4
             ),
         }
@@ -338,6 +379,7 @@ class Regression:
         n = len(self.data.points)
         yield from of_constants(names, self.data.values)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
+        yield from of_gradients(names, contradicted(self.basis, self.data))
         rough = [name for name, left in zip(names, self.fit.relative.tolist(), strict=True) if left > CLOSE]
         if rough and self.at_limit:
             yield Finding("expansion-order", "note", {"order": self.candidates.limit}, about=entries(rough))
@@ -349,7 +391,7 @@ class Regression:
         values = self.basis.values(drawn) @ self.fit.coefficients[:, trusted]
         yield from of_shape([names[i] for i in trusted], values, self.fit.relative[trusted], n)
         if np.ptp(self.data.weights) == 0:
-            which = np.flatnonzero(self.fit.relative > CLOSE)
+            which = np.flatnonzero(self.controlled | ((self.fit.relative > CLOSE) & (n >= FEWEST)))
             first, second, _ = self._unseen_samples()
             yield from of_tails(
                 [names[i] for i in which],

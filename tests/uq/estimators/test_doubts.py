@@ -82,7 +82,10 @@ def test_a_rough_expansion_controls_its_own_samples():
     exact = np.sqrt(1 / 12 + 0.35 * 0.65)
     assert fitted < 0.8 * exact
     assert abs(data["std"].item() - exact) < 2.5 * data["std_error"].item()
-    assert severities(data) == ["warning"]
+    assert [(one.severity, one.code) for one in findings(data)] == [
+        ("warning", "expansion-rough"),
+        ("warning", "gradients-contradict"),
+    ]
 
 
 def test_errors_of_indices_have_what_the_fit_leaves_out():

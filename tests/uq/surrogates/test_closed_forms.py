@@ -12,7 +12,7 @@ from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, 
 from uq.inputs.random_parameters import Inputs
 from uq.methods.derivative_based import poincare
 from uq.surrogates.basis import gauss_rule, hermite, hyperbolic, orthonormal
-from uq.surrogates.least_squares import _left_out
+from uq.surrogates.least_squares import left_out
 
 pytestmark = pytest.mark.unit
 RNG = np.random.default_rng(21)
@@ -70,7 +70,7 @@ def test_errors_of_samples_left_out_are_those_of_fits_without_them(alone):
     held = np.arange(12) // alone
     q, _ = np.linalg.qr(matrix[:, 0])
     residual = right - (q @ (q.T @ right[:, 0]))[:, None]
-    found = _left_out(q[:, None], residual, held)
+    found = left_out(q[:, None], residual, held)
     for number in np.unique(held):
         inside = held != number
         fit = np.linalg.lstsq(matrix[inside, 0], right[inside, 0], rcond=None)[0]
