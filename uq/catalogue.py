@@ -83,6 +83,12 @@ TABLE: dict[str, str | Words] = {
         "The expansion continues there smoothly, which neither samples nor errors cover: its moments, "
         "quantiles and indices hold only if the outputs do so too."
     ),
+    "answers-missing": Words(
+        "What has no answer may be up to {most:.2g} of all cases (95 %). If outputs there lay in the range of the "
+        "others, means of all cases would be: {about}. Quantiles nearer to an end than that share are not known.",
+        between="; ",
+        listed=3,
+    ),
     "stopped-on-the-way": "{count} of {total} samples stop on their way: at least the first {least} of {outputs} "
     "outputs of each are known and kept (`values`), but no estimate of any step counts these samples.",
     "screen-missed": "The screen of stability passed {missed} unstable {equilibria} that counting found: of the "
