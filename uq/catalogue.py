@@ -44,7 +44,7 @@ TABLE: dict[str, str | Words] = {
     "an expansion.",
     "expansion-rough": "The error of the expansion of {about} is {error:.3g} of the standard deviation at samples "
     "left out of the fit. Mean, standard deviation and quantiles are those of the {samples} samples, with the "
-    "expansion as control; Sobol' indices and the expansion itself are rough.",
+    "expansion as control where it agrees with them; Sobol' indices and the expansion itself are rough.",
     "expansion-order": "The expansion of {about} has functions of order {order}, the highest that was tried, and "
     "leaves more than a few percent of the standard deviation: a higher max_order may explain more.",
     "expansion-shape": "According to the expansion, the standard deviation of {about} is decided in a small part of "
