@@ -21,6 +21,7 @@ NAMES = (
     "throughput",
     "tolerance",
     "promises",
+    "claims",
     "variance",
     "levels",
     "fields",

@@ -54,9 +54,9 @@ def body(folder: Path, cell: str, along: int, layers: int) -> Hyperelastic:
     kinds = ("hexahedron", "quad") if cell == "hexahedron" else ("tetra", "triangle")
     blocks = [(kinds[0], cells), (kinds[1], np.array(facets))]
     path = folder / f"{cell}-{along}-{layers}.vtu"
-    meshio.write(
-        path, meshio.Mesh(points, blocks, cell_data={"part": [np.ones(len(cells), dtype=int), np.array(tags)]})
-    )
+    if not path.exists():  # another rank may be reading it
+        parts = [np.ones(len(cells), dtype=int), np.array(tags)]
+        meshio.write(path, meshio.Mesh(points, blocks, cell_data={"part": parts}))
     at = {"inner": (INNER, 0.0, 0.0), "outer": (OUTER, 0.0, 0.0), "middle": ((INNER + OUTER) / 2, 0.0, 0.0)}
     outputs = [{"kind": "displacement", "name": name, "at": place, "component": "x"} for name, place in at.items()]
     return Hyperelastic.model_validate(

@@ -104,7 +104,7 @@ def closed_forms(repeats: int, only: str) -> None:
     print("|---|---|---|---|---|---|---|---|---|---|")
     block = {"kind": "python", "function": "math.sin", "parameters": {"a": 1.0, "b": 1.0}, "outputs": ("f",)}
     forms = {name: form for name, form in _forms().items() if only in name}
-    for (name, (inputs, functions, exact)), full in product(forms.items(), ("evenly", "differences")):
+    for (name, (inputs, functions, exact)), full in product(forms.items(), ("evenly", "differences", "auto")):
         evaluate = Hierarchy([Case(name, function, inputs) for function in functions])
         costs = NESTED if "cut off" in name else COSTS
         cheap = [{"kind": "model", "name": n, "cost": c, "model": block} for n, c in zip(CHEAP, costs, strict=True)]

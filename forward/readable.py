@@ -53,15 +53,15 @@ def places(error: float) -> int:
 
 
 def with_error(value: float, error: float) -> str:
-    """Write a value and its error to the same place, that of `places`: 0.12279 ± 0.00015, 12.311 ± 0.009."""
+    """Write a value and its error to the same place, that of `places`: 0.12279 ± 0.00015, 12.311 ± 0.009, 12 ± ∞."""
     found = _rounded([value, error], value, error, DIGITS)
-    return f"{number(value, 6)} ± {number(error, 2)}" if found is None else found
+    return f"{number(value, 2 if error == math.inf else MOST)} ± {number(error, 2)}" if found is None else found
 
 
 def rounded(value: float, error: float) -> str:
-    """Write a value as `with_error` does, alone and to six digits at most; to four if it has no error."""
+    """Write a value as `with_error` does, alone; to four digits if it has no error, to two if that has no end."""
     found = _rounded([value], value, error, MOST)
-    return number(value, 4) if found is None else found
+    return number(value, 2 if error == math.inf else 4) if found is None else found
 
 
 def _rounded(numbers: list[float], value: float, error: float, most: int) -> str | None:

@@ -48,6 +48,11 @@ TABLE: dict[str, str | Words] = {
         "{degrees:.0f} directions that the data tell (probability {chance:.1g})",
         short="the prior does not allow it",
     ),
+    "heavy-tail": Words(
+        "{share:.0f} % of the variance of {name} come from the outermost 1 % of its probability (of a normal quantity "
+        "8 %), which few points tell: take its interval, not its standard deviation",
+        short="{name} has a heavy tail",
+    ),
     "little-seen": Words(
         "at {share:.0f} % of the vertices the data say next to nothing: there the standard deviation is above "
         "{unseen:g} of the prior's, and the value follows from prior and neighbours (smallest: {best}; largest: "

@@ -1,6 +1,7 @@
 """The public namespace: studies and models from Python, in a few lines."""
 
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ def test_importing_it_imports_nothing_heavy():
 
 
 def test_every_name_is_there():
+    assert dir(tissuq) == sorted([*tissuq.__all__, "__version__"])
+    assert tissuq.__version__ == version("tissuq")
     for name in tissuq.__all__:
         assert getattr(tissuq, name) is not None
     with pytest.raises(AttributeError, match="did you mean 'Study'"):

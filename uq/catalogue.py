@@ -44,7 +44,7 @@ TABLE: dict[str, str | Words] = {
     "an expansion.",
     "expansion-rough": "The error of the expansion of {about} is {error:.3g} of the standard deviation at samples "
     "left out of the fit. Mean, standard deviation and quantiles are those of the {samples} samples, with the "
-    "expansion as control; Sobol' indices and the expansion itself are rough.",
+    "expansion as control where it agrees with them; Sobol' indices and the expansion itself are rough.",
     "gradients-contradict": "The derivatives of {about} contradict its values, which differ from what they say by "
     "{share:.2g} of the standard deviation, more than the errors of the derivatives allow: the output has steps or "
     "jumps, or its derivatives are wrong. Fit values alone (method.gradients = false), or correct the derivatives.",
@@ -85,6 +85,12 @@ TABLE: dict[str, str | Words] = {
     + (
         "The expansion continues there smoothly, which neither samples nor errors cover: its moments, "
         "quantiles and indices hold only if the outputs do so too."
+    ),
+    "answers-missing": Words(
+        "What has no answer may be up to {most:.2g} of all cases (95 %). If outputs there lay in the range of the "
+        "others, means of all cases would be: {about}. Quantiles nearer to an end than that share are not known.",
+        between="; ",
+        listed=3,
     ),
     "stopped-on-the-way": "{count} of {total} samples stop on their way: at least the first {least} of {outputs} "
     "outputs of each are known and kept (`values`), but no estimate of any step counts these samples.",

@@ -32,7 +32,7 @@ ACCEPTED = 0.3  # acceptance rate for which β is tuned during the burn-in
 FIRST_STEP = 0.5  # β at its start
 SPREAD = 1.3  # of the starts of chains, in standard deviations of the Gaussian
 WIDER = 1.2  # standard deviations of the Gaussian of weighted points, over those of the points
-MIXED = 1.01  # R̂ up to which chains agree
+MIXED = 1.01  # R̂ up to which chains agree, however many draws there are
 INDEPENDENT = 400.0  # effective sample size from which R̂ and quantiles are meaningful
 
 Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -123,11 +123,9 @@ class Chains:
     def agreeing(self) -> float:
         """R̂ up to which chains agree.
 
-        Where fewer draws are needed than usual, means of half chains scatter by more, by χ² with one degree of freedom
-        less than there are halves: the largest R̂ of all quantities that one run in a hundred has by chance.
+        Means of half chains scatter, by χ² with one degree of freedom less than there are halves: the largest R̂ of
+        all quantities that one run in a hundred has by chance. A bound of its own, 1.01, holds where this is less.
         """
-        if self.needed >= INDEPENDENT:
-            return MIXED
         from scipy.special import chdtri
 
         halves, ess = 2 * len(self.draws), self.ess

@@ -318,17 +318,18 @@ def _constants(
 ) -> dict[str, Any]:
     """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
     shape, dims = (len(names), len(groups), len(parameters)), ("model", "group", "parameter")
-    mode, mean, std = np.full((3, *shape), np.nan)
+    mode, mean, std, far = np.full((4, *shape), np.nan)
     bands = np.full((len(QUANTILES), *shape), np.nan)
     for (k, g), one, columns in _cells(names, groups, parameters, found):
         known = answer(one.posterior, one.assessment)
         mode[k, g, columns] = one.posterior.physical(one.assessment.gaussian.mode[None, :])[0]
-        mean[k, g, columns], std[k, g, columns] = known.mean, known.std
+        mean[k, g, columns], std[k, g, columns], far[k, g, columns] = known.mean, known.std, known.outermost
         bands[:, k, g, columns] = known.quantiles(QUANTILES).T
     return {
         "constant_mode": (dims, mode),
         "constant_mean": (dims, mean),
         "constant_std": (dims, std),
+        "constant_outermost": (dims, far),
         "constant_quantiles": (("quantile", *dims), bands),
     }
 

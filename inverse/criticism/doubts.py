@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
 UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance for a warning, an error
 END, CROWDED = 0.02, 5.0  # share of the prior at an end of a range, and how many times that the posterior has there
+HEAVY = (
+    0.25  # share of a variance from 1 % of the probability: below, deviations were right to 4 %, above off by a third
+)
 NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data above which the model explains nothing
 STRANGE = 0.01  # probability that any of all data is as far out as an outlier
@@ -100,6 +103,15 @@ def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> l
 def _at(where: FloatArray) -> str:
     numbers, _, unit = place(where.tolist()).rpartition("\u00a0")
     return f"({numbers}) {unit}"
+
+
+def heavy_tails(names: Sequence[str], outermost: FloatArray) -> list[Finding]:
+    """Doubt standard deviations that rest on the outermost 1 % of the probability, by its shares (c,) of variances."""
+    return [
+        Finding("heavy-tail", "warning" if share > HALF else "note", {"name": name, "share": 100 * share})
+        for name, share in zip(names, outermost.tolist(), strict=True)
+        if share > HEAVY
+    ]
 
 
 def at_an_end(

@@ -202,6 +202,7 @@ def _moments(posterior: Posterior, one: Assessment, known: Answer, points: Point
         "lower": ends[:, 0],
         "upper": ends[:, 1],
         "covariance": known.covariance,
+        "outermost": known.outermost,
         "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, gaussian).std,
     }
     if look is None:

@@ -52,7 +52,7 @@ _NUMBERS = """
 """
 _WORDS = {"why", "mesh_why", "prediction_why"}
 _ARRAYS = {
-    "parameter": "mode mean std lower upper mesh_shift mesh_left laplace_std together_std reduced_shift",
+    "parameter": "mode mean std lower upper outermost mesh_shift mesh_left laplace_std together_std reduced_shift",
     "parameter partner": "covariance",
     "direction": "eigenvalue",
     "case": "alone_determined misfit misfit_degrees misfit_count",

@@ -6,26 +6,35 @@ not found from the straight ones. Estimates from the other samples describe the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.findings import Finding
+from forward.findings import Entry, Finding
 from forward.model import FloatArray, Stability
+from forward.readable import told as in_words
 from uq.evaluation.request import Evaluations
 from uq.inputs.random_parameters import Inputs
 
 SHOWN = 0.1  # weight of a parameter in a direction, relative to the largest, from which it is named
+SHUFFLES = 39  # of labels, all of which a bound separates worse: one time in forty by chance
+NAMED = 3  # parameters of a place, those furthest from their means
+ROWS = 2000  # points of a kind by which others are told apart, at most
+STEPS, RIDGE = 10, 1e-4  # of the logistic regression
 
 
-def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> Iterator[Finding]:
+def findings(
+    inputs: Inputs, evaluations: Evaluations, units: Mapping[str, str], *, continued: bool
+) -> Iterator[Finding]:
     """Say where samples have no answer, and what that does to estimates.
 
     Parameters
     ----------
     inputs, evaluations
         The random parameters and the evaluated samples.
+    units
+        Of the outputs (m), by their names, in order.
     continued
         Whether estimates use a function that continues where the model has no answer (an expansion).
     """
@@ -50,12 +59,38 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         least, outputs = int(known_outputs.sum(axis=1).min()), known_outputs.shape[1]
         values = {"count": count, "total": total, "least": least, "outputs": outputs}
         yield Finding("stopped-on-the-way", "warning", values)
+    if not ok.all():
+        yield from _left_out(units, evaluations.outputs)
     missed = int((known == Stability.MISSED).sum())
     if missed:
         screened = int((known == Stability.SCREENED).sum())
         equilibria = "equilibrium" if missed == 1 else "equilibria"
         values = {"missed": missed, "equilibria": equilibria, "screened": screened}
         yield Finding("screen-missed", "error" if screened else "warning", values)
+
+
+def _left_out(units: Mapping[str, str], outputs: FloatArray) -> Iterator[Finding]:
+    """Say between which ends moments of the whole distribution lie, by the outputs (n, m) that are known.
+
+    Its share is at most the upper end by C. J. Clopper and E. S. Pearson (Biometrika 26 (1934) 404–413).
+    With a share s without answer, the quantile of p is between those of (p − s)/(1 − s) and p/(1 − s) of the
+    others.
+    """
+    from scipy.special import betaincinv
+
+    n, told, most = len(outputs), [], 0.0
+    for (name, unit), column in zip(units.items(), outputs.T, strict=True):
+        values = column[np.isfinite(column)]
+        if len(values) in (0, n):
+            continue
+        share = float(betaincinv(n - len(values) + 1, len(values), 0.975))
+        ends = (1 - share) * values.mean() + share * np.array([values.min(), values.max()])
+        middle = np.quantile(values, np.clip([(0.5 - share) / (1 - share), 0.5 / (1 - share)], 0, 1))
+        of_mean, of_median = (f"{in_words(a, unit, 3)} to {in_words(b, unit, 3)}" for a, b in (ends, middle))
+        told.append(Entry(name, f" from {of_mean} (median {of_median if share < 0.5 else 'not known'})", share))
+        most = max(most, share)
+    if told:
+        yield Finding("answers-missing", "warning", {"most": most}, about=tuple(told))
 
 
 def of_jumps(
@@ -92,56 +127,72 @@ def _share(count: int, total: int, what: str) -> str:
 def separated(inputs: Inputs, points: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> str:
     """Say in words what distinguishes the points (n, d) that were refused (n,) from those that have an answer.
 
-    That is a bound on one parameter, or on a sum of several if that separates them better.
+    That is a bound on one parameter, or on a sum of several if that separates them better; but neither, where labels
+    that are shuffled are separated as well.
     """
     if not ok.any():
         return "no sample has an answer"
-    names = inputs.names
-    bounds = [_bound(points[:, i], refused, ok) for i in range(len(names))]
-    i = min(range(len(names)), key=lambda k: bounds[k][0])
-    wrong, above = bounds[i]
-    if wrong > 0 and len(names) > 1:
-        scaled = (points - inputs.mean) / inputs.std
-        both = refused | ok
-        rows = np.column_stack([np.ones(both.sum()), scaled[both]])
-        weights = np.linalg.lstsq(rows, np.where(refused[both], 1.0, -1.0), rcond=None)[0][1:]
-        weights /= np.abs(weights).max()
-        along = scaled @ weights
-        together, above_together = _bound(along, refused, ok)
-        if together < wrong and above_together:
-            shown = [k for k in np.argsort(-np.abs(weights)) if abs(weights[k]) >= SHOWN]
-            terms = " ".join(f"{'−' if weights[k] < 0 else '+'} {abs(weights[k]):.2g} {names[k]}" for k in shown)
-            what = f"{terms.removeprefix('+ ')} (deviations from the means in standard deviations)"
-            return _words(what, along, refused, ok, together, above=True)
-    return _words(names[i], points[:, i], refused, ok, wrong, above=above)
-
-
-def _bound(x: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> tuple[int, bool]:
-    """Smallest number of points on the wrong side of a bound of x (n,), and whether the refused ones are above it."""
+    scaled = (points - inputs.mean) / inputs.std
+    some = np.concatenate([np.flatnonzero(one)[:: 1 + int(one.sum()) // ROWS] for one in (refused, ok)])
+    x, labels, rng = scaled[some], refused[some], np.random.default_rng(0)
+    found = _least_wrong(x, labels)
+    shuffled = [_least_wrong(x, rng.permutation(labels)) for _ in range(SHUFFLES)]
+    chance = [min(wrong for wrong, _ in kind) for kind in zip(*shuffled, strict=True)]
+    told = [one for one, least in zip(found, chance, strict=True) if one[0] < least]
+    if not told:
+        first = np.flatnonzero(refused)[0]
+        far = np.argsort(-np.abs(scaled[first]))[:NAMED]
+        place = ", ".join(f"{inputs.names[k]} = {points[first, k]:.5g}" for k in far)
+        return f"no bound on the parameters separates them from the others; the first is at {place}"
+    _, weights = min(told, key=lambda one: one[0])
+    shown = [k for k in np.argsort(-np.abs(weights)) if abs(weights[k]) >= SHOWN]
+    if len(shown) == 1:
+        what, sign, along = inputs.names[shown[0]], np.sign(weights[shown[0]]), points[:, shown[0]]
+    else:
+        terms = " ".join(f"{'−' if weights[k] < 0 else '+'} {abs(weights[k]):.2g} {inputs.names[k]}" for k in shown)
+        what = f"{terms.removeprefix('+ ')} (deviations from the means in standard deviations)"
+        sign, along = 1.0, scaled @ weights
     both = refused | ok
-    order = np.argsort(x[both], kind="stable")
-    bad = refused[both][order]
-    below = np.concatenate([[0], np.cumsum(bad)])  # refused ones among the k smallest
-    k = np.arange(len(below))
-    above = (below + (len(bad) - k - (bad.sum() - below))).min()  # refused below the bound, answered above it
-    under = ((k - below) + (bad.sum() - below)).min()
-    return int(min(above, under)), bool(above <= under)
+    bound = _bounds(sign * along[both, None], refused[both])[1][0]
+    beyond = sign * along >= bound
+    inside, others = int((refused & beyond).sum()), int((ok & beyond).sum())
+    here, there = ("≥", "≤") if sign > 0 else ("≤", "≥")
+    said = f"{'all' if inside == refused.sum() else inside} with {what} {here} {sign * bound:.5g}"
+    if others:
+        return f"{said}, where {others} {'other has' if others == 1 else 'others have'} an answer"
+    if inside < refused.sum():
+        return f"{said}, where no other has an answer"
+    return f"{said}, none with {what} {there} {sign * (sign * along[ok]).max():.5g}"
 
 
-def _words(
-    what: str, x: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_], wrong: int, *, above: bool
-) -> str:
-    sign = 1 if above else -1
-    first = sign * (sign * x[refused]).min()
-    sides = "≥" if above else "≤", "≤" if above else "≥"
-    if wrong == 0:
-        last = sign * (sign * x[ok]).max()
-        return f"all with {what} {sides[0]} {first:.5g}, none with {what} {sides[1]} {last:.5g}"
-    inside = int(((sign * x >= sign * first) & ok).sum())
-    if 2 * inside > ok.sum():
-        return "no bound on the parameters separates them from the others"
-    others = "1 other has" if inside == 1 else f"{inside} others have"
-    return f"all with {what} {sides[0]} {first:.5g}, where {others} an answer"
+def _least_wrong(x: FloatArray, refused: NDArray[np.bool_]) -> list[tuple[int, FloatArray]]:
+    """Return the fewest points of x (n, d) on the wrong side of a bound, and the weights (d,) of the bounded sum.
+
+    That is of one parameter, up or down, and of the direction of a logistic regression.
+    """
+    n, d = x.shape
+    rows, fitted = np.column_stack([np.ones(n), x]), np.zeros(d + 1)
+    for _ in range(STEPS):
+        p = 1 / (1 + np.exp(-rows @ fitted))
+        curvature = (rows.T * (p * (1 - p))) @ rows + RIDGE * n * np.eye(d + 1)
+        fitted += np.linalg.solve(curvature, rows.T @ (refused - p) - RIDGE * n * fitted)
+    one, along = np.vstack([np.eye(d), -np.eye(d)]), fitted[1:] / max(np.abs(fitted[1:]).max(), 1e-300)
+    wrong = _bounds(x @ one.T, refused)[0]
+    best = int(wrong.argmin())
+    return [(int(wrong[best]), one[best]), (int(_bounds(x @ along[:, None], refused)[0][0]), along)]
+
+
+def _bounds(x: FloatArray, refused: NDArray[np.bool_]) -> tuple[NDArray[np.int_], FloatArray]:
+    """Return the bound (c,) of each column of x (n, c) with the fewest points on the wrong side, and how many (c,).
+
+    Refused ones are to be at the bound or above it.
+    """
+    order = np.argsort(x, axis=0, kind="stable")
+    below, answered = (np.pad(np.cumsum(one[order], axis=0), ((1, 0), (0, 0))) for one in (refused, ~refused))
+    wrong = below + answered[-1] - answered
+    k = wrong.argmin(axis=0)
+    sorted_, columns = np.take_along_axis(x, order, axis=0), np.arange(x.shape[1])
+    return wrong[k, columns], np.vstack([sorted_, np.full(x.shape[1], np.inf)])[k, columns]
 
 
 def counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:

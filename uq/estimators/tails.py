@@ -28,12 +28,14 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.moments import Estimates, error_of_root, estimate, monomials, ratio
 from uq.inputs.random_parameters import Inputs
 
 AGREE = 1e-12  # standard errors of means over the standard deviation up to which replicates are equal
+APART = 4.0  # standard errors between moments with a control and without
 FROM = 0.25  # standard deviation of logarithms up to which scatter suffices
 CLOSER = 0.75  # skewness of logarithms over that of the values: below, the values look log-normal
 SHORTER = -0.6  # skewness of logarithms below which the far tail is shorter than that of a log-normal
@@ -158,6 +160,18 @@ def counted(
         mean_error=np.hypot(found.mean_error * skewed(first), of_mean),
         std_error=np.hypot(found.std_error * skewed(moved), further),
     )
+
+
+def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:
+    """Whether moments (m,) with a control are those of the samples without, within `APART` standard errors.
+
+    Standard deviations on a scale of logarithms: where samples show too little of one, its error is too small as well.
+    """
+    apart = np.abs(found.mean - plain.mean) <= APART * np.hypot(found.mean_error, plain.mean_error)
+    sizes = [np.maximum(np.maximum(one.std, one.std_error), np.finfo(float).tiny) for one in (found, plain)]
+    with np.errstate(invalid="ignore"):  # what is claimed to be unknown agrees with nothing
+        error = np.hypot(*(one.std_error / size for one, size in zip((found, plain), sizes, strict=True)))
+    return np.asarray(apart & (np.abs(np.log(sizes[0] / sizes[1])) <= APART * error))
 
 
 def with_tails(

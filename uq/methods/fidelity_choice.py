@@ -21,12 +21,14 @@ from uq.estimators.fidelities import Found, correlations
 from uq.estimators.moments import ratio
 from uq.estimators.quantiles import Quantiles, quantiles_of_chosen
 from uq.estimators.subsampled_difference import FLOOR, Chosen, Design, Pool, Pooled, choice
-from uq.estimators.tails import with_tails
+from uq.estimators.tails import concentration, with_tails
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Fidelities, Taken
 from uq.methods.fidelity_ways import FEWEST, UNLIMITED, Way
+from uq.surrogates.regression import tails_of
 
 TRIED = 60  # numbers of full solves
+UNSEEN = 4.0  # times the variance that a pilot predicts, where it has seen no tail
 OF_POOL = 0.5  # largest part of a pool that is chosen
 
 
@@ -128,6 +130,17 @@ class ByChoice(Way):
     def expected(self, cost: float) -> float:
         """Predict the largest relative variance of a mean once so much more is spent."""
         return self.best(cost).variance
+
+    @property
+    def unseen(self) -> float:
+        """Predicted variance, over that of even full solves, up to which these may be better for what no point shows.
+
+        Of bounded parameters points show the differences d: if the models miss as much as they differ, even full solves
+        have the variance E[d²], and these E[d]².
+        """
+        if tails_of(self._team.inputs).any():
+            return UNSEEN
+        return concentration(self._design().differences(self._pooled().cheap), 0.0)
 
     def needed(self, target: float) -> float:
         """Predict what has to be spent for a largest relative variance."""

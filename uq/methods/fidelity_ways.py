@@ -15,11 +15,11 @@ from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated
 from uq.estimators.moments import Estimates, Z, combine, controlled, either, estimate, monomials, ratio, student, term
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
-from uq.estimators.tails import influences, kurtosis, with_tails
+from uq.estimators.tails import agree, influences, kurtosis, with_tails
 from uq.methods.chaos import objection
 from uq.methods.fidelity_team import PILOT, Block, Fidelities
 from uq.surrogates.field_regression import Deviations, deviations
-from uq.surrogates.gate import agree, wrong
+from uq.surrogates.gate import wrong
 from uq.surrogates.outside_samples import beyond
 from uq.surrogates.regression import Regression, tails_of
 from uq.surrogates.taylor import Control, expansion

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 MOST_MODELS = 6  # cheap ones: 127 groups
 FEWEST = 8  # samples of a pilot
 SAMPLES, PER_MODEL = 16, 4  # samples of a pilot, and how many more for each cheap model
-UNSEEN = 4.0  # predicted variance, over that of even full solves, up to which those where models differ are taken
 BETTER = 0.8  # predicted variance, over that of the models, from which an expansion takes their place
 LITTLE = 0.01  # of what was spent: not worth another round
 MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
@@ -82,7 +81,7 @@ class Multifidelity(Amount):
         Which points the study's model is solved at: "differences", with probabilities that grow with the difference of
         the two cheap models that follow it best, so that it is asked where they are least to be trusted; "evenly", as
         any point. "auto": "differences", unless the pilot predicts for them four times the variance, since it has seen
-        no tails; with a single cheap model, evenly.
+        no tails (without tails: more times than they may save); with a single cheap model, evenly.
     quantiles
         Probabilities of the quantiles of the outputs.
     seed
@@ -222,8 +221,8 @@ class Multifidelity(Amount):
         if len(self.cheap) == 1 or self.full_solves == "evenly":
             return models
         choice = ByChoice(team, models.pilot, known=self.control != "none")
-        better = self.full_solves == "differences" or choice.expected(cost) <= UNSEEN * models.expected(cost)
-        return choice if better else models
+        worth = choice.unseen * models.expected(cost)
+        return choice if self.full_solves == "differences" or choice.expected(cost) <= worth else models
 
     def _left(self, team: Fidelities) -> float:
         """What may still be spent, in solves of the study's model."""

@@ -17,13 +17,13 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, Solution, SolveError, scattered
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
-from uq.estimators.tails import by_chance, counted, influences, of_influences, skewed
+from uq.estimators.tails import agree, by_chance, counted, influences, of_influences, skewed
 from uq.evaluation.request import Evaluate, FieldSum, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis
 from uq.surrogates.field_regression import Deviations
-from uq.surrogates.gate import agree, wrong
+from uq.surrogates.gate import wrong
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.outside_samples import Beyond, beyond, drawn_beyond
 from uq.surrogates.regression import tails_of

@@ -8,17 +8,34 @@ what a root *would* leave at these samples is known, and so is what an expansion
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.indices import shares
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis
+from uq.surrogates.basis import Basis, IntArray
 from uq.surrogates.least_squares import Data, left_out
 
 CLOSEST = 1e-12  # of the distance to an end, in coordinates: roots have no slope there
 DETERMINED = 1e-10  # least over largest size of a column beside those before it
 POINCARE = 4.0  # of an exponential quantity, the largest of the usual ones: of a normal 1, of a uniform one 1.2
+
+
+def towards_ends(
+    bounded: NDArray[np.bool_], linear: IntArray, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return directions (K, d) to ends of bounded parameters (d,), and of which outputs they are asked (K, m).
+
+    That is of all outputs along each parameter, and of each along its slope, by the linear functions (L, d) of an
+    expansion and their coefficients (L, m).
+    """
+    unit, own = np.eye(bounded.size)[bounded], np.eye(coefficients.shape[1])
+    along = coefficients.T @ (linear * bounded)
+    along = shares(along, np.linalg.norm(along, axis=1)[:, None])
+    directions = np.concatenate([unit, -unit, along, -along])
+    asked = np.concatenate([np.ones((2 * len(unit), len(own))), own, own])
+    return directions, asked * directions.any(axis=1)[:, None]
 
 
 def roots(

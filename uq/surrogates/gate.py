@@ -10,7 +10,8 @@ samples in turn (`repeated`), and an expansion c counts
 - by how much of the norm of c_k − c they do not show in bounded ranges, as next to a corner (`Trial.scaled`);
 - where there are no samples but those of the fit, by the moments of the c_k (`Trial.spread`);
 - with what it has beyond all samples (`uq.surrogates.outside_samples`): there it is a guess;
-- only if its mean and standard deviation are those of the plain samples, within their errors (`agree`).
+- only if its mean and standard deviation are those of the plain samples, within their errors
+  (`uq.estimators.tails.agree`).
 
 No solve is taken for it.
 """
@@ -21,11 +22,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from uq.estimators.indices import coefficient_moments, shares
-from uq.estimators.moments import Estimates
 from uq.surrogates.basis import Basis
 from uq.surrogates.least_squares import fit_best
 
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 PARTS = 5  # of the samples, each predicted by a fit to the others
 EXPLAINED = 3.0  # times their squared standard errors: differences up to there are explained by chance
 LEAST = 2  # fits that tell what others would be
-AGREE = 4.0  # standard errors between moments with a control and without
 
 
 @dataclass(frozen=True)
@@ -150,15 +148,3 @@ def wrong(differences: FloatArray, sizes: FloatArray | None = None) -> FloatArra
         off = sizes * off
         found = np.maximum(found, np.hypot(np.sqrt((off**2).mean(axis=0)), (K - 1) * off.mean(axis=0)))
     return np.where(explained, 0.0, found)
-
-
-def agree(found: Estimates, plain: Estimates) -> NDArray[np.bool_]:
-    """Whether moments (m,) with a control are those of the samples without, within `AGREE` standard errors.
-
-    Standard deviations on a scale of logarithms: where samples show too little of one, its error is too small as well.
-    """
-    apart = np.abs(found.mean - plain.mean) <= AGREE * np.hypot(found.mean_error, plain.mean_error)
-    sizes = [np.maximum(np.maximum(one.std, one.std_error), np.finfo(float).tiny) for one in (found, plain)]
-    with np.errstate(invalid="ignore"):  # what is claimed to be unknown agrees with nothing
-        error = np.hypot(*(one.std_error / size for one, size in zip((found, plain), sizes, strict=True)))
-    return np.asarray(apart & (np.abs(np.log(sizes[0] / sizes[1])) <= AGREE * error))

@@ -16,8 +16,8 @@ from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.doubts import of_constants, of_expansion, of_gradients, of_reach, of_shape, of_tails
 from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
-from uq.estimators.moments import Z, error_of_root, student
-from uq.estimators.tails import influences
+from uq.estimators.moments import Estimates, Z, either, error_of_root, estimate, monomials, student
+from uq.estimators.tails import agree, counted, influences
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -32,7 +32,7 @@ from uq.surrogates.basis import (
     recurrence,
     rows_of,
 )
-from uq.surrogates.edges import contradicted, roots
+from uq.surrogates.edges import contradicted, roots, towards_ends
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.outside_samples import Beyond, beyond
 
@@ -47,7 +47,7 @@ FEWEST = 10  # samples of which the outermost tell how tails begin, beside an ex
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
 SYMMETRIC = 0.01  # share of even powers up to which a function is odd, and the reverse
 PULLS = 2.0  # times the largest effect of such a function that is claimed, since others are missing too
-LEAST = 1 / 3  # of the norm that is missing: claimed whatever the functions that were looked at would do
+LEAST = 1 / 3  # of the norm that is missing: claimed of 64 samples whatever the functions looked at would do
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Regression:
         return np.sqrt(shares(self.fit.squares, least))
 
     def hidden(self, missing: FloatArray) -> FloatArray:
-        """Return errors (m,) of standard deviations by what a fit lacks in tails: that itself (m,) of many parameters.
+        """Return errors (m,) of standard deviations by what a fit lacks in tails, of norms `missing` (m,).
 
         If a function ψ of norm 1 that the basis lacks is part of an output with the norm t, then the fit leaves it out,
         and its coefficients c take up what of ψ looks like the basis at the samples: with the columns A = QR of the
@@ -181,17 +181,22 @@ class Regression:
         t²/(2σ). For t stands the most that the residuals allow, see `missing`.
         """
         tails, basis, data, fit = tails_of(self.inputs), self.basis, self.data, self.fit
-        if tails.size > FULL or self.inputs.draws is not None:
+        if self.inputs.draws is not None:
             return missing
-        following = orthonormal(self.inputs, np.array(list(_neighbours(basis.indices, tails))))
-        moved, sizes = self._taken_up(data.left(following))
         varying = (basis.indices != 0).any(axis=1)
         c = fit.coefficients[varying]
         std = np.linalg.norm(c, axis=0)
+        # Of many parameters those that matter most.
+        matter = shares(c**2, std**2).sum(axis=1) @ (basis.indices[varying] > 0)
+        most, partners = (np.argsort(-np.where(some, matter, -1.0), kind="stable")[:FULL] for some in (tails, True))
+        tails &= np.isin(np.arange(tails.size), most)
+        following = orthonormal(self.inputs, np.array(list(_neighbours(basis.indices, tails, partners))))
+        moved, sizes = self._taken_up(data.left(following))
         pulls = np.abs(shares(moved[varying].T @ c, std))
         norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
         largest = (norms * pulls).max(axis=0)
-        return np.asarray(np.sqrt((PULLS * largest) ** 2 + (LEAST * missing) ** 2 + shares(missing**2, std) ** 2))
+        least = LEAST * min(1.0, (64 / len(data.points)) ** 0.5)  # points integrate a product the better, the more
+        return np.asarray(np.sqrt((PULLS * largest) ** 2 + (least * missing) ** 2 + shares(missing**2, std) ** 2))
 
     def edges(self) -> FloatArray:
         """Return errors (2, m) of means and standard deviations by a root at an end of ranges, as large as may be.
@@ -204,11 +209,7 @@ class Regression:
         bounded, first = ~tails_of(inputs), basis.indices.sum(axis=1) == 1
         if not bounded.any():
             return np.zeros((2, fit.loo.size))
-        unit, own = np.eye(bounded.size)[bounded], np.eye(fit.loo.size)
-        along = fit.coefficients[first].T @ (basis.indices[first] * bounded)
-        along = shares(along, np.linalg.norm(along, axis=1)[:, None])
-        directions = np.concatenate([unit, -unit, along, -along])
-        asked = np.concatenate([np.ones((2 * len(unit), len(own))), own, own]) * directions.any(axis=1)[:, None]
+        directions, asked = towards_ends(bounded, basis.indices[first], fit.coefficients[first])
         drawn = inputs.points(sobol_points(0, 0, 0, POINTS, bounded.size))
         (values, slopes), (everywhere, _) = (
             roots(inputs, basis.coordinates, points, directions) for points in (self.data.points, drawn)
@@ -219,8 +220,7 @@ class Regression:
         left, c = everywhere - functions @ taken, fit.coefficients[varying]
         of_std = shares(left.T @ (functions[:, varying] @ c) / POINTS, np.linalg.norm(c, axis=0))
         norms = asked * np.sqrt(shares(fit.squares, sizes[:, None]))
-        pulls = left.mean(axis=0)[:, None], of_std
-        return np.array([(norms * np.abs(pull)).max(axis=0) for pull in pulls])
+        return np.array([(norms * np.abs(pull)).max(axis=0) for pull in (left.mean(axis=0)[:, None], of_std)])
 
     def _taken_up(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what fits to other functions have for coefficients (P, K), and what they leave: sums of squares (K,).
@@ -247,12 +247,11 @@ class Regression:
         those of the jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for
         each parameter it is the jackknife's.
 
-        Next to the ends of ranges few samples show little, and what a root there would do is an error too (`edges`).
-
+        Next to the ends of ranges few samples show little: what a root there would do is an error too (`edges`).
         None of this sees what lies outside the basis. So there are other estimates too, from the samples, each with the
         fit without it as control (`_unseen`): half the distance to them counts as an error, and for the standard
         deviation the residual variance λ², λ the leave-one-out error. Above `ROUGH` their error counts for the mean,
-        and above `TRUSTED` they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
+        and above `TRUSTED` samples tell, not the fit (`_of_samples`; docs/decisions/0011-claims-of-expansions.md).
 
         In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have
         tails, the norm of what is `missing` there is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, or
@@ -268,12 +267,12 @@ class Regression:
         left_out = of(np.swapaxes(fit.without, 1, 2), largest)
         groups, n = len(fit.without), len(fit.unseen)
         seen = self._unseen()
-        trusted = fit.relative <= TRUSTED
+        sampled, trusted = self._of_samples(seen).named, ~self.controlled
         cautious = missing is not None
         beyond_samples = np.zeros_like(fit.loo) if missing is None else missing
         tails = np.maximum(fit.loo, beyond_samples) if cautious else beyond_samples
         bias = shares(fit.loo**2, 2 * central["std"])
-        whole: FloatArray = np.where(trusted, central["std"], seen["std"])
+        whole: FloatArray = np.where(trusted, central["std"], sampled["std"])
         share = shares(fit.loo**2, whole**2)
         # The norm of what a fit may leave beyond λ, which n samples know to λ√(κ/n), κ the kurtosis of the errors at
         # samples that are left out: few of them decide λ where a function grows towards an end of a range, and there it
@@ -284,15 +283,15 @@ class Regression:
             "mean": np.sqrt(
                 np.maximum(tails, unsure) ** 2 / n
                 + edges[0] ** 2
-                + (seen["mean"] - central["mean"]) ** 2 / 4
-                + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
+                + (seen.mean - central["mean"]) ** 2 / 4
+                + np.where(fit.relative > ROUGH, seen.mean_error, 0.0) ** 2
             ),
             "std": np.sqrt(
                 (beyond_samples if hidden is None else hidden) ** 2
                 + unsure**2
                 + bias**2
                 + edges[1] ** 2
-                + (seen["std"] - central["std"]) ** 2 / 4
+                + (seen.std - central["std"]) ** 2 / 4
             ),
         }
         for name, values in left_out.items():
@@ -300,11 +299,8 @@ class Regression:
             if name == "mean" and not cautious and n > 2 * largest.shape[1]:
                 spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
             if name in further:
-                known = np.hypot(seen[f"{name}_error"], tails if name == "std" else 0.0)
-                if name == "mean":
-                    known = np.maximum(known, np.hypot(spread, tails / np.sqrt(n)))
-                central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), known)
-                central[name] = np.where(trusted, central[name], seen[name])
+                central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), sampled[f"{name}_error"])
+                central[name] = np.where(trusted, central[name], sampled[name])
             else:
                 by_index = (-1, *(1,) * (spread.ndim - 1))
                 something = (fit.relative <= NOTHING).reshape(by_index)
@@ -312,7 +308,24 @@ class Regression:
                 central[name] = np.where(something, central[name], np.nan)
         return central
 
-    def _unseen(self) -> dict[str, FloatArray]:
+    def _of_samples(self, seen: Estimates) -> Estimates:
+        """Moments from samples with fits as controls, as in `_unseen`, or from plain ones, with their standard errors.
+
+        Beyond the samples a fit may have any moments, as one of a high order in a tail does. So those with fits count
+        only if they agree with the plain ones, and then the distance to these is an error too.
+        """
+        data = self.data
+        if np.ptp(data.weights) > 0:  # of a projection there are no plain samples
+            return replace(seen, std_error=np.hypot(seen.std_error, self.fit.loo))
+        middle = data.values.mean(axis=0)
+        plain: Estimates = estimate(monomials(data.values - middle, None).sum(axis=1), len(data.values), middle)
+        plain = counted(plain, self.inputs, data.values)
+        seen = counted(seen, self.inputs, data.values, self._unseen_samples()[:2])
+        errors = np.hypot(seen.mean_error, seen.mean - plain.mean), np.hypot(seen.std_error, seen.std - plain.std)
+        apart = replace(seen, mean_error=errors[0], std_error=errors[1])
+        return either(agree(seen, plain), apart, plain)
+
+    def _unseen(self) -> Estimates:
         """Moments by output from the samples, each with the fit without it as control, and their standard errors.
 
         With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and likewise for the square: unbiased
@@ -329,12 +342,8 @@ class Regression:
         variance = (weights * second).sum(axis=0)
         variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
         std = np.sqrt(np.maximum(variance + mean_error**2, 0.0))
-        return {
-            "mean": offset + mean,
-            "mean_error": mean_error,
-            "std": std,
-            "std_error": error_of_root(std, variance_error),
-        }
+        one = np.ones_like(mean)
+        return Estimates(offset + mean, mean_error, std, error_of_root(std, variance_error), one, one)
 
     def _unseen_samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Samples (n, m) of both moments of deviations from values (m,), each with the fit without it as control."""
@@ -424,17 +433,17 @@ def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, F
     return plain, np.sqrt(draws.weights @ left**2)
 
 
-def _neighbours(indices: IntArray, tails: NDArray[np.bool_]) -> Iterator[IntArray]:
+def _neighbours(indices: IntArray, tails: BoolArray, partners: IntArray) -> Iterator[IntArray]:
     """Go through powers (d,) that a basis (P, d) lacks: the next two of a parameter with a tail, alone and in products.
 
-    Products are with one other parameter; with another tail, of what is the highest power alone too.
+    Products are with one of the partners; with another tail, of what is the highest power alone too.
     """
     known = {tuple(row) for row in indices.tolist()}
     unit = np.eye(indices.shape[1], dtype=np.int64)
     for i in np.flatnonzero(tails):
         following = int(indices[:, i].max()) + 1
         found = [following * unit[i], (following + 1) * unit[i]]
-        for j in np.flatnonzero(np.arange(len(tails)) != i):
+        for j in partners[partners != i]:
             found.append(following * unit[i] + unit[j])
             if tails[j]:
                 found.append(max(following - 1, 1) * unit[i] + unit[j])

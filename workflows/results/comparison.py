@@ -178,6 +178,7 @@ def doubts_of_selection(
         draws = of["point"].sel(parameter=names).transpose("point", "parameter").to_numpy()
         draws = draws[resampled(weights, DRAWS, 0)]
         found = criticism.at_an_end(inputs.marginals, mode, draws, units.get(best, {}))
+        found += criticism.heavy_tails(names, of["constant_outermost"].sel(parameter=names).to_numpy())
         found += criticism.far_from_prior(inputs.marginals, mode, mean, 0.0, 0.0, units.get(best, {}))
         here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
         rows = dataset.isel(output=here)

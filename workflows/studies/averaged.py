@@ -138,9 +138,11 @@ class AveragedStudy(Study):
             space: Any = model.space
             mesh = (space.coordinates, *space.cells())
 
+        of_outputs = {name: units[name] for name in model.outputs}
+
         def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
             for one, several in evaluations.items():
-                told = failure_domain.findings(parts[one].inputs, several, continued=False)
+                told = failure_domain.findings(parts[one].inputs, several, of_outputs, continued=False)
                 add(found, *(finding.of(f"Candidate '{one}'") for finding in told))
             return with_unknown_meshes(self, found)
 

@@ -243,6 +243,7 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found += criticism.little_seen(*stiffness)
     else:
         priors = dict(study.inputs.marginals)
+        found += criticism.heavy_tails(names, one["outermost"].to_numpy())
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
     found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
     seen = np.isfinite(one["measured"].to_numpy())

@@ -72,8 +72,10 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     }
     model: Any = study.spec.build(ensemble.group, inputs.names)
 
+    of_outputs = {name: units[name] for name in model.outputs}
+
     def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        found = with_unknown_meshes(study, _with_stability(study, found, evaluations["/"]))
+        found = with_unknown_meshes(study, _with_stability(study, found, evaluations["/"], of_outputs))
         return adapted_mesh.with_history(study, found) if study.model.adaptive else found
 
     made = partial(MethodJob, model, others, task, recorders, told=told, finished=finished)
@@ -185,10 +187,12 @@ def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) ->
     return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
-def _with_stability(study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+def _with_stability(
+    study: SamplingBlocks, dataset: xr.Dataset, evaluations: Evaluations, units: Mapping[str, str]
+) -> xr.Dataset:
     """Add how the stability of each sample was tested, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
-    add(dataset, *failure_domain.findings(study.inputs, evaluations, continued=continued))
+    add(dataset, *failure_domain.findings(study.inputs, evaluations, units, continued=continued))
     if not failure_domain.counts([evaluations]):
         return dataset
     if "points" in dataset and dataset.points.dims == ("sample", "parameter"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from scipy.linalg import eigh
+from scipy.stats import binom
 
 from benchmarks import buckling
 from forward.hyperelastic import Hyperelastic
@@ -262,6 +263,10 @@ def evaluations(points, refused, known=None):
     )
 
 
+UNITS = {"W": "J"}
+CODES = "no-stable-state", "answers-missing"
+
+
 @pytest.fixture(scope="module")
 def inputs():
     return Inputs(buckling.uniform(loads_traction_size=(80, 150), material_C1=(0.5e4, 1.5e4)))
@@ -275,12 +280,12 @@ def test_where_a_branch_ends_is_found(inputs):
         (C1 < 7e3, r"all with material.C1 ≤ 69\d\d(\.\d)?, none with material.C1 ≥ 7\d\d\d"),
         (load / C1 > 1.3e-2, r"− 0\.\d+ |^all with .*material.C1"),
     ):
-        found = list(failure_domain.findings(inputs, evaluations(points, refused), continued=False))
-        assert [one.severity for one in found] == ["warning"]
+        found = list(failure_domain.findings(inputs, evaluations(points, refused), UNITS, continued=False))
+        assert [(one.code, one.severity) for one in found] == [(code, "warning") for code in CODES]
         assert f"{refused.sum()} of 200 samples have no stable equilibrium" in found[0].text
         where = failure_domain.separated(inputs, points, refused, ~refused)
         assert re.search(expected, where), where
-    (one,) = failure_domain.findings(inputs, evaluations(points, load > 120), continued=True)
+    one, _ = failure_domain.findings(inputs, evaluations(points, load > 120), UNITS, continued=True)
     assert one.severity == "error"
     assert "expansion" in one.text
     # A half-space of both parameters that no bound of one can tell.
@@ -303,7 +308,7 @@ def test_loads_that_follow_the_body_are_named():
 def test_without_refusals_nothing_is_said(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     none = np.zeros(20, dtype=bool)
-    assert list(failure_domain.findings(inputs, evaluations(points, none), continued=True)) == []
+    assert list(failure_domain.findings(inputs, evaluations(points, none), UNITS, continued=True)) == []
     untested = evaluations(points, none, np.zeros(20, dtype=np.int8))
     assert failure_domain.counts([untested]) == {}
     assert failure_domain.counts([evaluations(points, none)])["screened"] == 20
@@ -316,7 +321,7 @@ def test_where_solves_failed_is_found(inputs, continued, words):
     points = inputs.points(random_points(0, 0, 60, 2))
     failed = points[:, 0] > 120
     states = evaluations(points, failed, np.zeros(60, dtype=np.int8))
-    (one,) = failure_domain.findings(inputs, states, continued=continued)
+    one, _ = failure_domain.findings(inputs, states, UNITS, continued=continued)
     assert one.severity == "warning"
     assert f"{failed.sum()} of 60 samples have no answer: all with loads.traction.size ≥ 12" in one.text
     assert words in one.text
@@ -326,16 +331,39 @@ def test_failures_here_and_there_have_no_bound(inputs):
     points = inputs.points(random_points(0, 0, 60, 2))
     failed = np.sin(37 * points[:, 0]) > 0.5
     said = failure_domain.separated(inputs, points, failed, ~failed)
-    assert said == "no bound on the parameters separates them from the others"
+    place = f"loads.traction.size = {points[failed][0, 0]:.5g}"
+    assert said.startswith("no bound on the parameters separates them from the others; the first is at ")
+    assert place in said
+    by_chance = [np.random.default_rng(seed).permutation(60) < 3 for seed in range(40)]
+    said = [failure_domain.separated(inputs, points, failed, ~failed) for failed in by_chance]
+    told = sum(not one.startswith("no bound") for one in said)  # each of two kinds once in forty, by chance
+    assert binom.sf(told - 1, 40, 2 / 40) > 1e-3
+
+
+def test_what_is_missing_bounds_the_whole(inputs):
+    """Where missing outputs lie in the range of the others, the mean and the median of all are where it says."""
+    held, shares = [], []
+    for seed in range(20):
+        points = inputs.points(random_points(seed, 0, 100, 2))
+        load, refused = points[:, 0], points[:, 0] > 130
+        found = replace(evaluations(points, refused), outputs=np.where(refused, np.nan, abs(load - 115))[:, None])
+        (one,) = [one for one in failure_domain.findings(inputs, found, {"u": "1"}, continued=False) if one.about]
+        assert one.code == "answers-missing"
+        ends = np.array(re.findall(r"[\d.]+", one.about[0].words), dtype=float).reshape(2, 2)
+        held.append((ends[:, 0] <= 17.5) & (ends[:, 1] >= 17.5))
+        shares.append(one.values["most"])
+    assert np.all(binom.cdf(np.sum(held, axis=0), 20, 0.95) > 1e-3)
+    assert binom.cdf(np.sum(np.array(shares) > 2 / 7), 20, 0.975) > 1e-3  # 20 of 70 Pa are missing
 
 
 def test_what_the_screen_missed_is_an_error(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     refused = np.arange(20) < 2
     known = np.where(refused, [Stability.MISSED], [Stability.SCREENED]).astype(np.int8)
-    texts = list(failure_domain.findings(inputs, evaluations(points, refused, known), continued=False))
-    assert [one.severity for one in texts] == ["warning", "error"]
-    assert "2 unstable equilibria" in texts[1].text
+    texts = list(failure_domain.findings(inputs, evaluations(points, refused, known), UNITS, continued=False))
+    assert [one.code for one in texts] == [*CODES, "screen-missed"]
+    assert texts[-1].severity == "error"
+    assert "2 unstable equilibria" in texts[-1].text
 
 
 def test_samples_get_what_is_known_of_them(inputs):

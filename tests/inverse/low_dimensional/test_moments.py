@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr, ndtri
 
 from forward.pointwise import FunctionModel
-from inverse.criticism.assessment import Assessment, answer
+from inverse.criticism.assessment import Assessment, answer, by_points, even
+from inverse.criticism.doubts import HEAVY, heavy_tails
 from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
-from uq.inputs.distributions import Normal, Uniform
+from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
 CELLS = 2000
@@ -80,3 +82,24 @@ def test_what_a_polynomial_misses_is_not_believed():
     torn = Posterior(one.inputs, SerialEvaluate(jump), one.data, one.noise)
     found = evidence(torn, laplace(torn), 256)
     assert not found.agreed
+
+
+def test_deviations_that_rest_on_a_tail_are_doubted():
+    """A datum that bounds nothing above leaves the tail of a log-normal prior; a normal quantity has 8 % out there."""
+    z = ndtri((np.arange(100_000) + 0.5) / 100_000)
+    known = by_points("points", np.column_stack([z, np.exp(0.58 * z), np.exp(1.5 * z)]), even(len(z)))
+    edge = ndtri(0.995)
+    normal = 2 * (edge * np.exp(-(edge**2) / 2) / np.sqrt(2 * np.pi) + ndtr(-edge))
+    np.testing.assert_allclose(known.outermost[:2], [normal, HEAVY], atol=0.01)
+    found = heavy_tails(["a", "b", "c"], known.outermost + np.array([0, 0.02, 0]))
+    assert [(one.values["name"], one.severity) for one in found] == [("b", "note"), ("c", "warning")]
+    priors = {"a": LogNormal(mean=5, std=20)}
+    model = FunctionModel(saturating_at_five, ("a",), ("y",), lambda p: np.array([[5 / (5 + p[0]) ** 2]]))
+    of = Posterior(Inputs(priors), SerialEvaluate(model), np.array([0.5]), Noise(np.array([0.4])))
+    gaussian = laplace(of)
+    (one,) = heavy_tails(of.names, answer(of, Assessment(gaussian, evidence(of, gaussian, 256))).outermost)
+    assert one.severity == "warning"
+
+
+def saturating_at_five(p):
+    return p / (5 + p)

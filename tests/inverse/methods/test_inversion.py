@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from mpi4py import MPI
+from scipy.special import chdtri
 
 import inverse.methods.invert_field
 from benchmarks import buckling
@@ -140,8 +141,9 @@ def test_what_is_left_is_of_chains_that_have_mixed(kind):
     exact, covariance = exactly(np.arange(12))
     std = np.sqrt(np.diag(covariance))
     assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
-    assert record["chain_rhat"] < 1.01
     assert record["chain_effective"] > 400
+    halves = 2 * record["chains"]  # R̂ of chains that agree: less by chance in 99 runs of a hundred, of three quantities
+    assert record["chain_rhat"] < max(1.01, np.sqrt(1 + chdtri(halves - 1, 0.01 / 3) / (halves - 1) * halves / 400))
     np.testing.assert_allclose(record["mean"], exact, atol=0.15 * std.min())
     np.testing.assert_allclose(record["std"], std, rtol=0.1)
     np.testing.assert_allclose((record["upper"] - record["lower"]) / std, 2 * 1.96, rtol=0.1)
@@ -782,8 +784,9 @@ def shipped(name, out, code):
 
 @pytest.mark.slow
 def test_the_shipped_inclusion_is_recovered(tmp_path):
-    # Data of graded tetrahedra: the mesh errs by as much as the noise, and is corrected. 64 points are too few.
-    found = shipped("inclusion", tmp_path / "out", 3).isel(data_set=0)
+    # Data of graded tetrahedra: the mesh errs by as much as the noise, and is corrected. Few points of the prior have
+    # large weights, which a polynomial tells too.
+    found = shipped("inclusion", tmp_path / "out", 0).isel(data_set=0)
     assert bool(found["mesh_corrected"])
     assert "mesh" not in str(found["why"].item())
     assert float(np.sqrt((found["mesh_error"] ** 2).mean())) == pytest.approx(1.1, abs=0.1)

@@ -220,8 +220,19 @@ def test_full_solves_are_even_where_the_difference_tells_nothing():
     models = team(wave(0.29, 0.1), wave(0, 0.3))
     data = Multifidelity(samples=60, cheap=cheap(0.5, 0.001), control="none").run(INPUTS, models)
     assert not data["group_chosen"].values.any()
+    # And of a wave no point is worth much more than others.
+    data = Multifidelity(samples=256, cheap=cheap(0.05, 0.002), control="none").run(
+        INPUTS, team(wave(0.27, 0.1), wave(0, 0.3))
+    )
+    assert not data["group_chosen"].values.any()
     with pytest.raises(ValidationError, match="with a single cheap model, expected two or more"):
         Multifidelity(samples=60, cheap=cheap(0.5), full_solves="differences")
+
+
+def test_full_solves_are_chosen_where_few_points_decide():
+    own, *others = cut(0.0, 0.02, 0.06)
+    data = Multifidelity(samples=60, cheap=cheap(0.01, 0.005), control="none").run(INPUTS, team(*others, own=own))
+    assert data["group_chosen"].values.any()
 
 
 def test_a_pilot_that_does_not_count_chooses_too():

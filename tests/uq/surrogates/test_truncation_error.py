@@ -38,7 +38,46 @@ def test_what_a_missing_function_does_to_the_standard_deviation_is_claimed_and_n
 @pytest.mark.unit
 def test_powers_that_a_basis_lacks():
     basis = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1]])
-    tails = np.array([True, False])
-    assert [tuple(one) for one in regression._neighbours(basis, tails)] == [(3, 0), (4, 0), (3, 1)]
-    both = {tuple(one) for one in regression._neighbours(basis, np.array([True, True]))}
-    assert both == {(3, 0), (4, 0), (3, 1), (2, 1), (0, 2), (0, 3), (1, 2)}
+    tails, both = np.array([True, False]), np.arange(2)
+    assert [tuple(one) for one in regression._neighbours(basis, tails, both)] == [(3, 0), (4, 0), (3, 1)]
+    found = {tuple(one) for one in regression._neighbours(basis, np.array([True, True]), both)}
+    assert found == {(3, 0), (4, 0), (3, 1), (2, 1), (0, 2), (0, 3), (1, 2)}
+
+
+def of_values(function, d, samples, seeds):
+    """Mean, std and their errors (seeds, 4) from values at points of d normal quantities; whether fits are rough."""
+    inputs = Inputs({f"z{i}": Normal(mean=0.0, std=1.0) for i in range(d)})
+    rows, rough = [], []
+    for seed in range(seeds):
+        points = inputs.points(sobol_points(seed, 0, 0, samples, d))
+        fitted = Regression.of(inputs, points, function(points)[:, None], None, None)
+        found = fitted.estimates()
+        rough.append(fitted.controlled[0])
+        rows.append([found[name][0] for name in ("mean", "mean_error", "std", "std_error")])
+    return np.array(rows), np.array(rough)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("rate", [1.0, 0.1])  # of their expansions 0.7 and 0.02 are left
+def test_deviations_of_many_normals_are_claimed_within_ten_errors(rate):
+    d, seeds = 30, 5
+    direction = np.arange(1, d + 1) ** -0.5
+    direction *= rate / np.linalg.norm(direction)
+    _, _, std, error = of_values(lambda z: np.sin(z @ direction + 0.5), d, 120, seeds)[0].T
+    shrunk = np.exp(-(rate**2))
+    off = std - np.sqrt((1 - shrunk**2 * np.cos(1.0)) / 2 - shrunk * np.sin(0.5) ** 2)
+    assert (abs(off) < 1.96 * error).all()
+    assert np.median(error) < 10 * np.sqrt((off**2).mean())
+
+
+@pytest.mark.unit
+def test_a_fit_that_goes_wrong_beyond_its_samples_gives_way_to_these():
+    found, rough = of_values(lambda z: z[:, 0] * np.sin(3 * z[:, 0]), 1, 32, 16)
+    mean, mean_error, std, std_error = found[rough].T
+    assert rough.sum() > 12
+    second = 0.5 * (1 + 35 * np.exp(-18.0))  # E[z² (1 − cos 6z)]/2
+    exact = 3 * np.exp(-4.5)
+    assert (abs(mean - exact) < 1.96 * mean_error).mean() > 0.8
+    off = std - np.sqrt(second - exact**2)
+    assert (abs(off) < 1.96 * std_error).mean() > 0.8
+    assert abs(off).max() < 0.5

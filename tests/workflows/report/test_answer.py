@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from scipy import integrate, stats
 
-from forward.readable import interval, percent, quantity, rounded, scale, size, spoken
+from forward.readable import and_error, interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import SVG, solve, study, study_of, write
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
@@ -39,10 +39,13 @@ def undrawn(monkeypatch):
         (0.0, 0.0, "m", "0 m"),
         (0.99999, 1e-6, "m", "99.9990 cm"),
         (float("nan"), 1.0, "m", "–"),
+        (0.0012345678, float("inf"), "m", "1.2 mm"),
     ],
 )
 def test_numbers_are_read_without_counting_zeros(value, error, unit, text):
     assert quantity(value, error, unit).replace("\u00a0", " ") == text
+    if error == float("inf"):
+        assert and_error(value, error, unit).replace("\u00a0", " ") == "1.2 ± ∞ mm"
 
 
 def test_units_fit_over_thirty_powers_of_ten():

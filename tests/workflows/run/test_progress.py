@@ -81,7 +81,11 @@ def test_time_left_falls_while_nothing_ends(clock):
     shown = expecting(100)
     counted(shown, clock, *[(3.0, 1, 0)] * 20)
     assert watch.line(shown.state, clock.now + 60) == "20/100 solves, 0.333 per second, 3:00 left"
-    assert watch.line(shown.state, clock.now + 600) == "20/100 solves, 0.333 per second, 0:00 left"
+    assert watch.line(shown.state, clock.now + 600) == "20/100 solves, 0.333 per second, time left not known yet"
+    counted(shown, clock, *[(3.0, 1, 0)] * 80)
+    shown._phases = (("weighting points", clock.now),)
+    said = "100/100 solves, 0.333 per second, time left not known yet; weighting points (1:00)"
+    assert watch.line(shown.state, clock.now + 60) == said
 
 
 @pytest.mark.unit
