@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
 UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance for a warning, an error
 END, CROWDED = 0.02, 5.0  # share of the prior at an end of a range, and how many times that the posterior has there
-HEAVY = (
-    0.25  # share of a variance from 1 % of the probability: below, deviations were right to 4 %, above off by a third
-)
+HEAVY = 0.25  # share of a variance that 1 % of the probability makes, above which deviations were off by a third
 NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data above which the model explains nothing
 STRANGE = 0.01  # probability that any of all data is as far out as an outlier
