@@ -94,6 +94,8 @@ class _Client:
         When it last said something, by the monotonic clock.
     known
         Whether it has said its first line.
+    asked
+        Whether it has asked for a frame.
     rest
         What came of a line that is not complete.
     unsent
@@ -104,6 +106,7 @@ class _Client:
 
     heard: float
     known: bool = False
+    asked: bool = False
     rest: bytes = b""
     unsent: bytes = b""
     skipping: bool = False
@@ -200,7 +203,7 @@ class Loop:
             client, _ = listening.accept()
         except OSError as error:
             if error.errno in {errno.EMFILE, errno.ENFILE}:  # there is room for it once another one has left
-                self._leave(min(self._clients, key=lambda one: self._clients[one].heard, default=None))
+                self._leave(min(self._clients, key=self._stays, default=None))
                 time.sleep(REST)
             return  # or else it has gone again
         client.setblocking(False)
@@ -210,7 +213,8 @@ class Loop:
         self._selector.register(client, selectors.EVENT_READ, self._read)
         if self._token is None:
             self._send(client, [self.greeting()])
-        self._make_room(STRANGERS, known=False)
+        if client in self._clients:  # it has not gone meanwhile
+            self._make_room(client, STRANGERS)
 
     def _read(self, client: socket.socket) -> None:
         one = self._clients.get(client)
@@ -244,11 +248,11 @@ class Loop:
                 self._leave(client)
                 return
             one.known, one.heard = True, time.monotonic()
-            self._make_room(CLIENTS, known=True)
+            self._make_room(client, CLIENTS)
             answers = [] if self._token is None else [self.greeting()]
             lines[:1] = first
         if lines:
-            one.heard = time.monotonic()
+            one.asked, one.heard = True, time.monotonic()
         answers += [self.answer(line, late=k < len(lines)) for k, line in enumerate(lines, 1)]
         if len(one.rest) > LONGEST:
             answers.append({"error": f"a line of more than {LONGEST} bytes, expected a table of numbers"})
@@ -266,11 +270,17 @@ class Loop:
             return f'expected {{"token": "..."}} first, with what is in {place()} where `tissuq live` runs', []
         return "", [json.dumps(table).encode()] if table or given is None else []
 
-    def _make_room(self, most: int, *, known: bool) -> None:
-        """Have the one leave that has been silent for longest, where there are more than this number of its kind."""
-        kind = [client for client, one in self._clients.items() if one.known == known]
-        if len(kind) > most:
-            self._leave(min(kind, key=lambda client: self._clients[client].heard))
+    def _make_room(self, new: socket.socket, most: int) -> None:
+        """Have another one leave of the kind of a new one, of which there are at most so many."""
+        known = self._clients[new].known
+        kind = [client for client, one in self._clients.items() if one.known == known and client is not new]
+        if len(kind) >= most:
+            self._leave(min(kind, key=self._stays))
+
+    def _stays(self, client: socket.socket) -> tuple[bool, bool, float]:
+        """Of two clients the one with the smaller leaves: strangers, those who never asked, the longest silent."""
+        one = self._clients[client]
+        return one.known, one.asked, one.heard
 
     def _dismiss(self) -> None:
         """Have those leave that were to say a token and have said nothing."""

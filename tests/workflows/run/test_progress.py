@@ -186,7 +186,7 @@ def test_the_command_shows_life_though_quiet(tmp_path, ranks):
     (tmp_path / "study.toml").write_text(STUDY)
     done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     assert (done.returncode, done.stdout) == (0, "")
-    of_solves = r"(\d+)/4\d solves(, (.* per second, .* left|time left not known yet))?"
+    of_solves = r"(\d+)/4\d solves(, (.* per second, )?(.* left|time left not known yet))?"
     shown = re.compile(rf"({of_solves}; )?(\D+ \(0:\d\d\)(: )?)+|({of_solves}|at work)")
     lines = done.stderr.splitlines()
     assert all(shown.fullmatch(line) for line in lines), done.stderr
