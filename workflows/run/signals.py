@@ -19,19 +19,15 @@ SECONDS_TO_ABORT = 2.0
 def heed() -> None:
     """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
 
-    A single process raises KeyboardInterrupt. Of several ranks the first prints the line and ends the job from a
-    separate thread, since MPI waits without ever returning to Python, and `mpirun` kills a second later. The others die
-    from the signal at once, wherever they are, and the job with them.
+    A single process raises KeyboardInterrupt. Of several ranks the first prints the line; each ends the job from a
+    separate thread, since MPI waits without ever returning to Python. No rank dies at once: `mpirun`, which signals
+    all of them, would then kill the others at once too, before the line is printed, in place of a second later.
     """
     from mpi4py import MPI
 
     world = MPI.COMM_WORLD
     if world.size == 1:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return
-    if world.rank > 0:
-        for number in ENDING:
-            signal.signal(number, signal.SIG_DFL)
         return
     read, write = os.pipe()
     os.set_blocking(write, False)
@@ -44,8 +40,9 @@ def heed() -> None:
 def _wait(pipe: int, world: Any) -> None:
     while os.read(pipe, 1)[0] not in ENDING:
         pass
-    sys.stderr.write(f"{INTERRUPTED}\n")
-    sys.stderr.flush()
+    if world.rank == 0:
+        sys.stderr.write(f"{INTERRUPTED}\n")
+        sys.stderr.flush()
     time.sleep(SECONDS_FOR_OTHERS)
     fallback = Timer(SECONDS_TO_ABORT, os._exit, [1])
     fallback.daemon = True

@@ -28,9 +28,8 @@ def pace(state: dict[str, Any], now: float) -> str:
     found = [UNKNOWN] if state["done"] < state["planned"] else []
     if state["rate"]:
         left = (state["planned"] - state["done"]) / state["rate"] - (now - state["at"])
-        known = left > 0 or not (
-            state["phases"] or state["done"] < state["planned"]
-        )  # else it takes longer than thought
+        at_work = state["phases"] or state["done"] < state["planned"]
+        known = left > 0 or not at_work  # else it takes longer than thought
         found = [f"{state['rate']:.3g} per second", f"{clock(max(left, 0.0))} left" if known else UNKNOWN]
     return ", ".join(found + [f"{state['failed']} failed"] * (state["failed"] > 0))
 
