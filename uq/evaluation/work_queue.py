@@ -22,7 +22,7 @@ from forward.model import ModelError, SolveError
 T = TypeVar("T")
 # Told how many solves finished, and failed, since the last call; none and none: what follows has other costs.
 Progress = Callable[[int, int], None]
-_RESULT = 1
+_RESULT, _END = 1, 2  # tags: of results, and of a rank that ends the job
 SHORTEST, SHARE, LONGEST = 1e-5, 1.1, 0.01  # pauses (s) while waiting: about a tenth of what one has waited
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results
 
@@ -211,13 +211,23 @@ def abort_all(world: Any) -> Iterator[None]:
 
 
 def end_job(world: Any, error: BaseException) -> None:
-    """End the job of all ranks with exit code 1 for an exception of this rank, in one line if it has a reason."""
+    """End the job of all ranks with exit code 1 for an exception of this rank, in one line if it has a reason.
+
+    The others are told first, so that of ranks that fail in the same way one says so.
+    """
     reason = str(error) if isinstance(error, ModelError | SolveError) else reason_to_stop(error)
-    # If all ranks fail in the same way, the first one to report ends the others.
     time.sleep(min(0.1 * world.rank, 1.0))
-    if reason is None:
-        traceback.print_exception(error)
-    else:
-        sys.stderr.write(f"{'' if isinstance(error, KeyboardInterrupt) else 'failed: '}{reason}\n")
-    sys.stderr.flush()
+    if not is_ending():
+        told = [MPI.COMM_WORLD.isend(None, rank, _END) for rank in range(MPI.COMM_WORLD.size)]
+        if reason is None:
+            traceback.print_exception(error)
+        else:
+            sys.stderr.write(f"{'' if isinstance(error, KeyboardInterrupt) else 'failed: '}{reason}\n")
+        sys.stderr.flush()
+        MPI.Request.Testall(told)
     world.Abort(1)
+
+
+def is_ending() -> bool:
+    """Whether a rank has said that it ends the job."""
+    return bool(MPI.COMM_WORLD.iprobe(MPI.ANY_SOURCE, _END))

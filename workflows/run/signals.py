@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from threading import Thread, Timer
 from typing import Any
 
@@ -21,9 +22,12 @@ def heed() -> None:
 
     A single process raises KeyboardInterrupt. Of several ranks the first prints the line; each ends the job from a
     separate thread, since MPI waits without ever returning to Python. No rank dies at once: `mpirun`, which signals
-    all of them, would then kill the others at once too, before the line is printed, in place of a second later.
+    all of them, would then kill the others at once too, before the line is printed, in place of a second later. It
+    sends the signal too once a rank ends the job for a reason of its own: then that is said, and they die.
     """
     from mpi4py import MPI
+
+    from uq.evaluation.work_queue import is_ending
 
     world = MPI.COMM_WORLD
     if world.size == 1:
@@ -34,12 +38,14 @@ def heed() -> None:
     signal.set_wakeup_fd(write, warn_on_full_buffer=False)
     for number in ENDING:
         signal.signal(number, lambda *_: None)
-    Thread(target=_wait, args=(read, world), daemon=True).start()
+    Thread(target=_wait, args=(read, world, is_ending), daemon=True).start()
 
 
-def _wait(pipe: int, world: Any) -> None:
+def _wait(pipe: int, world: Any, is_ending: Callable[[], bool]) -> None:
     while os.read(pipe, 1)[0] not in ENDING:
         pass
+    if is_ending():
+        os.kill(os.getpid(), signal.SIGKILL)
     if world.rank == 0:
         sys.stderr.write(f"{INTERRUPTED}\n")
         sys.stderr.flush()
