@@ -37,7 +37,7 @@ from uq.inputs.sampling import sobol_points
 
 Source = Literal["laplace", "points", "chains"]
 Kind = Literal["pcn", "emcee", "hmc"]
-NEEDED: dict[Kind, tuple[str, ...]] = {"pcn": ("arviz",), "emcee": ("arviz", "emcee"), "hmc": ("arviz", "mici")}
+NEEDED: dict[Kind, tuple[str, ...]] = {"pcn": ("arviz",), "emcee": ("arviz",), "hmc": ("arviz", "mici")}
 
 OUTERMOST = 0.01  # of the probability
 MAPPED = 4096  # points of Laplace's Gaussian that correct the moments of the linear functions

@@ -245,20 +245,16 @@ def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = 
     """Run emcee's ensemble for few parameters, kept in physical units; its walkers are the chains.
 
     They start as Laplace's Gaussian says, and are as long as those of `walkers` by default.
-
-    Raises
-    ------
-    ImportError
-        If emcee is not installed.
     """
-    emcee = imported("an ensemble needs", "emcee")
+    from emcee import EnsembleSampler, State
+
     c = len(gaussian.mode)
     long = walkers(c) if lengths is None else lengths
     count = long.chains
-    sampler = emcee.EnsembleSampler(count, c, lambda x: posterior.at(x).log_posterior, vectorize=True)
+    sampler = EnsembleSampler(count, c, lambda x: posterior.at(x).log_posterior, vectorize=True)
     z = np.random.default_rng(seed).standard_normal((count, c))
     generator = np.random.RandomState(seed)
-    state = emcee.State(gaussian.mode + z @ gaussian.root.T, random_state=generator.get_state())
+    state = State(gaussian.mode + z @ gaussian.root.T, random_state=generator.get_state())
     state = sampler.run_mcmc(state, long.burn, store=False)
     sampler.run_mcmc(state, long.draws, thin_by=long.thin)
     walked = Chains(np.swapaxes(sampler.get_chain(), 0, 1), np.asarray(sampler.acceptance_fraction), np.nan)

@@ -15,7 +15,7 @@ Kernel over polynomial is a normal kernel again, of covariance B_i, at other pla
 For normal posteriors under normal priors it is exact for normal kernels of any width. The prior of m is normal, twice
 as wide as π_0, around its mean; standard deviations of the population have half-t priors with 3 degrees of freedom
 and those of π_0 as scale; correlations have density ∝ det R (Lewandowski, Kurowicka and Joe's with η = 2). m, the
-logarithms of standard deviations and the angles of R are sampled by an ensemble of walkers (J. Goodman, J. Weare,
+logarithms of standard deviations and the angles of R are sampled by emcee's ensemble of walkers (J. Goodman, J. Weare,
 Commun. Appl. Math. Comput. Sci. 5 (2010) 65–80).
 
 With covariates x_i of the specimens (grade, region), less their means, the mean of specimen i is m + B x_i. The prior
@@ -35,7 +35,6 @@ from forward.model import FloatArray
 from forward.phases import phase
 from uq.inputs.draws import effective
 
-STRETCH = 2.0  # a of the stretch move
 FREEDOM = 3.0  # of the prior of standard deviations
 WIDER = 2.0  # prior of the mean of a population over that of a specimen
 KEPT = 200  # draws of a specimen that are used
@@ -202,11 +201,12 @@ class Fit:
 
 def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
     """Ln of v N(b | m, C + B) (A, S) of all draws."""
-    roots = np.linalg.cholesky(covariances + one.kernels.covariance)
-    deviations = one.kernels.places[None] - means[:, None, :]
-    whitened = np.linalg.solve(roots, np.swapaxes(deviations, 1, 2))
-    logs = np.log(np.einsum("aii->ai", roots)).sum(axis=1)
-    return np.asarray(one.kernels.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
+    inverses = np.linalg.inv(np.linalg.cholesky(covariances + one.kernels.covariance))
+    places = (one.kernels.places - one.mean).T
+    whitened = (inverses.reshape(-1, len(places)) @ places).reshape(*means.shape, -1)  # one product for all
+    whitened -= inverses @ (means - one.mean)[:, :, None]
+    logs = np.log(np.einsum("aii->ai", inverses)).sum(axis=1)
+    return np.asarray(one.kernels.log_weights - np.einsum("ads,ads->as", whitened, whitened) / 2 + logs[:, None])
 
 
 @phase("fitting the population")
@@ -217,11 +217,15 @@ def fitted(
     seed: int,
     steps: int = 600,
     covariates: FloatArray | None = None,
+    kept: Callable[[FloatArray, Callable[[], FloatArray]], FloatArray] = lambda at, compute: compute(),
 ) -> Fit:
     """Sample the distribution of a population of at least two specimens, and keep so many draws.
 
     Each walker makes so many steps, of which the first third is left out. Covariates x (n, q) are less their means.
+    Densities that are `kept` are not computed again (`Steps.rows`).
     """
+    from emcee import EnsembleSampler, State
+
     few = tuple(thinned(one, seed) for one in specimens)
     d = len(prior.mean)
     means = np.array([one.mean for one in few])
@@ -233,7 +237,13 @@ def fitted(
     start = np.concatenate([means.mean(axis=0), np.log(spread), np.zeros(d * (d - 1) // 2), lines.T.ravel()])
     rng = np.random.default_rng([seed, 0])
     walkers = start + widths * rng.standard_normal((max(32, 4 * start.size), start.size))
-    chain = _walked(walkers, lambda at: _log_posterior(at, few, prior, x), steps, rng)[steps // 3 :]
+
+    def log_density(at: FloatArray) -> FloatArray:
+        return kept(at, lambda: _log_posterior(at, few, prior, x))
+
+    sampler = EnsembleSampler(*walkers.shape, log_density, vectorize=True)
+    sampler.run_mcmc(State(walkers, random_state=np.random.RandomState(seed).get_state()), steps)
+    chain = sampler.get_chain(discard=steps // 3)
     worth = min(
         effective(chain[:, :, j].T.ravel(), np.repeat(np.arange(chain.shape[1]), len(chain))) for j in range(start.size)
     )
@@ -298,24 +308,3 @@ def _log_posterior(
         top = kernels.max(axis=1)
         found[possible] += top + np.log(np.exp(kernels - top[:, None]).sum(axis=1))
     return np.asarray(found)
-
-
-def _walked(
-    walkers: FloatArray, log_density: Callable[[FloatArray], FloatArray], steps: int, rng: np.random.Generator
-) -> FloatArray:
-    """Positions (steps, K, q) of K walkers that stretch towards each other, half of them at a time."""
-    walkers = walkers.copy()
-    K, q = walkers.shape
-    logs = log_density(walkers)
-    chain = np.empty((steps, K, q))
-    for step in range(steps):
-        halves = np.array_split(rng.permutation(K), 2)
-        for here, others in (halves, halves[::-1]):
-            z = ((STRETCH - 1) * rng.random(len(here)) + 1) ** 2 / STRETCH
-            partner = walkers[rng.choice(others, len(here))]
-            proposed = partner + z[:, None] * (walkers[here] - partner)
-            new = log_density(proposed)
-            accepted = np.log(rng.random(len(here))) < (q - 1) * np.log(z) + new - logs[here]
-            walkers[here[accepted]], logs[here[accepted]] = proposed[accepted], new[accepted]
-        chain[step] = walkers
-    return chain

@@ -13,6 +13,7 @@ from forward.findings import Finding
 from forward.model import FloatArray
 from forward.settings import Settings, nearest
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, fitted
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.findings import add
 from uq.inputs.distributions import Distribution, LogNormal, Normal, TruncatedNormal
 from uq.inputs.draws import Draws
@@ -72,11 +73,13 @@ class Population(Settings):
     seed: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
 
-    def run(self, posteriors: Mapping[str, Draws], prior: Inputs, again: Again | None = None) -> xr.Dataset:
+    def run(
+        self, posteriors: Mapping[str, Draws], prior: Inputs, again: Again | None = None, steps: Steps = ALL_AGAIN
+    ) -> xr.Dataset:
         """Fit the population, without solving anything but for specimens whose draws do not reach it.
 
         All draws are of the same parameters, with the same prior. Specimens are drawn again under another prior; None
-        if that cannot be done. The variables are those of docs/results.md.
+        if that cannot be done. Fits may be kept as `steps`. The variables are those of docs/results.md.
 
         Raises
         ------
@@ -88,7 +91,7 @@ class Population(Settings):
         scale = Scale.of(self.distribution, posteriors)
         columns = Columns.of(self.covariates, list(posteriors))
         x, at = (columns.values, columns.row(self.new)) if self.covariates else (None, None)
-        reached = self._reached(posteriors, prior, scale, x, again)
+        reached = self._reached(posteriors, prior, scale, x, again, steps)
         fit, estimates = reached.fit, reached.estimates
         new = scale.back(fit.predictive(self.seed, at))
         own = np.array([np.array(_moments(one)) for one in posteriors.values()])
@@ -139,7 +142,13 @@ class Population(Settings):
         return found
 
     def _reached(
-        self, posteriors: Mapping[str, Draws], prior: Inputs, scale: Scale, x: FloatArray | None, again: Again | None
+        self,
+        posteriors: Mapping[str, Draws],
+        prior: Inputs,
+        scale: Scale,
+        x: FloatArray | None,
+        again: Again | None,
+        steps: Steps,
     ) -> _Reached:
         """Fit the population, and draw those specimens again of which few draws lie there, until there are none."""
         names, parameters, hyperprior = list(posteriors), prior_names(posteriors), scale.of_prior(prior)
@@ -147,7 +156,8 @@ class Population(Settings):
         times: dict[str, int] = {}
         refused: dict[str, str] = {}
         for left in reversed(range(ROUNDS)):
-            fit = fitted(specimens, hyperprior, self.draws, self.seed, covariates=x)
+            kept = steps.rows(f"densities, {left} more")
+            fit = fitted(specimens, hyperprior, self.draws, self.seed, covariates=x, kept=kept)
             estimates = [fit.estimates(i, self.seed) for i in range(len(names))]
             low = [i for i, (_, size) in enumerate(estimates) if size < LEAST and names[i] not in refused]
             if again is None or not low or not left:

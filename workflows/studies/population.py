@@ -240,6 +240,11 @@ class PopulationJob(Job):
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Fit on rank 0; collective over all ranks."""
+        from mpi4py import MPI
+
+        from uq.evaluation.evaluate import Steps
+        from uq.evaluation.kept import Kept
+
         method, drawn = self.study.method, list[str]()
 
         def again(specimen: str, prior: Inputs) -> tuple[Draws | None, str]:
@@ -272,7 +277,7 @@ class PopulationJob(Job):
                 return found
 
             begin = time.process_time()
-            fitted = method.run(posteriors, prior, timed)
+            fitted = method.run(posteriors, prior, timed, Steps(Kept(checkpoint, MPI.COMM_SELF, "steps")))
             self.own.append(time.process_time() - begin - asking)
             return fitted
 

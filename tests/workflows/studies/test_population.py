@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from inverse.low_dimensional import population as fits
 from inverse.methods.population import LEAST
 from tests.inverse.low_dimensional.test_population import closed_form
 from tests.launch import TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
+from uq.evaluation import kept
 from uq.inputs.distributions import LogNormal, Normal
 from workflows.config.study import load
 from workflows.report.page import write_report
@@ -58,6 +60,10 @@ noise = { absolute = 100 }
 subsets = { tension = ["uniaxial"] }
 """
 VALUES = 6 + np.hypot(0.5, 1.0) * np.random.default_rng(1).standard_normal(4)
+
+
+class Killed(BaseException):
+    """An end amid the work."""
 
 
 def population(folder, source, more=""):
@@ -116,6 +122,30 @@ def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path,
     alone = population(tmp_path, batch / "results", 'distribution = "normal"')
     assert run(load(alone), "population", tmp_path / "alone", quiet=True, report=False) == 0
     assert any("cannot be drawn again: s0.csv is not in" in text for text in texts(tmp_path / "alone"))
+
+
+def test_walkers_go_on_where_they_were_stopped(batch, tmp_path, monkeypatch):
+    """What is lost of the fit is what was not written yet; the results are the same bytes."""
+    monkeypatch.setattr(kept, "SECONDS_BETWEEN_STRETCHES", 0.005)
+    monkeypatch.setattr("inverse.methods.population.ROUNDS", 1)
+    study = load(population(tmp_path, batch / "results", 'distribution = "normal"'))
+    counts, density = [0], fits._log_posterior
+
+    def counted(*given):
+        counts[-1] += 1
+        if len(counts) == 2 and counts[-1] > 400:
+            raise Killed
+        return density(*given)
+
+    monkeypatch.setattr(fits, "_log_posterior", counted)
+    assert run(study, "population", tmp_path / "whole", quiet=True, report=False) in (0, 3)
+    counts.append(0)
+    with pytest.raises(Killed):
+        run(study, "population", tmp_path / "parts", quiet=True, report=False)
+    counts.append(0)
+    assert run(study, "population", tmp_path / "parts", quiet=True, report=False) in (0, 3)
+    assert counts[2] <= counts[0] - 390
+    assert_same_bits(tmp_path / "whole", tmp_path / "parts")
 
 
 def test_data_that_have_changed_are_not_inverted_again(batch, tmp_path):
