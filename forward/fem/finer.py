@@ -24,7 +24,7 @@ from forward.bodies.location import locate, shapes
 from forward.combine import CombinedSolution, Joined, Mapped, OfOne, Rows, sums_of
 from forward.finer_meshes import OF_EQUAL, TIMES, finer, graded, on_mesh, share
 from forward.joined_models import JoinedMeshes
-from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError, gathered, scattered
 from forward.pointwise import OneByOne
 
 if TYPE_CHECKING:
@@ -35,9 +35,10 @@ if TYPE_CHECKING:
 
 # Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
 ITERATIONS, LOAD_STEP = 12, 1 / 16
-# States with their derivatives; or none, and why: the reason, and the history of the solver.
-Begun = tuple[tuple[tuple[FloatArray, FloatArray], ...], tuple[str, tuple[str, ...]] | None]
-Keep = Callable[[str, Callable[[], Begun]], Begun]  # by the name of the meshes; what a run begun before has found
+# States with their derivatives as rows; or none, and why: the reason, and the history of the solver.
+Begun = tuple[tuple[FloatArray, ...], tuple[str, tuple[str, ...]] | None]
+# By the name of the meshes; what a run begun before has found, whole on all ranks.
+Keep = Callable[[str, Callable[[], Begun]], Begun]
 WHOLE = 2.0  # times the difference between meshes that show no order, of which nearly a half counts otherwise
 TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
@@ -179,36 +180,44 @@ class FromStart(OfOne):
         """
         if self.start is None:
             return self.model.solve(parameters)
-        here: list[CombinedSolution] = []
+        here: list[tuple[CombinedSolution, tuple[FloatArray, ...]]] = []
         at_start = not self.begun and np.array_equal(parameters, self.start)
         if not self.begun:
-            self.begun.append(self.keep(partial(self._begin, self.start, here)))
+            known, reason = self.keep(partial(self._begin, self.start, here))
+            pairs = zip(self.model.models, known, strict=False)  # none without an answer
+            parts = here[0][1] if here else tuple(scattered(_meshed(model), rows) for model, rows in pairs)
+            self.begun.append((parts, reason))
         begun, reason = self.begun[0]
         unanswered = None if reason is None else SolveError(*reason)
         if at_start and unanswered is not None:
             raise unanswered
         if at_start:  # where states were kept, this solve was not: it is done as it was begun
-            return here[0] if here else self.model.solve(parameters)
+            return here[0][0] if here else self.model.solve(parameters)
         if unanswered is None:
             step = parameters - self.start
-            guesses = [Guess(state + step @ slopes if slopes.size else state) for state, slopes in begun]
+            guesses = [Guess(rows[0] + step @ rows[1:] if len(rows) > 1 else rows[0]) for rows in begun]
             return self.model.solve_each(parameters, guesses)
         if self.needed:
             raise unanswered
         return self.model.solve(parameters)
 
-    def _begin(self, start: FloatArray, here: list[CombinedSolution]) -> Begun:
-        """Solve at the start, for all to begin from."""
+    def _begin(self, start: FloatArray, here: list[tuple[CombinedSolution, tuple[FloatArray, ...]]]) -> Begun:
+        """Solve at the start, for all to begin from; states are returned whole, and added with the rank's own part."""
         try:
             found = self.model.solve(start)
         except SolveError as error:
             return (), (error.reason, tuple(error.history))
-        here.append(found)
         few = len(start) <= TANGENTS and self.differentiable
-        slopes = (
-            one.state_tangent(np.eye(len(start))) if few else np.zeros((len(start), 0)) for one in found.solutions
-        )
-        return tuple((one.state, by) for one, by in zip(found.solutions, slopes, strict=True)), None
+        every = np.eye(len(start))
+        rows = tuple(np.vstack([one.state, *(one.state_tangent(every) if few else ())]) for one in found.solutions)
+        here.append((found, rows))
+        whole = map(gathered, map(_meshed, self.model.models), rows)
+        return tuple(np.zeros((0, 0)) if one is None else one for one in whole), None  # the former on other ranks
+
+
+def _meshed(model: ForwardModel) -> ForwardModel:
+    """Return the body whose states are those of a model."""
+    return model._model if isinstance(model, OtherMesh) else model
 
 
 @dataclass(frozen=True)

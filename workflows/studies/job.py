@@ -29,9 +29,9 @@ MOVED = "moved points"  # in names of models
 
 
 def kept_starts(checkpoint: Checkpoint, group: Any, label: str = "") -> Callable[[str, Callable[[], T]], T]:
-    """Return what keeps where solves on finer meshes start; not of ranks that share a model, each with its part."""
+    """Return what keeps where solves on finer meshes start."""
     kept = Kept(checkpoint, group, f"{label}, starts")
-    return lambda name, begin: begin() if group.size > 1 else kept.value(name, begin)[0]
+    return lambda name, begin: kept.value(name, begin)[0]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ import json
 import signal
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from forward.fem.finer import FromStart
@@ -11,7 +12,7 @@ from forward.reduced.reduction import Reduction
 from inverse.criticism.chains import Lengths
 from inverse.criticism.gradient_chains import gradient_chains
 from inverse.low_dimensional.posterior import Posterior
-from tests.launch import in_process, run_script
+from tests.launch import in_process, on_kept_ranks, run_script
 from uq.evaluation import kept
 from uq.evaluation.block import BlockSolver
 
@@ -49,6 +50,27 @@ other_noises.larger = { relative = 0.1, absolute = 5e3 }
 TABLE = "test,mode,stretch,P_MPa\n" + "".join(
     f"one,uniaxial,{s},{0.4 * (s - s**-2)}\n" for s in (1.1, 1.3, 1.5, 1.8, 2.1)
 )
+# Twice, as two runs do: how often a start was solved for, the states that were kept, and the outputs.
+STARTS = """
+import sys
+from pathlib import Path
+from unittest.mock import patch
+from mpi4py import MPI
+from forward.fem import finer
+from uq.evaluation.checkpoint import Checkpoint
+from workflows.config.study import load
+from workflows.studies.job import kept_starts
+
+study, begun, begin = load(Path(sys.argv[1])), [], finer.FromStart._begin
+with patch.object(finer.FromStart, "_begin", lambda *given: begun.append(1) or begin(*given)):
+    for _ in range(2):
+        keep = kept_starts(Checkpoint(Path(sys.argv[2]), "study"), MPI.COMM_WORLD)
+        model = study.model.build(MPI.COMM_WORLD, tuple(study.parameters))
+        there = finer.extrapolated(model, study.inputs.mean, keep).of(model)
+        outputs = [there.solve(study.inputs.mean * factor).outputs.tolist() for factor in (1.0, 1.1)]
+        if MPI.COMM_WORLD.rank == 0:
+            print(len(begun), outputs, flush=True)
+"""
 CHAINS = """
 [model]
 kind = "python"
@@ -193,6 +215,21 @@ def test_finer_meshes_are_not_solved_at_the_start_again(tmp_path, monkeypatch):
     assert parts + run(tmp_path, "parts") <= whole + 1
     assert len(begun) == 2
     assert same(tmp_path)
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_ranks_that_share_a_body_keep_its_start_too(tmp_path):
+    (tmp_path / "study.toml").write_text(MESH)
+    found = {}
+    for ranks in (None, 2):
+        done = on_kept_ranks(ranks, STARTS, tmp_path / "study.toml", tmp_path / str(ranks))
+        assert done.returncode == 0, done.stderr
+        (times, first), (again, second) = (line.split(maxsplit=1) for line in done.stdout.splitlines())
+        assert (times, again) == ("1", "1")
+        found[ranks] = json.loads(first)
+        np.testing.assert_allclose(json.loads(second), found[ranks], rtol=1e-10)  # ranks add up in any order
+    np.testing.assert_allclose(found[2], found[None], rtol=1e-8)
 
 
 @pytest.mark.fem
