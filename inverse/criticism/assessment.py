@@ -37,6 +37,7 @@ from uq.inputs.sampling import sobol_points
 
 Source = Literal["laplace", "points", "chains"]
 Kind = Literal["pcn", "emcee", "hmc"]
+When = Literal["always", "needed"]
 NEEDED: dict[Kind, tuple[str, ...]] = {"pcn": ("arviz",), "emcee": ("arviz",), "hmc": ("arviz", "mici")}
 
 OUTERMOST = 0.01  # of the probability
@@ -105,13 +106,15 @@ def assess(
     samples: int,
     *,
     chains: Kind | None = None,
+    when: When = "always",
     model: ForwardModel | None = None,
     seed: int = 0,
     steps: Steps = ALL_AGAIN,
 ) -> Assessment:
     """Correct Laplace's Gaussian by so many solves for weighted points, and by chains if they are asked for.
 
-    Those by "hmc" follow the gradients of the model, point by point. `steps` keep points, gradients and chains.
+    That is always, or when they are "needed": where the points cannot be trusted. Those by "hmc" follow the gradients
+    of the model, point by point. `steps` keep points, gradients and chains.
 
     Raises
     ------
@@ -119,7 +122,7 @@ def assess(
         If the model has no answer at any of the points.
     """
     found = steps("points", lambda: evidence(posterior, gaussian, samples or LEAST, seed=seed))
-    if chains is None:
+    if chains is None or (when == "needed" and (found.route == "closed form" or counts(found))):
         return Assessment(gaussian, found)
     run = partial(_run, posterior, gaussian, found, chains, model, seed, steps)
     return Assessment(gaussian, found, steps("chains", run))
@@ -156,6 +159,13 @@ def solves_of(kind: Kind | None, size: int) -> int:
     if kind == "hmc":
         return BUDGET
     return (FEW if kind == "pcn" else walkers(size)).evaluations
+
+
+def only_needed(chains: Kind | None, when: When, solves: int) -> list[str]:
+    """Say in a line how many solves chains take at most that run only where they are needed; none otherwise."""
+    if chains is None or when == "always":
+        return []
+    return [f"chains      where weighted points cannot be trusted: at most {solves:,} more solves"]
 
 
 def own_seconds(size: int, outputs: int, samples: int, chains: Kind | None = None) -> float:

@@ -250,11 +250,11 @@ def comparison(
     parameters = list(dict.fromkeys(p for one in found.values() for p in one.posterior.names))
     variables |= _by_point(names, groups, parameters, found)
     variables |= _constants(names, groups, parameters, found)
-    chains = {pair: one.assessment.chains for pair, one in found.items() if one.assessment.chains is not None}
-    if chains:
-        variables["chains"] = table({pair: len(one.draws) * one.mixed for pair, one in chains.items()})
-        variables["chain_rhat"] = table({pair: one.rhat.max() for pair, one in chains.items()})
-        variables["chain_effective"] = table({pair: one.ess for pair, one in chains.items()})
+    chains = {pair: one.assessment.chains for pair, one in found.items()}
+    if any(one is not None for one in chains.values()):
+        variables["chains"] = table({k: 0 if one is None else len(one.draws) * one.mixed for k, one in chains.items()})
+        variables["chain_rhat"] = table({k: np.nan if one is None else one.rhat.max() for k, one in chains.items()})
+        variables["chain_effective"] = table({k: np.nan if one is None else one.ess for k, one in chains.items()})
     if all(one.mesh is not None for one in found.values()):
         variables |= _meshes(names, data_groups, parameters, found)
     coordinates = {"model": names, "group": groups, "variant": list(variants), "parameter": parameters}

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from inverse.criticism.assessment import Assessment, Kind, assess
+from inverse.criticism.assessment import Assessment, Kind, When, assess
 from inverse.criticism.finer import Finer, MeshFound
 from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
@@ -72,6 +72,7 @@ def infer(
     look: Looked | None = None,
     shared: Shared | None = None,
     chains: Kind | None = None,
+    when: When = "always",
     model: ForwardModel | None = None,
     say: Callable[[str], None] = lambda line: None,
     steps: Steps = ALL_AGAIN,
@@ -84,7 +85,7 @@ def infer(
         Of a model and data. Where solves start from something already, that is not sought again.
     start
         Makes what predicts states from a solution at parameters (d,), at the mean and at the mode.
-    samples, chains, model
+    samples, chains, when, model
         As of `assess`.
     starts, seed
         Of the search for the mode.
@@ -117,7 +118,7 @@ def infer(
     if look is not None:
         treatment = look.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
-    one = assess(posterior, gaussian, samples, chains=chains, model=model, seed=seed, steps=steps)
+    one = assess(posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
     return Inferred(posterior, searched, one, mesh, before)
 
 

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from forward.model import ForwardModel, ModelError
 from forward.settings import Settings
-from inverse.criticism.assessment import Kind, solves_of
+from inverse.criticism.assessment import Kind, When, solves_of
 from inverse.criticism.chains import FIELD
 from inverse.criticism.weights import usual
 from inverse.fields.low_rank import CUTOFF
@@ -70,6 +70,8 @@ class Invert(MeshTreatment, Settings):
         or, for few parameters, "emcee" (35 208 solves, or more) or "hmc", which follows gradients and mixes in tens of
         unknowns too (60 000 solves with an adjoint at most, one after another; by mici). If they have mixed, moments
         and draws of few parameters are theirs; for a field, only if Laplace's cannot be trusted.
+    chains_when
+        "needed": only for those data sets whose weighted points, or samples of a field, cannot be trusted.
     starts
         Starts of the search for the mode of few parameters.
     cutoff, rank
@@ -98,6 +100,7 @@ class Invert(MeshTreatment, Settings):
     samples: Annotated[int, Field(ge=0)] | None = None
     noise: Distribution | None = None
     chains: Kind | None = None
+    chains_when: When = "always"
     starts: Annotated[int, Field(ge=1)] = 4
     cutoff: Annotated[float, Field(gt=0)] = CUTOFF
     rank: Annotated[int, Field(ge=1)] = 256

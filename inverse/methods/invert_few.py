@@ -128,6 +128,7 @@ def invert_few(
         look=looked,
         shared=problem.shared,
         chains=method.chains,
+        when=method.chains_when,
         model=model,
         say=problem.say,
         steps=replace(problem.steps, recorder=counted),

@@ -112,7 +112,8 @@ def invert_field(
     samples = method.solves(0, field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
     chains = whole = None
-    if method.chains is not None:
+    needed = weighed is None or not weighed.trusted
+    if method.chains is not None and (needed or method.chains_when == "always"):
         # Chains are judged by the mean over the body: mixing at all vertices would need far more draws.
         whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
         chains = replace(whole, draws=whole.draws[:, :, :1])

@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.phases import phase
 from forward.settings import Settings
-from inverse.criticism.assessment import Kind, solves_of
+from inverse.criticism.assessment import Kind, When, solves_of
 from inverse.criticism.comparison import Candidate, Compared, comparison
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
@@ -111,6 +111,8 @@ class Select(MeshTreatment, Settings):
     chains
         Run Markov chains for each candidate too, as an inversion does: "pcn", "emcee" or "hmc". If they have mixed,
         constants and predictions are theirs; those by "hmc" tell the evidence too, where weighted points cannot.
+    chains_when
+        "needed": only where weighted points cannot be trusted.
     check
         "dynesty": compute the evidences by nested sampling too.
     mesh_error
@@ -131,6 +133,7 @@ class Select(MeshTreatment, Settings):
     seed: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 4
     chains: Kind | None = None
+    chains_when: When = "always"
     check: Literal["dynesty"] | None = None
     mesh_error: Literal["correct", "report", False] = "correct"
     mesh_check: bool = True
@@ -213,6 +216,7 @@ class Select(MeshTreatment, Settings):
                     look=None if finer is None else Looked(finer(name, group), data, self.treatment),
                     shared=None if shared is None else shared.get((name, group)),
                     chains=self.chains,
+                    when=self.chains_when,
                     model=None if model is None else model(name, group),
                     say=lambda line, name=name: say(f"{name}: {line}"),  # type: ignore[misc]
                     steps=steps(name, group).of(STATED),

@@ -158,9 +158,13 @@ def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compil
 
 def of_inversion(study: InversionBlocks) -> list[str]:
     """Say what is inverted, and how long that will take."""
+    from inverse.criticism.assessment import only_needed
+
+    method = study.method
     lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
+    lines += only_needed(method.chains, method.chains_when, method.chain_solves(len(study.names), field=study.field))
     refused = (f"warning     {one.refused}" for one in study.data.sets if one.refused)
-    return [f"method      {study.method.kind}", *lines, *refused]
+    return [f"method      {method.kind}", *lines, *refused]
 
 
 def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:

@@ -10,7 +10,7 @@ from forward.findings import Finding
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
 from forward.spec import ModelSpec
-from inverse.criticism.assessment import NEEDED, own_seconds
+from inverse.criticism.assessment import NEEDED, only_needed, own_seconds
 from inverse.criticism.doubts import not_estimable
 from inverse.data.measurements import AXES
 from inverse.data.table import DataError
@@ -166,6 +166,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             f"data        {count}{among}",
             f"evidences   {evidences}{check}",
             *(f"mesh check  {words}" for words in dict.fromkeys(words for _, words in meshes)),
+            *only_needed(method.chains, method.chains_when, sum(self.chain_solves(name) for name, _ in self.pairs)),
             f"solves      about {self.planned:,}",
             f"time        about {duration(seconds)} on 1 core (rough)",
         ]

@@ -7,6 +7,8 @@ import pytest
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
+from inverse.criticism import assessment
+from inverse.criticism.assessment import assess, only_needed
 from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
 from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
 from inverse.criticism.predictive import examine
@@ -233,6 +235,22 @@ def test_verdicts_on_few_parameters():
     assert "but chains agree" in verdict_on_few(gaussian, uneven, test, long).why
     agreeing = replace(test, agreement_probability=0.001)
     assert "residuals of neighbours" in verdict_on_few(gaussian, found, agreeing).why
+
+
+def test_chains_run_where_they_are_needed(monkeypatch):
+    """Not where weighted points may stand for the posterior; else they take over."""
+    posterior = quick(ridge(0.1))
+    gaussian = laplace(posterior)
+    told = assess(posterior, gaussian, 256, chains="pcn", when="needed")
+    assert (told.source, told.chains) == ("points", None)
+    poor = replace(told.evidence, pareto_k=0.9, ess=10.0, many=None)
+    monkeypatch.setattr(assessment, "evidence", lambda *given, **more: poor)
+    over = assess(posterior, gaussian, 256, chains="pcn", when="needed")
+    assert over.chains is not None
+    assert over.source == ("chains" if over.chains.mixed else "laplace")
+    (line,) = only_needed("pcn", "needed", 5204)
+    assert line.endswith("cannot be trusted: at most 5,204 more solves")
+    assert only_needed("pcn", "always", 5204) == []
 
 
 def test_verdicts_on_fields():
