@@ -47,7 +47,7 @@ from uq.surrogates.field_regression import (
     relative_of_field,
 )
 from uq.surrogates.gate import repeated
-from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
+from uq.surrogates.least_squares import NOTHING, ROUNDING, Data
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import HIGHEST, ORDER, TRUSTED, Regression
 
@@ -222,7 +222,7 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            regression = Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
+            regression = Regression.fitted(inputs, bases, largest, data)
             if self.max_order is None and not projection and not expand_fields:
                 regression = regression.higher()
             yield Expanded(centre, evaluations, regression)

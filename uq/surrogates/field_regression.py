@@ -164,7 +164,7 @@ def fit_deviations(
     wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    regression = Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+    regression = Regression.fitted(inputs, candidates, largest, data)
     return deviations(regression.higher() if wanted is None else regression, evaluations, centre)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +74,11 @@ class Regression:
     fit: Fit
 
     @classmethod
+    def fitted(cls, inputs: Inputs, candidates: Candidates, largest: Basis, data: Data) -> Regression:
+        """Fit data with the best of these sets; errors as in `of`."""
+        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+
+    @classmethod
     def of(
         cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int | None
     ) -> Regression:
@@ -86,14 +92,12 @@ class Regression:
         data = Data.at(points, values, tangents, inputs)
         rows = len(points) * rows_of(inputs, gradients=tangents is not None)
         candidates = candidates_of(inputs, max_order or ORDER, rows, DICTIONARY)
-        largest = orthonormal(inputs, candidates.all)
-        found = cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+        found = cls.fitted(inputs, candidates, orthonormal(inputs, candidates.all), data)
         return found if max_order else found.higher()
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as in `of`."""
-        data = self.data.some(slice(count))
-        return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
+        return Regression.fitted(self.inputs, self.candidates, self.largest, self.data.some(slice(count)))
 
     def higher(self) -> Regression:
         """Return the fit of half as high an order again, as long as the highest is chosen, and it explains far more.
@@ -106,8 +110,7 @@ class Regression:
         while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
             order = min(found.candidates.limit * 3 // 2, HIGHEST)
             candidates = candidates_of(self.inputs, order, rows, DICTIONARY)
-            largest = orthonormal(self.inputs, candidates.all)
-            again = replace(found, candidates=candidates, largest=largest, fit=fit_best(candidates, largest, data))
+            again = Regression.fitted(self.inputs, candidates, orthonormal(self.inputs, candidates.all), data)
             if EXPLAINS * again.fit.relative.max() > found.fit.relative.max():
                 break
             found = again
@@ -162,14 +165,11 @@ class Regression:
         tails = tails_of(self.inputs)
         if not tails.any():
             return None
-        basis, data = self.basis, self.data
-        left = data.left(basis)
-        q, _ = np.linalg.qr(left.reshape(left.shape[0] * left.shape[1], -1))
         joint = np.isin(np.arange(tails.size), self.inputs.joint)
         least = np.full(self.fit.loo.size, np.inf)
         for places in map(np.flatnonzero, (tails & ~joint, tails & joint)):
             if places.size:
-                least = np.minimum(least, self._left_of_following(places, q))
+                least = np.minimum(least, self._left_of_following(places))
         return np.sqrt(shares(self.fit.squares, least))
 
     def hidden(self, missing: FloatArray) -> FloatArray:
@@ -222,6 +222,13 @@ class Regression:
         norms = asked * np.sqrt(shares(fit.squares, sizes[:, None]))
         return np.array([(norms * np.abs(pull)).max(axis=0) for pull in (left.mean(axis=0)[:, None], of_std)])
 
+    @cached_property
+    def _columns(self) -> tuple[FloatArray, FloatArray]:
+        """Q and R of the columns of the regression."""
+        left = self.data.left(self.basis)
+        q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
+        return q, triangle
+
     def _taken_up(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what fits to other functions have for coefficients (P, K), and what they leave: sums of squares (K,).
 
@@ -229,8 +236,7 @@ class Regression:
         """
         from scipy.linalg import solve_triangular
 
-        left = self.data.left(self.basis)
-        q, triangle = np.linalg.qr(left.reshape(-1, left.shape[2]))
+        q, triangle = self._columns
         columns = columns.reshape(len(q), -1)
         along = q.T @ columns
         return solve_triangular(triangle, along), ((columns - q @ along) ** 2).sum(axis=0)
@@ -355,15 +361,15 @@ class Regression:
         f = data.values - offset
         return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
-    def _left_of_following(self, places: IntArray, q: FloatArray) -> FloatArray:
+    def _left_of_following(self, places: IntArray) -> FloatArray:
         """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
-        basis, data = self.basis, self.data
+        basis, (q, _) = self.basis, self._columns
         degrees = basis.indices[:, places]
         powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
         powers[:, np.arange(places.size), places] = following, following + 1
         functions, norms = _following(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
-        columns = data.left(functions).reshape(len(q), -1)
+        columns = self.data.left(functions).reshape(len(q), -1)
         found = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0)
         found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
         next_one, after = found.reshape(2, places.size, 1)
