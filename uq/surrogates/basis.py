@@ -403,3 +403,36 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
         for (sparse, _), (indices, order, q) in found.items()
     ]
     return Candidates(union, tuple(sets), max_order)
+
+
+def lacking(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, FloatArray]:
+    """Return the powers (K, d) of single coordinates that a basis lacks, and the norms (K,) of what is new in them."""
+    if basis.joint is None or not powers[:, basis.joint.members].any():
+        return orthonormal(inputs, powers), np.ones(len(powers))
+    draws, start = inputs.draws, inputs.joint.start
+    assert draws is not None
+    alpha, beta = recurrence(Normal(mean=0.0, std=1.0), int(powers.max()))
+    d = powers.shape[1]
+    plain = Basis(basis.coordinates, np.tile(alpha, (d, 1)), np.tile(beta, (d, 1)), powers)
+    points = np.hstack([np.tile(inputs.mean[:start], (len(draws.values), 1)), draws.values])
+    alone = basis.subset(np.flatnonzero((basis.indices[:, :start] == 0).all(axis=1)))
+    known, new = alone.values(points), plain.values(points)
+    left = new - known @ (known.T @ (draws.weights[:, None] * new))
+    return plain, np.sqrt(draws.weights @ left**2)
+
+
+def neighbours(indices: IntArray, tails: NDArray[np.bool_], partners: IntArray) -> Iterator[IntArray]:
+    """Go through powers (d,) that a basis (P, d) lacks: the next two of a parameter with a tail, alone and in products.
+
+    Products are with one of the partners; with another tail, of what is the highest power alone too.
+    """
+    known = {tuple(row) for row in indices.tolist()}
+    unit = np.eye(indices.shape[1], dtype=np.int64)
+    for i in np.flatnonzero(tails):
+        following = int(indices[:, i].max()) + 1
+        found = [following * unit[i], (following + 1) * unit[i]]
+        for j in partners[partners != i]:
+            found.append(following * unit[i] + unit[j])
+            if tails[j]:
+                found.append(max(following - 1, 1) * unit[i] + unit[j])
+        yield from (one for one in found if tuple(one.tolist()) not in known)

@@ -19,7 +19,6 @@ from uq.estimators.doubts import of_constants, of_expansion, of_gradients, of_re
 from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
 from uq.estimators.moments import Estimates, Z, either, error_of_root, estimate, monomials, student
 from uq.estimators.tails import agree, counted, influences
-from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import (
@@ -29,8 +28,9 @@ from uq.surrogates.basis import (
     Candidates,
     IntArray,
     candidates_of,
+    lacking,
+    neighbours,
     orthonormal,
-    recurrence,
     rows_of,
 )
 from uq.surrogates.edges import contradicted, roots, towards_ends
@@ -190,7 +190,7 @@ class Regression:
         matter = shares(c**2, std**2).sum(axis=1) @ (basis.indices[varying] > 0)
         most, partners = (np.argsort(-np.where(some, matter, -1.0), kind="stable")[:FULL] for some in (tails, True))
         tails &= np.isin(np.arange(tails.size), most)
-        following = orthonormal(self.inputs, np.array(list(_neighbours(basis.indices, tails, partners))))
+        following = orthonormal(self.inputs, np.array(list(neighbours(basis.indices, tails, partners))))
         moved, sizes = self._taken_up(data.left(following))
         pulls = np.abs(shares(moved[varying].T @ c, std))
         norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
@@ -368,7 +368,7 @@ class Regression:
         powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
         powers[:, np.arange(places.size), places] = following, following + 1
-        functions, norms = _following(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
+        functions, norms = lacking(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
         columns = self.data.left(functions).reshape(len(q), -1)
         found = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0)
         found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
@@ -421,36 +421,3 @@ def tails_of(inputs: Inputs) -> BoolArray:
     """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
     bounded = [marginal.support is not None for marginal in inputs.marginals.values()]
     return ~np.array(bounded, dtype=bool) | np.isin(np.arange(len(bounded)), inputs.joint)
-
-
-def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, FloatArray]:
-    """Return the powers (K, d) of single coordinates that a basis lacks, and the norms (K,) of what is new in them."""
-    if basis.joint is None or not powers[:, basis.joint.members].any():
-        return orthonormal(inputs, powers), np.ones(len(powers))
-    draws, start = inputs.draws, inputs.joint.start
-    assert draws is not None
-    alpha, beta = recurrence(Normal(mean=0.0, std=1.0), int(powers.max()))
-    d = powers.shape[1]
-    plain = Basis(basis.coordinates, np.tile(alpha, (d, 1)), np.tile(beta, (d, 1)), powers)
-    points = np.hstack([np.tile(inputs.mean[:start], (len(draws.values), 1)), draws.values])
-    alone = basis.subset(np.flatnonzero((basis.indices[:, :start] == 0).all(axis=1)))
-    known, new = alone.values(points), plain.values(points)
-    left = new - known @ (known.T @ (draws.weights[:, None] * new))
-    return plain, np.sqrt(draws.weights @ left**2)
-
-
-def _neighbours(indices: IntArray, tails: BoolArray, partners: IntArray) -> Iterator[IntArray]:
-    """Go through powers (d,) that a basis (P, d) lacks: the next two of a parameter with a tail, alone and in products.
-
-    Products are with one of the partners; with another tail, of what is the highest power alone too.
-    """
-    known = {tuple(row) for row in indices.tolist()}
-    unit = np.eye(indices.shape[1], dtype=np.int64)
-    for i in np.flatnonzero(tails):
-        following = int(indices[:, i].max()) + 1
-        found = [following * unit[i], (following + 1) * unit[i]]
-        for j in partners[partners != i]:
-            found.append(following * unit[i] + unit[j])
-            if tails[j]:
-                found.append(max(following - 1, 1) * unit[i] + unit[j])
-        yield from (one for one in found if tuple(one.tolist()) not in known)

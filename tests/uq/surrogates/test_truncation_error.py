@@ -6,7 +6,7 @@ import pytest
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates import regression
+from uq.surrogates.basis import neighbours
 from uq.surrogates.regression import Regression
 
 INPUTS = Inputs({name: Normal(mean=0.0, std=1.0) for name in "ab"})
@@ -39,8 +39,8 @@ def test_what_a_missing_function_does_to_the_standard_deviation_is_claimed_and_n
 def test_powers_that_a_basis_lacks():
     basis = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1]])
     tails, both = np.array([True, False]), np.arange(2)
-    assert [tuple(one) for one in regression._neighbours(basis, tails, both)] == [(3, 0), (4, 0), (3, 1)]
-    found = {tuple(one) for one in regression._neighbours(basis, np.array([True, True]), both)}
+    assert [tuple(one) for one in neighbours(basis, tails, both)] == [(3, 0), (4, 0), (3, 1)]
+    found = {tuple(one) for one in neighbours(basis, np.array([True, True]), both)}
     assert found == {(3, 0), (4, 0), (3, 1), (2, 1), (0, 2), (0, 3), (1, 2)}
 
 
