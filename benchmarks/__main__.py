@@ -49,6 +49,7 @@ NAMES = (
     "sizes",
     "skewed",
     "skewed_posteriors",
+    "assumptions",
     "coverage",
     "quantiles",
     "small_indices",

@@ -21,7 +21,7 @@ from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.readable import number, scale, with_unit
 from forward.registry import named
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Factor, Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.spec import UNREFINED
 from forward.terms.displacement import Block, label, lists, too_far
@@ -174,6 +174,12 @@ class Path(Hyperelastic):
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be made a parameter, by its path: not those that have steps."""
         return {path: number for path, number in super().scalars.items() if path not in self.steps}
+
+    @property
+    def every_scalar(self) -> dict[str, Scalar]:
+        """Every number, and of what has steps a factor on all of them, `steps.PATH`, unless the body remembers."""
+        factors = () if self.path_dependent else self.steps
+        return {**super().every_scalar, **{f"steps.{path}": Scalar(1.0, Factor, "factor") for path in factors}}
 
     @property
     def unavailable(self) -> Mapping[str, str]:

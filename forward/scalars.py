@@ -47,6 +47,12 @@ class Scalar(NamedTuple):
         return unit_of(self.block.model_fields[self.field].metadata) or "1"
 
 
+class Factor(Settings):
+    """A factor on numbers of a model."""
+
+    factor: Annotated[float, Field(gt=0), Unit("1")] = 1.0
+
+
 def numbers(block: type[Settings]) -> tuple[str, ...]:
     """Return the fields of a block that are annotated with a unit: these can be parameters."""
     return tuple(name for name, field in block.model_fields.items() if unit_of(field.metadata))

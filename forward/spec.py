@@ -89,6 +89,11 @@ class ModelSpec(Settings):
     def scalars(self) -> Mapping[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
 
+    @property
+    def every_scalar(self) -> Mapping[str, Scalar]:
+        """Every number that `build` takes by its path alone: what acts in one load case only is apart there."""
+        return {path: number for path, number in self.scalars.items() if path not in self.unavailable}
+
     @abstractmethod
     def build(self, comm: Any, parameters: tuple[str, ...]) -> ForwardModel:
         """Make the model on a communicator; collective.

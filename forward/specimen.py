@@ -26,6 +26,7 @@ from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
 SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
+ACTING = ("loads.", "displacements.")  # paths of numbers of what acts in a load case
 
 
 class LoadCase(Settings):
@@ -175,6 +176,18 @@ class Specimen(Solid):
         found: dict[str, Scalar] = {}
         for case in self.cases:
             found |= self.loaded(case).scalars
+        return found
+
+    def path_in(self, case: LoadCase, path: str) -> str:
+        """Return the path of a number of one load case alone: of what acts there `cases.NAME.PATH`, else the same."""
+        return f"cases.{case.name}.{path}" if path.startswith(ACTING) else path
+
+    @property
+    def every_scalar(self) -> dict[str, Scalar]:
+        """Every number, those of what acts apart by load case."""
+        found: dict[str, Scalar] = {}
+        for case in self.cases:
+            found |= {self.path_in(case, path): number for path, number in self.loaded(case).scalars.items()}
         return found
 
     @property

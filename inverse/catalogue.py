@@ -173,6 +173,12 @@ TABLE: dict[str, str | Words] = {
         ": what they are said to tell needs a finer mesh, or an inversion that corrects the error as invert "
         "does; method.mesh_error = 'noise' counts it as noise."
     ),
+    "taken-for-granted": Words("taken for granted: {listed}", short=""),
+    "uncertain-bent": Words(
+        "{name} is too uncertain for its first order: second order moves {answer} by {size:.2g} deviations; make it a "
+        "parameter, with a normal prior",
+        short="{name} is too uncertain for its first order",
+    ),
     "motions": Words(
         "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
         short="",

@@ -8,14 +8,14 @@ solution.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import eye
+from scipy.sparse import lil_matrix
 
 from forward.affine import Sparse
 from forward.bodies.geometry import AXES
@@ -151,11 +151,11 @@ class PathSolution(CombinedSolution):
 
 def path(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathModel:
     """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
-    whole = HyperelasticModel(spec.whole, comm, (*parameters, *spec.stepped))
+    own = tuple(path for path in parameters if path in {*spec.scalars, *spec.coefficients})
+    whole = HyperelasticModel(spec.whole, comm, (*own, *spec.stepped))
     bodies = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
     values = np.array(list(spec.stepped.values())).T
-    extended = eye(len(parameters) + len(spec.stepped), len(parameters), format="csr")
-    maps = [Sparse(extended, np.append(np.zeros(len(parameters)), of_step)) for of_step in values]
+    maps = [_at_step(own, dict(zip(spec.stepped, of_step, strict=True)), parameters) for of_step in values]
     return PathModel(
         tuple(Mapped(body, by, parameters) for body, by in zip(bodies, maps, strict=True)),
         tuple(output.name for output in spec.returned),
@@ -166,6 +166,18 @@ def path(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathMod
         bodies=bodies,
         values=values,
     )
+
+
+def _at_step(own: Sequence[str], there: Mapping[str, float], parameters: Sequence[str]) -> Sparse:
+    """Return what tells a body's own numbers and those `there` at a step, by their paths, of parameters by theirs."""
+    A, b = lil_matrix((len(own) + len(there), len(parameters))), np.append(np.zeros(len(own)), list(there.values()))
+    for row, path in enumerate((*own, *there)):
+        factor = f"steps.{path}"
+        if row < len(own):
+            A[row, parameters.index(path)] = 1.0
+        elif factor in parameters:
+            A[row, parameters.index(factor)], b[row] = there[path], 0.0
+    return Sparse(A.tocsr(), b)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +320,7 @@ def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel
     ValueError
         For a path that is not a number of any load case.
     """
-    known = {*spec.scalars, *spec.coefficients}
+    known = {*spec.scalars, *spec.every_scalar, *spec.coefficients}
     for path in parameters:
         if path not in known:
             raise ValueError(f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}")
@@ -316,8 +328,10 @@ def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel
     models: list[Mapped] = []
     for case in spec.cases:
         loaded = spec.loaded(case)
-        where = np.flatnonzero(np.isin(parameters, [*loaded.scalars, *loaded.coefficients]))
-        bodies.append(loaded.build(comm, tuple(parameters[i] for i in where)))
+        own = {path: path for path in (*loaded.scalars, *loaded.coefficients)}
+        own |= {spec.path_in(case, path): path for path in loaded.scalars}
+        where = [i for i, path in enumerate(parameters) if path in own]
+        bodies.append(loaded.build(comm, tuple(own[parameters[i]] for i in where)))
         models.append(taking(bodies[-1], where, parameters))
     none = np.zeros(0, dtype=np.int64)
     model = SpecimenModel(

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
+from inverse.criticism.assumptions import Assumptions, Moves
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.stacking import stacking
 from inverse.criticism.verdict import Verdict, verdict_on_points
@@ -127,12 +128,15 @@ class Compared:
         The posterior, its data, and what was found around the mode.
     mesh
         What finer meshes have said; None where they were not asked.
+    assumed
+        What is taken for granted, and how far it moves the posterior; None where it is not looked at.
     """
 
     posterior: Posterior
     data: Measurements
     assessment: Assessment
     mesh: MeshFound | None
+    assumed: tuple[Assumptions, Moves] | None = None
 
     @cached_property
     def points(self) -> Points:
@@ -257,8 +261,13 @@ def comparison(
         variables["chain_effective"] = table({k: np.nan if one is None else one.ess for k, one in chains.items()})
     if all(one.mesh is not None for one in found.values()):
         variables |= _meshes(names, data_groups, parameters, found)
+    held = list(dict.fromkeys(taken.name for one in found.values() if one.assumed for taken in one.assumed[0].all))
+    bends = list(dict.fromkeys(name for one in found.values() if one.assumed for name in one.assumed[0].groups))
+    if held:
+        variables |= _assumptions(names, groups, parameters, held, bends, found)
     coordinates = {"model": names, "group": groups, "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
+    coordinates |= {"assumption": held, "uncertain": bends} if held else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
 
 
@@ -377,4 +386,39 @@ def _meshes(
         "mesh_error": (("model", "output"), np.concatenate(errors, axis=1)),
         "mesh_shift": ((*dims, "parameter"), shift),
         "mesh_left": ((*dims, "parameter"), left),
+    }
+
+
+def _assumptions(
+    names: list[str],
+    groups: list[str],
+    parameters: list[str],
+    held: list[str],
+    uncertain: list[str],
+    found: Mapping[Pair, Compared],
+) -> dict[str, Any]:
+    """How far what is taken for granted moves the constants, in their deviations, and ln Z; NaN where it is not."""
+    shape, dims = (len(names), len(groups), len(held)), ("model", "group", "assumption")
+    shift, added = np.full((*shape, len(parameters)), np.nan), np.full(shape, np.nan)
+    bend = np.full((*shape[:2], len(uncertain), len(parameters)), np.nan)
+    size, part = np.full((2, len(names), len(held)), np.nan)
+    unit: dict[str, str] = {}
+    for (k, g), one, columns in _cells(names, groups, parameters, found):
+        if one.assumed is None:
+            continue
+        taken, moves = one.assumed
+        rows, mine = [held.index(each.name) for each in taken.all], columns[: len(one.posterior.inputs.names)]
+        std = answer(one.posterior, one.assessment).std[: len(mine)]
+        shift[k, g][np.ix_(rows, mine)] = moves.parameters / std
+        bend[k, g][np.ix_([uncertain.index(name) for name in taken.groups], mine)] = moves.bends / std
+        added[k, g, rows] = moves.log_evidence
+        size[k, rows], part[k, rows] = [each.size for each in taken.all], [each.part for each in taken.all]
+        unit |= {each.name: each.unit for each in taken.all}
+    return {
+        "assumption_shift": ((*dims, "parameter"), shift),
+        "assumption_bend": (("model", "group", "uncertain", "parameter"), bend),
+        "assumption_log_evidence": (dims, added),
+        "assumption_size": (("model", "assumption"), size),
+        "assumption_part": (("model", "assumption"), part),
+        "assumption_unit": ("assumption", [unit[name] for name in held]),
     }

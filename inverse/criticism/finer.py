@@ -132,7 +132,7 @@ class MeshFound:
 
 
 def parameters_moved(posterior: Posterior, gaussian: Laplace, A: FloatArray, error: FloatArray) -> FloatArray:
-    """Return how far the most probable parameters (d,) move if predictions are larger by `error` (m,).
+    """Return how far the most probable parameters (d,), or (d, k), move if predictions are larger by (m,), or (m, k).
 
     The derivatives A (m, d) by the normal coordinates are over the errors of the data, as the error is.
     """

@@ -118,6 +118,8 @@ class Noise:
         (k, m): what data share, a row for a standard deviation of each; None if there is nothing.
     model
         What the model misses; None where that is not known, or nothing.
+    uncertain
+        (k, m): what predictions share because of what is taken for granted, as `shared`.
     """
 
     sigma: FloatArray
@@ -125,6 +127,7 @@ class Noise:
     factor: Distribution | None = None
     shared: FloatArray | None = None
     model: ModelError | None = None
+    uncertain: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if not (self.sigma > 0).all():
@@ -132,18 +135,20 @@ class Noise:
 
     def of(self, rows: NDArray[np.intp]) -> Noise:
         """Return that of some of the data, by number."""
-        shared, model = None if self.shared is None else self.shared[:, rows], self.model
+        shared, uncertain = (None if of is None else of[:, rows] for of in (self.shared, self.uncertain))
+        model = self.model
         if model is not None:
             error, slopes, root, apart = model.error[rows], model.slopes[rows], model.root[:, rows], model.apart[rows]
             model = replace(model, error=error, slopes=slopes, root=root, apart=apart)
-        return replace(self, sigma=self.sigma[rows], shared=shared, model=model)
+        return replace(self, sigma=self.sigma[rows], shared=shared, model=model, uncertain=uncertain)
 
     def seen(self, measured: FloatArray) -> Noise:
         """Return the same where those data that were not measured, zeros among ones (m,), share nothing."""
-        shared, model = None if self.shared is None else self.shared * measured, self.model
+        shared, uncertain = (None if of is None else of * measured for of in (self.shared, self.uncertain))
+        model = self.model
         if model is not None:
             model = replace(model, root=model.root * measured, apart=model.apart * measured)
-        return replace(self, shared=shared, model=model)
+        return replace(self, shared=shared, model=model, uncertain=uncertain)
 
     @cached_property
     def scale(self) -> FloatArray:
@@ -161,7 +166,8 @@ class Noise:
     @cached_property
     def _rows(self) -> FloatArray:
         """Uᵀ (k, m), of all that is shared."""
-        roots = [np.zeros((0, len(self.sigma))) if self.shared is None else self.shared]
+        none = np.zeros((0, len(self.sigma)))
+        roots = [none if of is None else of for of in (self.shared, self.uncertain)]
         return np.concatenate(roots if self.model is None else [*roots, self.model.root / self.model.scale])
 
     @cached_property
@@ -213,6 +219,11 @@ class Noise:
     def score(self, r: FloatArray) -> FloatArray:
         """Return ψ = ρ′."""
         return r if self.dof is None else np.asarray((self.dof + 1) * r / (self.dof + r**2))
+
+    def score_slope(self, r: FloatArray) -> FloatArray:
+        """Return ψ′ = ρ″, which is negative of data that do not belong."""
+        nu = self.dof
+        return np.ones_like(r) if nu is None else np.asarray((nu + 1) * (nu - r**2) / (nu + r**2) ** 2)
 
     def information(self, r: FloatArray) -> FloatArray:
         """Return what stands for ψ′ in Gauss–Newton's matrix; never negative."""

@@ -13,9 +13,10 @@ prior before the search for the mode, then at the mode.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,8 @@ from uq.evaluation.request import Evaluate, Request
 STEP = 1e-4  # of the extent of the points: how far they are moved for derivatives
 DETERMINED = 1.0  # eigenvalue from which on data say more about a motion than the registration
 
-Shared = Callable[[FloatArray], FloatArray]  # parameters (d,) → (k, m), what errors the data share, in their units
+# Parameters (d,) → what errors the data share there: rows (k, m), in their units, by the names of them in `Noise`.
+Shared = Callable[[FloatArray], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,16 +109,16 @@ class SharedMotion:
         return np.argsort(cases, kind="stable")
 
     def errors_by(self, evaluate: Evaluate) -> Shared:
-        """Return the function parameters (d,) → what the data share (k, m), given the model of what is observed.
+        """Return the function parameters (d,) → what the data share, given the model of what is observed.
 
         It raises `SolveError` where that has no answer.
         """
 
-        def errors(point: FloatArray) -> FloatArray:
+        def errors(point: FloatArray) -> Mapping[str, FloatArray]:
             found = evaluate(Request(point[None]))
             for failure in found.failures:
                 raise SolveError(failure.reason)
-            return self.errors(found.outputs[0])
+            return {"shared": self.errors(found.outputs[0])}
 
         return errors
 
@@ -137,6 +139,13 @@ class SharedMotion:
             each = np.einsum("ma,mak->km", self.along, slopes(self.places + u, self.centre)) * self.between[:, None]
             rows += [row * (self.cases == case) for case in np.unique(self.cases) for row in each]
         return np.array(rows).reshape(-1, m)
+
+
+def together(one: Shared | None, other: Shared | None) -> Shared | None:
+    """Return what errors data share for two reasons; None if for neither."""
+    if one is None or other is None:
+        return one or other
+    return lambda point: {**one(point), **other(point)}
 
 
 def said(values: FloatArray) -> Finding:

@@ -5,10 +5,11 @@ Start, mode, errors that data share, error of the mesh, evidence: in this order,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.assessment import Assessment, Kind, When, assess
@@ -122,8 +123,8 @@ def infer(
     return Inferred(posterior, searched, one, mesh, before)
 
 
-def _sharing(posterior: Posterior, shared: FloatArray) -> Posterior:
-    return replace(posterior, noise=replace(posterior.noise, shared=shared))
+def _sharing(posterior: Posterior, shared: Mapping[str, Any]) -> Posterior:
+    return replace(posterior, noise=replace(posterior.noise, **shared))
 
 
 def by_tangents(inputs: Inputs, evaluate: Evaluate) -> Starts:

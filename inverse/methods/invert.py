@@ -85,6 +85,9 @@ class Invert(MeshTreatment, Settings):
         the posterior, by solves on finer meshes with thinner cells at the faces that are held: "correct" the model by
         it where it exceeds a fifth of either, with what is uncertain of it among the errors of the data; "report" it
         only; false: not at all, and no posterior is said to be trusted.
+    assumptions
+        Tell how far what is taken for granted moves the answers: numbers of the model that are not unknown, scales of
+        the data and places of its points (one solve, with derivatives by these numbers).
     expansion
         Solves of an expansion of the outputs over the prior that all data sets share: they are then inverted with it,
         in about a second each, whatever a solve takes. By default every data set has solves of its own.
@@ -110,6 +113,7 @@ class Invert(MeshTreatment, Settings):
     expansion: Annotated[int, Field(ge=LEAST_SHARED)] | None = None
     reduced: ByReduced | None = None
     mesh_check: bool = True
+    assumptions: bool = True
 
     @field_validator("reduced", mode="before", json_schema_input_type=ByReduced | str)
     @classmethod

@@ -24,6 +24,7 @@ from inverse.criticism.assessment import (
     of_gaussian,
     weighted,
 )
+from inverse.criticism.assumptions import Assumptions, moved_by
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import resampled
@@ -154,6 +155,7 @@ def invert_few(
         **of_motions(spectrum, posterior.noise, root),
         **_moments(posterior, one, known, points, look),
         **_alone(posterior, gaussian, spectrum, data),
+        **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
         **_draws(posterior, *drawn),
         "point": points.values,
         "point_weight": points.weights,
@@ -233,6 +235,14 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Me
 
     cases = range(int(data.cases.max()) + 1)
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
+
+
+def _of_assumed(posterior: Posterior, gaussian: Laplace, at: Density, known: Answer, assumed: Assumptions) -> Record:
+    """How far (…, c) what is taken for granted moves the parameters, in their deviations; of the noise NaN."""
+    moves, d = moved_by(posterior, gaussian, at, assumed), len(posterior.inputs.names)
+    nans = ((0, 0), (0, len(known.std) - d))
+    shift, bend = (np.pad(of / known.std[:d], nans, constant_values=np.nan) for of in (moves.parameters, moves.bends))
+    return {"assumption_shift": shift, "assumption_bend": bend}
 
 
 def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.assessment import quantiles
+from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
@@ -25,7 +26,7 @@ from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise_size import SolvedField, infer_noise
 from inverse.methods.invert import Invert
-from inverse.methods.mesh_correction import corrected_field, told
+from inverse.methods.mesh_correction import corrected_field, field_moved, told
 from inverse.methods.record import (
     COLUMNS,
     ENDS,
@@ -93,9 +94,9 @@ def invert_field(
     before = _before(posterior, finer, problem.say) if method.treatment is not None else None
     first = None
     if shared is not None:  # which depends on the displacements
-        noise = replace(posterior.noise, shared=shared(posterior.values(np.zeros(posterior.size))))
+        noise = replace(posterior.noise, **shared(posterior.values(np.zeros(posterior.size))))
         begun = _solve(method, replace(posterior, noise=noise), None).mode.point
-        noise, first = replace(noise, shared=shared(begun.values)), begun.whitened
+        noise, first = replace(noise, **shared(begun.values)), begun.whitened
         posterior = replace(posterior, noise=noise)
 
     def solve(asked: FieldPosterior, start: FloatArray | None) -> SolvedField:
@@ -154,9 +155,35 @@ def invert_field(
         "neglected": np.array(spectrum.neglected),
         "information": np.array(found.information),
     }
+    if problem.assumed is not None:
+        record |= _of_assumed(solved, problem.assumed, g, np.asarray(stiffness["stiffness_std"]), mean["std"])
     if predict is not None:
         record |= predict(found, corrected)
     return as_dataset(record)
+
+
+def _of_assumed(solved: SolvedField, assumed: Assumptions, g: FloatArray, std: FloatArray, of_mean: Any) -> Record:
+    """How far what is taken for granted moves the mean over the body, and the vertex that it moves most, in deviations.
+
+    Of second order the larger of both.
+    """
+    point = solved.mode.point
+    state = np.asarray(point.solution.state)
+    found: Record = {}
+    for name, changes in (
+        ("shift", assumed.changes(point.values[None], state)[0]),
+        ("bend", assumed.bends(point.values, state)),
+    ):
+        moves = field_moved(solved, changes)
+        largest = np.abs(moves / np.maximum(std, 1e-300)).max(axis=1, initial=0.0)
+        rows = np.full((len(moves), np.size(of_mean)), np.nan)
+        rows[:, 0] = moves @ g / np.ravel(of_mean)[0]
+        if name == "shift":
+            found["assumption_stiffness"] = largest
+        else:
+            rows[:, 0] = np.maximum(np.abs(rows[:, 0]), largest)
+        found[f"assumption_{name}"] = rows
+    return found
 
 
 def _before(posterior: FieldPosterior, finer: Finer, say: Callable[[str], None]) -> float:

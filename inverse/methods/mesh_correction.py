@@ -262,7 +262,7 @@ def corrected_field(
         found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.seen)]))
         # Nothing is said of data that are not there.
         over = found.error * posterior.measured / point.posterior.noise.sigma
-        moved = _moved(here, found.error if mesh is None else found.error - mesh.error)
+        moved = field_moved(here, found.error if mesh is None else found.error - mesh.error)
         width = here.found.marginal(weights)[1]
         shift = np.array([weights @ moved / width])
         largest = max(abs(float(shift[0])), float(np.sqrt(((moved / here.found.std) ** 2).mean())))
@@ -279,11 +279,11 @@ def corrected_field(
     return here, moved, known
 
 
-def _moved(here: SolvedField, error: FloatArray) -> FloatArray:
-    """How far (N,) the mode of a field moves where data are predicted larger by `error` (n,), in their units."""
+def field_moved(here: SolvedField, error: FloatArray) -> FloatArray:
+    """Return how far (…, N) the mode of a field moves where data are predicted larger by (…, n), in their units."""
     point, spectrum = here.mode.point, here.found.spectrum
     over = point.root * point.posterior.seen.whitened(point.posterior.weights * error)
-    return np.asarray(-(spectrum.images @ over / (1 + spectrum.values)) @ here.found.directions)
+    return np.asarray(-(over @ spectrum.images.T / (1 + spectrum.values)) @ here.found.directions)
 
 
 def _gain(here: SolvedField, weights: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.predictive import ResidualTest
@@ -58,6 +59,9 @@ _ARRAYS = {
     "case": "alone_determined misfit misfit_degrees misfit_count",
     "case direction": "alone_eigenvalue",
     "motion": "motion_eigenvalue",
+    "assumption parameter": "assumption_shift",
+    "assumption": "assumption_stiffness",
+    "uncertain parameter": "assumption_bend",
     "iteration column": "step",
     "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution",
     "datum axis": "place datum_direction",
@@ -101,6 +105,8 @@ class Problem:
         Shows the user a line before the search.
     steps
         What keeps what is found of few parameters.
+    assumed
+        What is taken for granted; None if it is not looked at.
     """
 
     data: Measurements
@@ -110,6 +116,7 @@ class Problem:
     shared: Shared | None = None
     say: Callable[[str], None] = field(default=lambda line: None)
     steps: Steps = ALL_AGAIN
+    assumed: Assumptions | None = None
 
     @property
     def noise(self) -> Noise:

@@ -21,6 +21,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.phases import phase
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, When, solves_of
+from inverse.criticism.assumptions import Assumptions, Moves, moved_by
 from inverse.criticism.comparison import Candidate, Compared, comparison
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
@@ -113,6 +114,8 @@ class Select(MeshTreatment, Settings):
         constants and predictions are theirs; those by "hmc" tell the evidence too, where weighted points cannot.
     chains_when
         "needed": only where weighted points cannot be trusted.
+    assumptions
+        Tell how far what is taken for granted moves the constants and the evidence, as an inversion does.
     check
         "dynesty": compute the evidences by nested sampling too.
     mesh_error
@@ -137,6 +140,7 @@ class Select(MeshTreatment, Settings):
     check: Literal["dynesty"] | None = None
     mesh_error: Literal["correct", "report", False] = "correct"
     mesh_check: bool = True
+    assumptions: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> Select:
@@ -165,6 +169,7 @@ class Select(MeshTreatment, Settings):
         shared: Mapping[tuple[str, str], Shared] | None = None,
         model: Callable[[str, str], ForwardModel] | None = None,
         steps: Callable[[str, str], Steps] = lambda name, group: ALL_AGAIN,
+        assumed: Callable[[str, str], Assumptions] | None = None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -188,6 +193,8 @@ class Select(MeshTreatment, Settings):
             The model of a candidate for a group itself, whose gradients chains follow.
         steps
             What keeps what is found of a candidate for a group; by default an interrupted comparison begins again.
+        assumed
+            What a candidate and a group take for granted; by default it is not looked at.
 
         Returns
         -------
@@ -273,11 +280,17 @@ class Select(MeshTreatment, Settings):
             for test in dict.fromkeys(tests_of)
         }
         compared = {
-            (name, group): Compared(one.posterior, data_groups[group], one.assessment, one.mesh)
+            (name, group): Compared(
+                one.posterior,
+                data_groups[group],
+                one.assessment,
+                one.mesh,
+                None if assumed is None else _taken(one.posterior, one.assessment.gaussian, assumed(name, group)),
+            )
             for (name, group), one in found.items()
         }
         result = comparison(candidates, data_groups, compared, variants, checks, left_out)
-        if not shared:
+        if any(one.noise.shared is None for one in posteriors.values()):
             return result
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
         return result.assign(motion_eigenvalue=(("model", "motion"), np.array(seen)))
@@ -288,6 +301,12 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
     seen = data.seen()
     which = np.arange(len(seen))  # what is only predicted follows
     return Posterior(candidate.inputs, evaluate, seen.values, noise.of(seen), which)
+
+
+def _taken(posterior: Posterior, gaussian: Laplace, assumed: Assumptions) -> tuple[Assumptions, Moves]:
+    """What is taken for granted, and how far it moves a posterior."""
+    at = posterior.at(gaussian.mode[None], derivatives=True)
+    return assumed, moved_by(posterior, gaussian, at, assumed)
 
 
 def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:

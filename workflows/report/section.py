@@ -217,6 +217,7 @@ SECTIONS = Kinds(
         "predictions": f"{_HERE}.inversions:predictions",
         "posterior": f"{_HERE}.posterior:posterior",
         "posterior-field": f"{_HERE}.posterior:field_posterior",
+        "taken-for-granted": f"{_HERE}.assumptions:taken_for_granted",
         "places": f"{_HERE}.bodies:places",
         "finer-meshes": f"{_HERE}.errors:finer_meshes",
         "dependence": f"{_HERE}.selection:dependence",

@@ -48,6 +48,9 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         How it is inverted.
     predict
         What else is to be known by the posterior; by default nothing.
+    uncertain
+        Standard deviations of what is taken for granted, by its name, as the table of it in a report has it: of numbers
+        of the model, ``data.scale`` and ``data.shift``. Their errors are among those of the data, to first order.
     """
 
     stopped: ClassVar[str] = "all data sets inverted"
@@ -168,10 +171,19 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             if name not in self.model.scalars:
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
+        yield from self._of_uncertain()
         if self.predict is not None:
             from workflows.studies.predicted import mistakes
 
             yield from mistakes(self)
+
+    def _of_uncertain(self) -> Iterator[Mistake]:
+        """Find what cannot be uncertain."""
+        if self.uncertain and (self.method.expansion is not None or self.method.reduced is not None):
+            message = "what is uncertain beside the parameters needs solves of the model itself, expected neither "
+            yield ("uncertain",), f"{message}method.expansion nor method.reduced", list(self.uncertain)
+        elif self.taken is not None:
+            yield from self.taken.mistakes()
 
     def _of_specimen(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of displacements."""

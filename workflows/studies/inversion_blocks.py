@@ -22,6 +22,7 @@ from workflows.config.priors import ranges
 from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
+from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class InversionBlocks(OneModel):
     data: Annotated[DataFiles | MeasuredOutputs, AS_DECIDED]
     method: Invert = Invert()
     predict: Predict | None = None
+    uncertain: dict[str, Uncertain] = Field(default={})
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     if TYPE_CHECKING:  # of every study
@@ -152,6 +154,13 @@ class InversionBlocks(OneModel):
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
+
+    @property
+    def taken(self) -> TakenForGranted | None:
+        """What is taken for granted; None where it is not looked at."""
+        if self.method.expansion is not None or not (self.method.assumptions or self.uncertain):
+            return None
+        return TakenForGranted(self.spec, self.unknown, self.measurements, self.uncertain)
 
     # --- the data ----------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,9 @@ from forward.fem.finer import Keep, extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
+from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.criticism.finer import Finer
+from inverse.data.shared_motion import together
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.record import Problem, with_record
@@ -27,6 +29,7 @@ from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
+from workflows.studies.assumptions import ASSUMED
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import (
     BATCH,
@@ -84,11 +87,14 @@ class _Observed:
         The same on finer meshes (`forward.fem.finer`).
     shared
         What errors the data share, and the model that tells what they are; None if they are independent.
+    held
+        The model with the numbers that are taken for granted; None where it is not asked.
     """
 
     model: ForwardModel
     there: There
     shared: tuple[SharedMotion, ForwardModel] | None = None
+    held: ForwardModel | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +130,17 @@ def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
         there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
-    return _Made(model, lambda number: _Observed(model, there))
+    held = _holding(study, ensemble)
+    return _Made(model, lambda number: _Observed(model, there, held=held(number)))
+
+
+def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], ForwardModel | None]:
+    """Return what makes the model of a data set, by its number, with what is taken for granted; collective."""
+    taken = study.taken
+    if taken is None:
+        return lambda number: None
+    model = taken.build(ensemble.group)
+    return lambda number: taken.observed(model, study.measurements[number])
 
 
 def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
@@ -133,6 +149,7 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep)
     model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
     meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
+    held = _holding(study, ensemble)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
@@ -146,7 +163,7 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep)
         there = None if meshes is None else meshes.of(own)
         motion = motion_of(data, study.model.body)
         shared = None if motion is None else (motion, model.observing(*motion.observed))
-        return _Observed(own, (there, why), shared)
+        return _Observed(own, (there, why), shared, held(number))
 
     return _Made(model, observed, vertices, look)
 
@@ -189,7 +206,14 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensem
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
     steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
-    return Problem(study.measurements[number], study.method, study.data.errors, finer, shared, ensemble.say, steps)
+    data, taken, assumed = study.measurements[number], study.taken, None
+    if taken is not None:
+        held, ask = seen.held, None
+        if held is not None:
+            ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
+        assumed = taken.of(data, ask)
+        shared = together(shared, assumed.shared)
+    return Problem(data, study.method, study.data.errors, finer, shared, ensemble.say, steps, assumed)
 
 
 def _inverted(
@@ -357,7 +381,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Ch
     recorders: dict[str, Recorder] = {}
     cheap = _reduced(study)(seen.model)
     moved = None if seen.shared is None else seen.shared[1]
-    models = {FINER: None if seen.there is None else seen.there[0], MOVED: moved, PREDICTED: predicted}
+    fine = None if seen.there is None else seen.there[0]
+    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: seen.held}
     others = {name: partial(lambda one: one, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:

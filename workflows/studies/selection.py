@@ -52,6 +52,8 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         Models by name.
     predict
         Tests of materials that are predicted besides the measured ones, in every group.
+    uncertain
+        Standard deviations of what is taken for granted, as of inversions; candidates without such a number have none.
     method
         How the candidates are compared.
     """
@@ -208,6 +210,15 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             if spec is not None:
                 yield from self.mistakes_of_ranks(spec)
         yield from self._of_method()
+        yield from self._of_uncertain()
+
+    def _of_uncertain(self) -> Iterator[Mistake]:
+        """Find what is stated to be uncertain of which no candidate takes anything for granted."""
+        each = [
+            {place: (place, message, given) for place, message, given in taken.mistakes()}
+            for taken in (self.takes(name, []) for name in self.candidates if self.uncertain)
+        ]
+        yield from (one for place, one in (each[0] if each else {}).items() if all(place in other for other in each))
 
     def _of_tests(self) -> Iterator[Mistake]:
         """Find several tests of one name in a group, words about meshes, and candidates that are no materials."""

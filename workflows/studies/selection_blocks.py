@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +26,7 @@ from workflows.config.tables import at
 from workflows.data.material_tests import WHOLE, MeasuredTests
 from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
+from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.predictions import has_mesh, meshes_of
 
@@ -41,6 +42,7 @@ class SelectionBlocks(OfCandidates):
     data: Annotated[MeasuredTests | DisplacementFile | OutputFile, AS_DECIDED]
     candidates: Annotated[dict[str, CandidateModel], Field(min_length=1)]
     predict: tuple[MaterialTest, ...] = ()
+    uncertain: dict[str, Uncertain] = Field(default={})
     method: Select
     measurements: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)
 
@@ -112,6 +114,15 @@ class SelectionBlocks(OfCandidates):
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
         spec: Any = self.of_candidates[name]
         return motion_of(self.data_as_in(spec), spec.body) if spec.placed else None
+
+    def takes(self, name: str, found: Sequence[Measurements]) -> TakenForGranted:
+        """Return what a candidate and data take for granted."""
+        return TakenForGranted(self.of_candidates[name], tuple(self.candidates[name].parameters), found, self.uncertain)
+
+    def taken(self, name: str, group: str) -> TakenForGranted:
+        """Return the same of a group of data."""
+        data = self.data_groups[group] if self.model is None else self.data_as_in(self.of_candidates[name])
+        return self.takes(name, [data.seen()])
 
     # --- the data ----------------------------------------------------------------------------------------------------
 

@@ -12,12 +12,15 @@ from forward.combine import sums_of
 from forward.fem.finer import Keep, extrapolated
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel
+from inverse.criticism.assumptions import Assumptions, by_evaluation
 from inverse.criticism.finer import Finer
+from inverse.data.shared_motion import together
 from uq.evaluation.evaluate import Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
+from workflows.studies.assumptions import ASSUMED
 from workflows.studies.job import MOVED, MethodJob, kept_starts
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
@@ -41,10 +44,20 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
     recorders: dict[str, Recorder] = {}
     kept = Kept(checkpoint, MPI.COMM_SELF, "steps")  # of the method, which runs on the first rank
     checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
+    taken = {pair: study.taken(*pair) for pair in study.pairs}
     motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
+        def assumed(name: str, group: str) -> Assumptions:
+            one = taken[name, group]
+            (data,) = one.found
+            assert data is not None
+            asked = by_evaluation(evaluate.on(f"{name}/{group}/{ASSUMED}")) if one.asked else None
+            return one.of(data, asked)
+
         shared = {(n, g): motion.errors_by(evaluate.on(f"{n}/{g}/{MOVED}")) for (n, g), motion in motions.items()}
+        both = {pair: together(shared.get(pair), assumed(*pair).shared) for pair in taken}
+        shared = {pair: one for pair, one in both.items() if one is not None}
 
         def recorded(name: str, group: str) -> Evaluate:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
@@ -69,6 +82,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
             shared or None,
             lambda *pair: makers[pair](),
             lambda *pair: Steps(kept, recorders["/".join(pair)], "/".join(pair), ensemble.count),
+            assumed if method.assumptions or study.uncertain else None,
         )
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
@@ -92,15 +106,16 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         for n, g in checked
     }
     moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
+    held_ones = {f"{n}/{g}/{ASSUMED}": partial(one.model, ensemble.group) for (n, g), one in taken.items() if one.asked}
     return MethodJob(
         makers[study.pairs[0]](),
-        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones,
+        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones | held_ones,
         task,
         recorders,
         labelled=labelled,
         arviz_groups=partial(comparison.arviz_groups, study.models, method.noise.factor, method.seed),
         costly=study.model is not None or method.chains in {"pcn", "emcee"},  # whose one step may take minutes
-        passing=frozenset(finer_ones),
+        passing=frozenset({*finer_ones, *held_ones}),
     )
 
 

@@ -137,6 +137,61 @@ def test_a_linear_model_has_its_exact_posterior(alone, looked_at):
     assert "oad case" not in page
 
 
+def test_what_is_taken_for_granted_is_told(alone, batch, folder):
+    """Scales of the data in closed form, in deviations of the posterior; said and shown; in a batch too; or not."""
+    one = results(alone).isel(data_set=0)
+    covariance = exactly([0, 2, 2], VALUES, SIGMA)[1]
+    B, part = A[[0, 2, 2]], 0.01 * VALUES / SIGMA**2
+    right = np.array([covariance @ (B.T @ (part * here)) for here in ([1, 0, 0], [0, 1, 1])])  # of u, and of w
+    assert one["assumption"].values.tolist() == ["data.scale.displacement", "data.scale.w"]
+    np.testing.assert_allclose(one["assumption_shift"], right / one["std"].to_numpy(), rtol=1e-5)
+    assert one["assumption_part"].values.tolist() == [0.01, 0.01]
+    found = json.loads((alone / "summary.json").read_text())["findings"]
+    (note,) = (one for one in found if one["code"] == "taken-for-granted")
+    assert note["severity"] == "note"
+    assert "if measured w is 1 % larger than stated, " in note["text"]
+    page = (alone / "report.html").read_text()
+    assert "Taken for granted" in page
+    assert "measured displacement is 1 % larger" in page
+    assert results(batch)["assumption_shift"].shape == (3, 2, 2)
+    assert ran(folder / "stated.toml", folder / "without", "method.assumptions=false") == 0
+    assert "assumption" not in results(folder / "without").dims
+
+
+def test_what_is_uncertain_is_among_the_errors(folder):
+    """Of a linear model and normal errors exactly: a scale that all data share, and one of each quantity."""
+    changes = ["uncertain={'data.scale'=0.2}", "uncertain={'data.scale.displacement'=0.2, 'data.scale.w'={std=0.2}}"]
+    B, apart = A[[0, 2, 2]], [1, 0, 0]
+    for number, change in enumerate(changes):
+        out = folder / f"uncertain-{number}"
+        assert ran(folder / "stated.toml", out, change) == 0
+        one = results(out).isel(data_set=0)
+        parts = [VALUES * 0.2] if number == 0 else [VALUES * 0.2 * apart, VALUES * 0.2 * np.subtract(1, apart)]
+        errors = np.diag(SIGMA**2) + np.transpose(parts) @ parts
+        covariance = np.linalg.inv(B.T @ np.linalg.solve(errors, B) + np.diag(STD**-2.0))
+        mode = covariance @ (B.T @ np.linalg.solve(errors, VALUES) + MEAN / STD**2)
+        np.testing.assert_allclose(one["mode"], mode, rtol=1e-6)
+        np.testing.assert_allclose(one["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-6)
+        assert "motion_eigenvalue" not in one
+        assert one["assumption_part"].values.tolist() == [0.2, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("uncertain={'data.scale'=0}", "uncertain.data.scale.std: input should be greater than 0; given 0"),
+        ("uncertain={a=0.1}", "uncertain.a: is a parameter too, expected one of both; given 'a'"),
+        ("uncertain={'data.scales'=0.1}", "uncertain.data.scales: not a number that is taken for granted; did you"),
+        ("uncertain={'data.shift.x'={std=1e-3}}", "uncertain.data.shift.x: not a number that is taken for granted"),
+        ("uncertain={'data.scale'={}}", "uncertain.data.scale: expected either relative or std"),
+    ],
+)
+def test_what_cannot_be_uncertain_is_refused(folder, given, told):
+    with pytest.raises(StudyError) as error:
+        load(folder / "stated.toml", [given])
+    assert told in str(error.value)
+
+
 def test_tables_are_data_sets_side_by_side(batch, looked_at, capsys):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     found = results(batch)

@@ -99,8 +99,21 @@ def test_linear_models_have_their_exact_evidences(folder, looked_at):
         assert "mesh_checked" not in found
         assert found["output_test"].values.tolist() == ["w", "w", "u"]
         assert found.attrs["quantity"] == "output"
+        # What a candidate takes for granted: one of them holds b = −1, of which 1 % moves a as in closed form.
+        alone = found.sel(model="one-alone").isel(group=0)
+        B, sigma = ONE[[2, 2, 0]], np.array([0.3, 0.3, 0.05])
+        variance = 1 / (STD[0] ** -2 + ((B[:, 0] / sigma) ** 2).sum())
+        change = -0.01 * B[:, 1] / sigma**2
+        std = float(alone["constant_std"].sel(parameter="a"))
+        moved = alone["assumption_shift"].sel(assumption="b", parameter="a")
+        np.testing.assert_allclose(moved, -variance * (B[:, 0] @ change) / std, rtol=1e-5)
+        residual = B @ [float(alone["constant_mode"].sel(parameter="a")), -1.0] - [3.1, 2.9, 0.4]
+        np.testing.assert_allclose(alone["assumption_log_evidence"].sel(assumption="b"), -residual @ change, rtol=1e-5)
+        assert np.isnan(found["assumption_shift"].sel(model="one", assumption="b")).all()
     assert set(json.loads((out / "summary.json").read_text())["models"]) == {"one", "one-alone", "other"}
-    assert "one-alone" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert "one-alone" in page
+    assert "b is 1 % larger" in page
     looked_at(out)
     study, table = load(folder / "rivals.toml"), 'data={file="table.csv", sigma={w=0.3}}'
     assert (
@@ -109,6 +122,18 @@ def test_linear_models_have_their_exact_evidences(folder, looked_at):
     )
     assert parse(document(study)) == study
     assert main(["check", str(folder / "rivals.toml")]) == 0
+
+
+def test_a_number_that_is_uncertain_counts_as_one_that_is_inferred(folder):
+    """Marginalised, where the model is linear: a candidate that holds b has the evidence of the one that infers it."""
+    (folder / "uncertain.toml").write_text(f"{STUDY}\n[uncertain]\nb = 2.0\n")
+    assert main(["run", str(folder / "uncertain.toml"), "--out", str(folder / "out"), "--quiet", "--no-report"]) == 0
+    with xr.open_dataset(folder / "out" / "results.nc", engine="h5netcdf") as found:
+        by_name = found["log_evidence"]
+        np.testing.assert_allclose(by_name.sel(model="one-alone"), log_evidence(ONE, STD), rtol=1e-8)
+        np.testing.assert_allclose(by_name.sel(model="one"), log_evidence(ONE, STD), rtol=1e-8)
+        modes = found["constant_mode"].isel(group=0).sel(parameter="a")
+        np.testing.assert_allclose(modes.sel(model="one-alone"), modes.sel(model="one"), rtol=1e-6)
 
 
 def test_a_candidate_with_a_wrong_jacobian_is_named(folder):

@@ -131,7 +131,7 @@ def test_motions_that_are_uncertain_are_integrated_out(study):
     data = it.data_groups["all"]
     model, motion = it.build("right", "all", MPI.COMM_SELF), it.shared("right", "all")
     mode = found["constant_mode"].values[0, 0, :1]
-    G = motion.errors_by(SerialEvaluate(model.observing(*motion.observed)))(mode)
+    G = motion.errors_by(SerialEvaluate(model.observing(*motion.observed)))(mode)["shared"]
     assert G.shape == (6, len(data.values))
     law = multivariate_normal(np.zeros(len(data.values)), np.diag(data.sigma**2) + G.T @ G)
     grid, prior = np.arange(-2.4, 0.7, 0.08), LogNormal(mean=1.2e4, std=4e3)

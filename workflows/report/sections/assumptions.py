@@ -1,0 +1,65 @@
+"""What inversions and comparisons have taken for granted, and how far it moves their answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.readable import number, spoken
+from inverse.criticism.assumptions import Assumption
+from workflows.report.blocks import Block, Folded, Heading, Table, Text
+from workflows.report.section import Results, section
+from workflows.report.sections.bodies import first
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+OPEN, SETS = 6, 12  # rows of a table that are not folded, and candidates that have one
+SAID = (
+    "What was not inferred is as stated. The table tells how many posterior deviations each answer moves if the truth "
+    "is larger by so much; what is known worse than that moves it in proportion. Residuals cannot show it where the "
+    "unknowns swallow the change."
+)
+
+
+@section("assumption_shift", heading="Taken for granted")
+def taken_for_granted(results: Results) -> Iterator[Block]:
+    """How far everything that was not inferred moves the answers, of each data set or candidate the largest first."""
+    of = results.dataset
+    yield Text(SAID)
+    if "model" in of["assumption_shift"].dims:
+        each = {str(name): of.sel(model=name).isel(group=0) for name in of["model"].values[:SETS]}
+    else:
+        each = {str(one.data_set.item()): one for one in first(results)}
+    for name, one in each.items():
+        if len(each) > 1:
+            yield Heading(name, level=3)
+        yield from _table(one)
+
+
+def _table(one: xr.Dataset) -> Iterator[Block]:
+    shifts = one["assumption_shift"].transpose("assumption", "parameter").to_numpy()
+    if not np.isfinite(shifts).any():
+        yield Text("Nothing is known: the model had no answer beside the mode.")
+        return
+    known = np.isfinite(one["assumption_size"].to_numpy()) & np.isfinite(shifts).any(axis=1)
+    answers = [i for i in range(shifts.shape[1]) if np.isfinite(shifts[:, i]).any()]
+    columns = [(spoken(str(one["parameter"].values[i])), shifts[:, i]) for i in answers]
+    if "assumption_stiffness" in one:
+        columns.append(("stiffness, where it moves most", one["assumption_stiffness"].to_numpy()))
+    if "assumption_log_evidence" in one:
+        columns.append(("ln Z", one["assumption_log_evidence"].to_numpy()))
+    largest = np.nanmax(np.abs(np.column_stack([values for _, values in columns])), axis=1, initial=0.0)
+    rows = []
+    for k in np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]:
+        size, part = (float(one[f"assumption_{key}"][k]) for key in ("size", "part"))
+        assumed = Assumption(str(one["assumption"].values[k]), size, str(one["assumption_unit"].values[k]), part)
+        rows.append((str(assumed), *(number(float(values[k]), 2) for _, values in columns)))
+    head = ("if …", *(title for title, _ in columns))
+    yield Table(head, rows[:OPEN])
+    if len(rows) > OPEN:
+        yield Folded(f"{len(rows) - OPEN} more that move less", [Table(head, rows[OPEN:])])
+    if not known.all():
+        yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")

@@ -1,0 +1,205 @@
+"""What studies that infer take for granted: the model with the numbers that it holds, and what it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from forward.bodies.geometry import AXES
+from forward.model import FloatArray, ForwardModel
+from forward.scalars import Mistake, Scalar
+from forward.settings import Settings, nearest
+from inverse.criticism.assumptions import (
+    PART,
+    STEP_OF,
+    Ask,
+    Assumption,
+    Assumptions,
+    Moved,
+    of_data,
+)
+from inverse.data.measurements import Measurements
+from workflows.data.measured import observing, onto
+
+ASSUMED = "taken for granted"  # in names of models
+
+
+def of_numbers(numbers: Mapping[str, Scalar], unknown: Sequence[str], extent: float) -> list[Assumption]:
+    """Return what numbers of a model, by their paths, take for granted that are not unknown.
+
+    Places may be otherwise by a part of the extent (m) of the body, directions by an angle, other numbers by a part of
+    themselves.
+    """
+    found = []
+    for path, one in numbers.items():
+        whole, place = path.split(".", 2)[-1] if path.startswith("cases.") else path, one.field in AXES
+        size, part = PART * one.value, PART
+        if place and one.unit == "m" and not whole.startswith("displacements."):
+            size, part = PART * extent, 0.0
+        elif one.field.startswith("direction"):
+            size, part = PART, 0.0
+        if whole not in unknown:
+            found.append(Assumption(path, size, one.unit, part))
+    return found
+
+
+class Uncertain(Settings):
+    """How uncertain something is that is taken for granted: a number alone is its standard deviation.
+
+    Parameters
+    ----------
+    relative
+        Standard deviation over the stated value.
+    std
+        Standard deviation in the unit of the number; of scales of the data relative.
+    group
+        Those of one name err together: by as many of their deviations.
+    """
+
+    relative: Annotated[float, Field(gt=0)] | None = None
+    std: Annotated[float, Field(gt=0)] | None = None
+    group: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_number(cls, given: Any) -> Any:
+        return {"std": given} if isinstance(given, int | float) else given
+
+    @model_validator(mode="after")
+    def _check(self) -> Uncertain:
+        if (self.relative is None) == (self.std is None):
+            raise ValueError("expected either relative or std")
+        return self
+
+
+def means(name: str, path: str) -> bool:
+    """Whether what is stated by a name means an assumption: itself, a part of it, or the same in a load case."""
+    return name == path or path.startswith(f"{name}.") or path.split(".", 2)[-1] == name
+
+
+@dataclass(frozen=True, eq=False)
+class TakenForGranted:
+    """What is taken for granted of a model with some unknown numbers, and of the data sets of a study.
+
+    What is stated to be uncertain may be otherwise by its standard deviation.
+    """
+
+    spec: Any
+    unknown: tuple[str, ...]
+    found: Sequence[Measurements | None]
+    stated: Mapping[str, Uncertain] = field(default_factory=dict)
+
+    @cached_property
+    def _extent(self) -> float:
+        return max((high - low for one in self.spec.bodies for low, high in one.body.bounds), default=0.0)
+
+    @cached_property
+    def numbers(self) -> list[Assumption]:
+        """Numbers of the model, but for those that are zero, and not stated to be uncertain."""
+        found = of_numbers(self.spec.every_scalar, self.unknown, self._extent)
+        return [one for one in map(self._as_stated, found) if one.size]
+
+    @cached_property
+    def beside(self) -> list[Assumption]:
+        """Of the data."""
+        return [self._as_stated(one) for one in of_data(self.found, self._units, self._extent)]
+
+    def _as_stated(self, one: Assumption) -> Assumption:
+        for name, how in self.stated.items():
+            if means(name, one.name):
+                if how.std is None:
+                    assert how.relative is not None
+                    return one._replace(size=one.size / PART * how.relative, part=how.relative)
+                return one._replace(size=how.std, part=how.std if one.name.startswith("data.scale.") else 0.0)
+        return one
+
+    @cached_property
+    def groups(self) -> dict[str, FloatArray]:
+        """What is uncertain independently, by its name: weights (k,) of all in it."""
+        found: dict[str, FloatArray] = {}
+        for name, how in self.stated.items():
+            row = np.array([float(means(name, one.name)) for one in self.all])
+            if row.any():
+                label = how.group or name
+                found[label] = found.get(label, 0.0) + row
+        return found
+
+    @cached_property
+    def _units(self) -> dict[str, str]:
+        if self.spec.placed:
+            return {name: unit for units in self.spec.measurable.values() for name, unit in units.items()}
+        return {output.name: output.unit for output in self.spec.returned}
+
+    @property
+    def all(self) -> list[Assumption]:
+        """All of them, in this order."""
+        return [*self.numbers, *self.beside]
+
+    def described(self, *, field: bool) -> str:
+        """Say what is looked at, and how many solves that takes."""
+        solves = 0 if not self.asked else 1 if field else 1 + len(self.unknown)
+        by = f", by {solves} solve{'s' if solves > 1 else ''}" if solves else ""
+        return f"{len(self.numbers)} numbers of the model and {len(self.beside)} of the data{by}: what they move"
+
+    @property
+    def values(self) -> FloatArray:
+        """Values (k,) of the numbers as stated."""
+        return np.array([self.spec.every_scalar[one.name].value for one in self.numbers])
+
+    def build(self, comm: Any) -> Any:
+        """Make the model with all of these numbers among its parameters; collective."""
+        return self.spec.build(comm, (*self.unknown, *(one.name for one in self.numbers)))
+
+    @property
+    def asked(self) -> bool:
+        """Whether the model has to be asked of the data sets."""
+        return bool(self.numbers) or any(one is not None and self._moved(one) is not None for one in self.found)
+
+    def model(self, comm: Any) -> ForwardModel:
+        """Make what is asked of the first data set; collective."""
+        data = self.found[0]
+        assert data is not None
+        found = self.observed(self.build(comm), data)
+        assert found is not None
+        return found
+
+    def observed(self, model: Any, data: Measurements) -> ForwardModel | None:
+        """Return what that model is asked of a data set; collective. None where nothing has to be asked."""
+        moved = self._moved(data)
+        if moved is not None:
+            return moved.observed(model)
+        return observing(model, data) if self.numbers else None
+
+    def of(self, data: Measurements, ask: Ask | None) -> Assumptions:
+        """Return what is taken for granted of a data set."""
+        known = data, self.numbers, self.beside, self.values, self._units
+        return Assumptions(*known, ask, self._moved(data), self.groups)
+
+    def _moved(self, data: Measurements) -> Moved | None:
+        if not self.spec.placed or not np.isfinite(data.places).all(axis=1).any():
+            return None
+        body = self.spec.bodies[0].body
+        return Moved(data, self._extent, onto(body) if data.on_surface else body.nearest, data.on_surface)
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what is stated to be uncertain and is not taken for granted; of data what may be measured counts."""
+        measured = dict.fromkeys(
+            STEP_OF.sub("", name) if unit != "m" else "displacement" for name, unit in self._units.items()
+        )
+        scales = [*(["displacement"] if self.spec.placed else []), *measured]
+        shifts = [f"data.shift.{axis}" for axis in AXES] if self.spec.placed else []
+        known = [*(one.name for one in self.numbers), *(f"data.scale.{name}" for name in scales), *shifts]
+        for name, how in self.stated.items():
+            if name in self.unknown:
+                yield ("uncertain", name), "is a parameter too, expected one of both", name
+            elif not any(means(name, path) for path in known):
+                yield ("uncertain", name), f"not a number that is taken for granted; {nearest(name, known)}", name
+            elif how.relative is not None and not name.startswith("data.scale"):
+                numbers = [one for one in self.numbers if means(name, one.name)]
+                if not all(one.part for one in numbers):
+                    yield ("uncertain", name), "a place or a direction, expected std", how.relative
