@@ -65,6 +65,7 @@ NAMES = (
     "edges",
     "held_out",
     "others",
+    "collections_of_others",
     "scaling",
     "startup",
     "phases",

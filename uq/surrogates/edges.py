@@ -53,6 +53,20 @@ def roots(
     return values, -directions.T / (2 * values[:, None])
 
 
+def beside(indices: IntArray, bounded: NDArray[np.bool_]) -> IntArray:
+    """Return powers (K, d) next to those of a basis (P, d), in bounded parameters (d,).
+
+    It lacks them, and has one or two powers less of each parameter in them: even functions lack no odd ones.
+    """
+    steps = np.concatenate([k * np.eye(bounded.size, dtype=np.int64)[bounded] for k in (1, 2)])
+    inside = indices[(indices[:, ~bounded] == 0).all(axis=1)]
+    known = set(map(tuple, inside.tolist()))
+    found = np.unique((inside + steps[:, None]).reshape(-1, bounded.size), axis=0)
+    less = [[tuple(row) in known for row in (found - step).tolist()] for step in steps]
+    has = np.array(less).reshape(2, -1, len(found)).any(axis=0) | (found[:, bounded].T == 0)
+    return np.asarray(found[has.all(axis=0) & [tuple(row) not in known for row in found.tolist()]])
+
+
 def contradicted(basis: Basis, data: Data) -> FloatArray:
     """Compare values with what an expansion of the gradients alone says of them.
 

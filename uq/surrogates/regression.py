@@ -33,7 +33,7 @@ from uq.surrogates.basis import (
     orthonormal,
     rows_of,
 )
-from uq.surrogates.edges import contradicted, roots, towards_ends
+from uq.surrogates.edges import beside, contradicted, roots, towards_ends
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.outside_samples import Beyond, beyond
 
@@ -185,12 +185,11 @@ class Regression:
             return missing
         varying = (basis.indices != 0).any(axis=1)
         c = fit.coefficients[varying]
-        std = np.linalg.norm(c, axis=0)
-        # Of many parameters those that matter most.
-        matter = shares(c**2, std**2).sum(axis=1) @ (basis.indices[varying] > 0)
-        most, partners = (np.argsort(-np.where(some, matter, -1.0), kind="stable")[:FULL] for some in (tails, True))
-        tails &= np.isin(np.arange(tails.size), most)
-        following = orthonormal(self.inputs, np.array(list(neighbours(basis.indices, tails, partners))))
+        std, d = np.linalg.norm(c, axis=0), np.arange(tails.size)
+        most, partners = self._most(tails), self._most(d >= 0)
+        following = orthonormal(
+            self.inputs, np.array(list(neighbours(basis.indices, np.isin(d, most) & tails, partners)))
+        )
         moved, sizes = self._taken_up(data.left(following))
         pulls = np.abs(shares(moved[varying].T @ c, std))
         norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
@@ -199,9 +198,10 @@ class Regression:
         return np.asarray(np.sqrt((PULLS * largest) ** 2 + (least * missing) ** 2 + shares(missing**2, std) ** 2))
 
     def edges(self) -> FloatArray:
-        """Return errors (2, m) of means and standard deviations by a root at an end of ranges, as large as may be.
+        """Return errors (2, m) of means and standard deviations by what is missing in ranges, as large as may be.
 
-        That is, of the distance to either end of a bounded parameter, or of all of them along the slope of the output.
+        That is a root of the distance to either end of a bounded parameter, or of all of them along the slope of the
+        output, or a function next to those of the basis: it goes wrong next to corners, where few samples are.
         As in `hidden`, ψ is taken up with R⁻¹Qᵀψ, and residuals allow the norm that they have over those of ψ: here
         what is left of ψ is known everywhere, and its mean and its product with the expansion are integrals.
         """
@@ -214,13 +214,24 @@ class Regression:
         (values, slopes), (everywhere, _) = (
             roots(inputs, basis.coordinates, points, directions) for points in (self.data.points, drawn)
         )
+        near = bounded & np.isin(np.arange(bounded.size), self._most(bounded))
+        following = orthonormal(inputs, beside(basis.indices, near))
         columns = replace(self.data, values=values, slopes=None if self.data.slopes is None else slopes).right
-        taken, sizes = self._taken_up(columns)
+        taken, sizes = self._taken_up(np.concatenate([columns, self.data.left(following)], axis=2))
+        everywhere = np.hstack([everywhere, following.values(drawn)])
+        asked = np.concatenate([asked, np.ones((len(following.indices), fit.loo.size))])
         functions, varying = basis.values(drawn), (basis.indices != 0).any(axis=1)
         left, c = everywhere - functions @ taken, fit.coefficients[varying]
         of_std = shares(left.T @ (functions[:, varying] @ c) / POINTS, np.linalg.norm(c, axis=0))
         norms = asked * np.sqrt(shares(fit.squares, sizes[:, None]))
         return np.array([(norms * np.abs(pull)).max(axis=0) for pull in (left.mean(axis=0)[:, None], of_std)])
+
+    def _most(self, some: BoolArray) -> IntArray:
+        """Return the parameters that matter most, `FULL` at most, of some of them (d,) first."""
+        varying = (self.basis.indices != 0).any(axis=1)
+        squares = self.fit.coefficients[varying] ** 2
+        matter = shares(squares, squares.sum(axis=0)).sum(axis=1) @ (self.basis.indices[varying] > 0)
+        return np.argsort(-np.where(some, matter, -1.0), kind="stable")[:FULL]
 
     @cached_property
     def _columns(self) -> tuple[FloatArray, FloatArray]:

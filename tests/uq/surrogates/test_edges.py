@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.polynomial import Legendre
 
 from uq.estimators.moments import Z
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
+from uq.surrogates.edges import beside
 from uq.surrogates.regression import Regression
 
 SEEDS, SOLVES = 40, 12
@@ -17,11 +19,11 @@ SMOOTH = {
 }
 
 
-def fits(value, slopes, d=2, seeds=SEEDS):
+def fits(value, slopes, d=2, seeds=SEEDS, solves=SOLVES):
     """Fits to functions of columns (n, 1) with slopes (n, d), with the sets and orders that expansions take."""
     inputs = Inputs({f"x{i}": Uniform(lower=0.0, upper=1.0) for i in range(d)})
     for seed in range(seeds):
-        points = inputs.points(sobol_points(seed, 0, 0, SOLVES, d))
+        points = inputs.points(sobol_points(seed, 0, 0, solves, d))
         columns = [points[:, [i]] for i in range(d)]
         yield Regression.of(inputs, points, value(*columns), slopes(*columns)[:, None], None)
 
@@ -61,24 +63,53 @@ def test_claims_hold_at_limit_points():
 
 
 @pytest.mark.unit
-def test_errors_are_those_of_the_root_that_residuals_allow():
-    """By another solver of the least squares, and integrals by the rule of the midpoint."""
+def test_errors_are_those_of_the_function_that_residuals_allow():
+    """A root, or the next polynomials: by another solver of the least squares, and integrals by the midpoint rule."""
     found = next(fits(np.exp, np.exp, 1))
     basis, data = found.basis, found.data
     u = (np.arange(20_000)[:, None] + 0.5) / 20_000
     left, right = (one.reshape(-1, one.shape[2]) for one in (data.left(basis), data.right))
     residual = np.linalg.norm(right - left @ found.fit.coefficients)
     expansion = basis.values(u) @ found.fit.coefficients
+    pairs = [
+        (lambda x, end=end: abs(end - x) ** 0.5, lambda x, end=end: (-1) ** end / 2 / abs(end - x) ** 0.5)
+        for end in (0, 1)
+    ]
+    order = int(basis.indices.max())
+    polynomials = (Legendre.basis(k, [0, 1]) * (2 * k + 1) ** 0.5 for k in range(order + 1, order + 3))
+    pairs += [(one, one.deriv()) for one in polynomials]
     means, stds = [], []
-    for end in (0.0, 1.0):
-        sample, slope = np.sqrt(abs(end - data.points)), 12**-0.5 / 2 * (-1.0) ** end
-        column = np.stack([sample, slope / sample], axis=1).ravel()  # a coordinate is u over its standard deviation
+    for value, slope in pairs:
+        column = np.stack([value(data.points), 12**-0.5 * slope(data.points)], axis=1).ravel()  # u over its deviation
         taken = np.linalg.lstsq(left, column, rcond=None)[0]
         size = residual / np.linalg.norm(column - left @ taken)
-        rest = size * (np.sqrt(abs(end - u[:, 0])) - basis.values(u) @ taken)
+        rest = size * (value(u[:, 0]) - basis.values(u) @ taken)
         means.append(abs(rest.mean()))
         stds.append(abs(np.mean(rest * (expansion[:, 0] - expansion.mean())) / expansion.std()))
     np.testing.assert_allclose(found.edges()[:, 0], [max(means), max(stds)], rtol=2e-2)
+
+
+@pytest.mark.unit
+def test_what_is_next_to_a_basis():
+    """One or two powers more, of which less are in the basis in each parameter; parameters with tails stay out."""
+    even = np.array([[0, 0], [2, 0], [0, 2], [2, 2], [4, 0]])
+    alone = [(1, 0), (3, 0), (5, 0), (6, 0)]
+    found = beside(even, np.array([True, True]))
+    assert set(map(tuple, found.tolist())) == {*alone, (0, 1), (0, 3), (0, 4), (4, 2)}
+    assert list(map(tuple, beside(even, np.array([True, False])).tolist())) == alone
+
+
+@pytest.mark.unit
+def test_claims_hold_where_few_samples_are_next_to_corners():
+    """A hill, in at most 7 % of cases: without the functions next to those of a fit, 18 % miss mean or deviation."""
+
+    def hill(u, v):
+        return np.exp(-5 * ((u - 0.5) ** 2 + (v - 0.5) ** 2))
+
+    found = list(fits(hill, lambda u, v: -10 * (np.hstack([u, v]) - 0.5) * hill(u, v), solves=16))
+    u = (np.arange(2000) + 0.5) / 2000
+    values = hill(u[:, None], u)
+    assert np.mean([missed(one, values.mean(), values.std()) for one in found]) <= 0.07
 
 
 @pytest.mark.unit
