@@ -174,6 +174,7 @@ TABLE: dict[str, str | Words] = {
         "does; method.mesh_error = 'noise' counts it as noise."
     ),
     "taken-for-granted": Words("taken for granted: {listed}", short=""),
+    "not-random": Words("taken for granted, at the mean and to first order: {listed}", short=""),
     "uncertain-bent": Words(
         "{name} is too uncertain for its first order: second order moves {answer} by {size:.2g} deviations; make it a "
         "parameter, with a normal prior",

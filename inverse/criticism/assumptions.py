@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -346,6 +346,17 @@ def findings(assumed: Sequence[Assumption], names: Sequence[str], shifts: FloatA
             way = "larger" if shifts[k, i] > 0 else "smaller"
             lines.append(f"if {assumed[k]} than stated, {names[i]} is {number(sizes[k, i], 2)} deviations {way}")
     return [Finding("taken-for-granted", "note", {"listed": "; ".join(lines)})] if lines else []
+
+
+def of_outputs(
+    assumed: Sequence[Assumption], outputs: Sequence[str], changes: FloatArray, spread: FloatArray
+) -> list[Finding]:
+    """Return a note of what that is not random moves outputs most, by changes (k, m) over deviations (m,) of these.
+
+    Nothing is said of outputs whose deviations are not known.
+    """
+    shifts = np.divide(changes, spread, out=np.full(changes.shape, np.nan), where=spread > 0)
+    return [replace(one, code="not-random") for one in findings(assumed, outputs, shifts)]
 
 
 def bent(names: Sequence[str], answers: Sequence[str], shifts: FloatArray) -> list[Finding]:

@@ -213,6 +213,7 @@ SECTIONS = Kinds(
         "contact": f"{_HERE}.bodies:contact",
         "local-sensitivities": f"{_HERE}.outputs:local_sensitivities",
         "local-field": f"{_HERE}.outputs:local_field",
+        "not-random": f"{_HERE}.assumptions:not_random",
         "batch": f"{_HERE}.inversions:batch",
         "predictions": f"{_HERE}.inversions:predictions",
         "posterior": f"{_HERE}.posterior:posterior",

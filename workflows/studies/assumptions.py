@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import AXES
-from forward.model import FloatArray, ForwardModel
+from forward.model import FloatArray, ForwardModel, ModelError, SolveError
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from inverse.criticism.assumptions import (
@@ -21,12 +22,21 @@ from inverse.criticism.assumptions import (
     Assumption,
     Assumptions,
     Moved,
+    by_evaluation,
     of_data,
+    of_outputs,
 )
 from inverse.data.measurements import Measurements
+from uq.findings import add
 from workflows.data.measured import observing, onto
 
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.evaluation.request import Evaluate
+
 ASSUMED = "taken for granted"  # in names of models
+KEPT = ("size", "unit", "part")  # of what is taken for granted, in results
 
 
 def of_numbers(numbers: Mapping[str, Scalar], unknown: Sequence[str], extent: float) -> list[Assumption]:
@@ -88,6 +98,8 @@ class TakenForGranted:
 
     What is stated to be uncertain may be otherwise by its standard deviation.
     """
+
+    label: ClassVar[str] = ASSUMED
 
     spec: Any
     unknown: tuple[str, ...]
@@ -203,3 +215,26 @@ class TakenForGranted:
                 numbers = [one for one in self.numbers if means(name, one.name)]
                 if not all(one.part for one in numbers):
                     yield ("uncertain", name), "a place or a direction, expected std", how.relative
+
+    def with_changes(self, found: xr.Dataset, mean: FloatArray, evaluate: Evaluate) -> xr.Dataset:
+        """Add how far outputs are larger at the mean (d,) if each number that is not random is; NaN without an answer.
+
+        Raises
+        ------
+        ModelError
+            If the model has no derivatives.
+        """
+        if not evaluate.differentiable:
+            raise ModelError("sensitivity.all: the model has no derivatives, expected one that has")
+        outputs = list(evaluate.outputs)
+        changes = np.full((len(self.numbers), len(outputs)), np.nan)
+        with suppress(SolveError):
+            _, slopes = by_evaluation(evaluate)(mean[None], self.values[None], None)
+            changes = (slopes[0] * [one.size for one in self.numbers]).T
+        kept: dict[str, Any] = {f"assumption_{key}": [getattr(one, key) for one in self.numbers] for key in KEPT}
+        held: dict[str, Any] = {name: ("assumption", values) for name, values in kept.items()}
+        held["assumption_change"] = (("assumption", "output"), changes)
+        found = found.assign(held).assign_coords(assumption=[one.name for one in self.numbers], output=outputs)
+        if "std" in found and found["std"].dims == ("output",):
+            add(found, *of_outputs(self.numbers, outputs, changes, found["std"].to_numpy()))
+        return found

@@ -25,6 +25,7 @@ from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
 from uq.findings import add
 from uq.inputs.distributions import Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
+from workflows.studies.assumptions import KEPT
 from workflows.studies.predictions import of_file
 
 if TYPE_CHECKING:
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
-KEPT_OF_ASSUMED = ("size", "unit", "part")
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
@@ -92,7 +92,7 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
     if study.taken is not None and "assumption_shift" in held:
         assumed = study.taken.all
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
-        held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT_OF_ASSUMED}
+        held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
     if study.predict is not None:
         goals = study.predicted.returned
         coordinates["goal"] = [one.name for one in goals]

@@ -44,6 +44,8 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         What is computed and how.
     accuracy
         What is asked of errors beside those of sampling. ``mesh_error`` may stand beside the blocks too.
+    sensitivity
+        What else is asked of derivatives.
     """
 
     stopped: ClassVar[str] = "one linearisation"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 from forward.machine import MIB
 from forward.registry import OfKind
+from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
 from uq.methods.method import MESH, METHODS, Method
@@ -18,6 +19,20 @@ from workflows.studies.predictions import estimates_paid, never_estimable
 
 if TYPE_CHECKING:
     from uq.accuracy.doubts import Told
+    from workflows.studies.assumptions import TakenForGranted
+
+
+class Sensitivity(Settings):
+    """What else is asked of derivatives.
+
+    Parameters
+    ----------
+    all
+        Derivatives of the outputs at the mean by all numbers of the model, not by the random ones alone: which constant
+        that nobody made uncertain matters most. One solve, and an adjoint for each output.
+    """
+
+    all: bool = False
 
 
 class SamplingBlocks(Sourced):
@@ -26,6 +41,7 @@ class SamplingBlocks(Sourced):
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
+    sensitivity: Sensitivity = Sensitivity()
 
     if TYPE_CHECKING:  # of every study
         parallel: Parallel
@@ -105,6 +121,15 @@ class SamplingBlocks(Sourced):
     def of(self, model: ModelSpec) -> Self:
         """Return the same study of another model."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | {"model": model})
+
+    @property
+    def taken(self) -> TakenForGranted | None:
+        """What is taken for granted; None where it is not asked for."""
+        if not self.sensitivity.all:
+            return None
+        from workflows.studies.assumptions import TakenForGranted
+
+        return TakenForGranted(self.spec, self.inputs.names, ())
 
     @property
     def told(self) -> Told:

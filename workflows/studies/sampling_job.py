@@ -45,11 +45,13 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
     recorders: dict[str, Recorder] = {}
     estimates: list[Evaluations] = []
-    told: dict[str, Any] = {}
+    told, taken = dict[str, Any](), study.taken
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         found = sampled(evaluate)
+        if taken is not None:
+            found = taken.with_changes(found, inputs.mean, evaluate.on(taken.label))
         told.update(_told(study, recorders["/"], estimates, directory))
         if not (study.spec.meshed and study.spec.touched):
             return found
@@ -69,7 +71,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
 
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
-    }
+    } | ({} if taken is None else {taken.label: partial(taken.build, ensemble.group)})
     model: Any = study.spec.build(ensemble.group, inputs.names)
 
     of_outputs = {name: units[name] for name in model.outputs}

@@ -48,6 +48,26 @@ def test_a_specimen_is_sampled_like_any_model(tmp_path):
     np.testing.assert_allclose(found["mean"], np.mean(exact, axis=0), rtol=1e-6)
 
 
+@pytest.mark.fem
+def test_numbers_that_nobody_made_uncertain_are_looked_at(tmp_path):
+    """Each load case apart, by differences of the model; said where they matter, and shown."""
+    study = parse(tomllib.loads(STUDY + "\n[sensitivity]\nall = true\n"))
+    assert run(study, "tip", tmp_path / "out", quiet=True) == 0
+    found = xr.load_dataset(tmp_path / "out" / "results.nc")
+    names = [f"cases.{case}.loads.traction.size" for case in ("shear", "pull")]
+    assert found["assumption"].values.tolist() == ["material.lmbda", *names]
+    changes = found["assumption_change"].transpose("assumption", "output").to_numpy()
+    assert not changes[1, 2:].any()
+    assert not changes[2, :2].any()
+    model, size = study.spec.build(MPI.COMM_SELF, ("material.mu", *names[:1])), 1e-3 * 9
+    ends = [np.asarray(model.solve(np.array([1e3, 9 + sign * size])).outputs) for sign in (1, -1)]
+    np.testing.assert_allclose(changes[1], (ends[0] - ends[1]) / 2 * 10, atol=1e-5 * np.abs(changes[1]).max())
+    assert found["assumption_size"].values.tolist() == pytest.approx([10.0, 0.09, 0.09])
+    said = [one["code"] for one in json.loads((tmp_path / "out" / "summary.json").read_text())["findings"]]
+    assert "not-random" in said
+    assert "What nobody made uncertain" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_nodes_of_a_boundary_are_no_outputs():
     blocks = tomllib.loads(STUDY)
     blocks["model"]["observed"] = [{"on": "z-max"}]

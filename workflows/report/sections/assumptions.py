@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.readable import number, spoken
+from forward.readable import number, size, spoken
 from inverse.criticism.assumptions import Assumption
 from workflows.report.blocks import Block, Folded, Heading, Table, Text
 from workflows.report.section import Results, section
@@ -52,14 +52,37 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
     if "assumption_log_evidence" in one:
         columns.append(("ln Z", one["assumption_log_evidence"].to_numpy()))
     largest = np.nanmax(np.abs(np.column_stack([values for _, values in columns])), axis=1, initial=0.0)
-    rows = []
-    for k in np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]:
-        size, part = (float(one[f"assumption_{key}"][k]) for key in ("size", "part"))
-        assumed = Assumption(str(one["assumption"].values[k]), size, str(one["assumption_unit"].values[k]), part)
-        rows.append((str(assumed), *(number(float(values[k]), 2) for _, values in columns)))
-    head = ("if …", *(title for title, _ in columns))
+    rows = [
+        (str(_assumption(one, int(k))), *(number(float(values[k]), 2) for _, values in columns))
+        for k in np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]
+    ]
+    yield from _folded(("if …", *(title for title, _ in columns)), rows)
+    if not known.all():
+        yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")
+
+
+@section("assumption_change", heading="What nobody made uncertain")
+def not_random(results: Results) -> Iterator[Block]:
+    """How far outputs change at the mean with the numbers that are not random."""
+    of = results.dataset
+    yield Text("Changes of the outputs at the mean, to first order, if numbers that are not random are larger.")
+    changes = of["assumption_change"].sel(output=results.drawn).transpose("assumption", "output").to_numpy()
+    largest, units = np.abs(changes).max(axis=0, initial=0.0), [results.unit(name) for name in results.drawn]
+    over = np.abs(np.divide(changes, largest, out=np.zeros(changes.shape), where=largest > 0)).max(axis=1, initial=0.0)
+    rows = [
+        (str(_assumption(of, int(k))), *(size(float(x), unit, 3) for x, unit in zip(changes[k], units, strict=True)))
+        for k in np.argsort(-over, kind="stable")
+    ]
+    yield from _folded(("if …", *results.drawn), rows)
+
+
+def _assumption(of: xr.Dataset, k: int) -> Assumption:
+    far, part = (float(of[f"assumption_{key}"][k]) for key in ("size", "part"))
+    return Assumption(str(of["assumption"].values[k]), far, str(of["assumption_unit"].values[k]), part)
+
+
+def _folded(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[Block]:
+    """Show the first rows, and fold the others."""
     yield Table(head, rows[:OPEN])
     if len(rows) > OPEN:
         yield Folded(f"{len(rows) - OPEN} more that move less", [Table(head, rows[OPEN:])])
-    if not known.all():
-        yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")
