@@ -199,13 +199,19 @@ def _weighted(parts: Sequence[_Part], route: Route, why: str, cloud: Cloud | Non
 
 
 def _corrected(found: Evidence, log_over: FloatArray, cloud: Cloud) -> tuple[FloatArray, FloatArray] | None:
-    """Return points of a cloud and of an estimate with their weights; None where the cloud is no help."""
+    """Return points of a cloud and of an estimate with their weights; None where the cloud is no help.
+
+    Or where it is so wrong that what the points differ from it leaves a negative variance.
+    """
     x, weights = found.density.x, found.weights
     by_polynomial = cloud.surrogate.at(x).log_likelihood - log_over
     if not np.isfinite(by_polynomial).any():
         return None
-    many = np.concatenate([cloud.weights, weights - normalised(by_polynomial)])
-    return (np.concatenate([cloud.x, x]), many) if many @ many < weights @ weights else None
+    points, many = np.concatenate([cloud.x, x]), np.concatenate([cloud.weights, weights - normalised(by_polynomial)])
+    apart = points - many @ points
+    if np.linalg.eigvalsh((many[:, None] * apart).T @ apart)[0] <= 0:
+        return None
+    return (points, many) if many @ many < weights @ weights else None
 
 
 def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -> Evidence:

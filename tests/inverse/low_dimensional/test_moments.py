@@ -1,5 +1,7 @@
 """Moments and ends of intervals of skewed posteriors of few parameters, against quadrature."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
@@ -8,7 +10,7 @@ from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import Assessment, answer, by_points, even
 from inverse.criticism.doubts import HEAVY, heavy_tails
 from inverse.data.noise import Noise
-from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.evidence import _corrected, evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
@@ -103,3 +105,16 @@ def test_deviations_that_rest_on_a_tail_are_doubted():
 
 def saturating_at_five(p):
     return p / (5 + p)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("far", [0.5, 3.0])
+def test_a_polynomial_that_leaves_a_negative_variance_is_no_help(far):
+    """It gives half of its weight to points that the posterior does not have; near them that is a correction."""
+    n, rng = 64, np.random.default_rng(0)
+    x = np.concatenate([0.01 * rng.standard_normal((n // 2, 1)), far * rng.choice([-1.0, 1.0], (n // 2, 1))])
+    found = SimpleNamespace(density=SimpleNamespace(x=x), weights=np.repeat([2 / n, 0.0], n // 2))
+    flat = SimpleNamespace(at=lambda points: SimpleNamespace(log_likelihood=np.zeros(len(points))))
+    cloud = SimpleNamespace(surrogate=flat, x=rng.standard_normal((4096, 1)), weights=even(4096))
+    corrected = _corrected(found, np.zeros(n), cloud)
+    assert (corrected is None) == (far > 1)
