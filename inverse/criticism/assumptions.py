@@ -235,27 +235,29 @@ class Assumptions:
         """The weights (g, k) of all groups."""
         return np.array(list(self.groups.values())).reshape(len(self.groups), len(self.all))
 
-    def changes(self, points: FloatArray, start: Any) -> FloatArray:
+    def changes(self, points: FloatArray, start: Any, *, predicted: bool = False) -> FloatArray:
         """Return by how much outputs (n, k, m) are larger if each is; NaN where the model has no answer.
 
-        At parameters (n, d) or values of a field (1, N), from a prediction of the states.
+        At parameters (n, d) or values of a field (1, N), from a prediction of the states. Of scales it is that of what
+        was measured or, where it becomes an error that data share, `predicted`: else noise would count as signal, and
+        answers be drawn to smaller data (R. W. Peelle's puzzle; G. D'Agostini, Nucl. Instrum. Methods A 346 (1994) 306).
         """
         n, m, moved = len(points), len(self.data), self.moved
-        of = np.array(quantities(self.data, self.units))
-        found = {one.name: -one.size * self.data.values * (of == one.name.split(".", 2)[-1]) for one in self.beside}
         by_shift = {one.name: one.size for one in self.beside if one.name.startswith("data.shift.")}
-        found |= {one.name: np.zeros((n, m)) for one in self.numbers}
+        found, scaled = {one.name: np.zeros((n, m)) for one in (*self.numbers, *self.beside)}, self.data.values
         if self.ask is not None:
             try:
                 outputs, slopes = self._asked(points, np.broadcast_to(self.values, (n, len(self.values))), start)
             except SolveError:
-                nothing = np.full((n, m), np.nan)
-                found |= dict.fromkeys((*by_shift, *(one.name for one in self.numbers)), nothing)
-            else:
-                found |= {one.name: one.size * slopes[:, :m, i] for i, one in enumerate(self.numbers)}
-                if moved is not None:
-                    by_places = np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1)
-                    found |= {name: size * by for (name, size), by in zip(by_shift.items(), by_places, strict=True)}
+                return np.full((n, len(self.all), m), np.nan)
+            found |= {one.name: one.size * slopes[:, :m, i] for i, one in enumerate(self.numbers)}
+            scaled = outputs[:, :m] if predicted else scaled
+            if moved is not None:
+                by_places = np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1)
+                found |= {name: size * by for (name, size), by in zip(by_shift.items(), by_places, strict=True)}
+        of = np.array(quantities(self.data, self.units))
+        scales = [one for one in self.beside if one.name not in by_shift]
+        found |= {one.name: -one.size * scaled * (of == one.name.split(".", 2)[-1]) for one in scales}
         rows = [np.broadcast_to(found[one.name], (n, m)) for one in self.all]
         return np.array(rows).reshape(-1, n, m).swapaxes(0, 1)
 
@@ -293,7 +295,7 @@ class Assumptions:
             return None
 
         def errors(point: FloatArray) -> Mapping[str, FloatArray]:
-            changes = self.changes(point[None], None)[0]
+            changes = self.changes(point[None], None, predicted=True)[0]
             used = self.weights.any(axis=0)
             if not np.isfinite(changes[used]).all():
                 raise SolveError("the model has no answer, which would tell what uncertain numbers do")

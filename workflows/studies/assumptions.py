@@ -170,7 +170,8 @@ class TakenForGranted:
     @property
     def asked(self) -> bool:
         """Whether the model has to be asked of the data sets."""
-        return bool(self.numbers) or any(one is not None and self._moved(one) is not None for one in self.found)
+        moved = any(one is not None and self._moved(one) is not None for one in self.found)
+        return bool(self.numbers or self.groups) or moved
 
     def model(self, comm: Any) -> ForwardModel:
         """Make what is asked of the first data set; collective."""
@@ -185,7 +186,7 @@ class TakenForGranted:
         moved = self._moved(data)
         if moved is not None:
             return moved.observed(model)
-        return observing(model, data) if self.numbers else None
+        return observing(model, data) if self.numbers or self.groups else None
 
     def of(self, data: Measurements, ask: Ask | None) -> Assumptions:
         """Return what is taken for granted of a data set."""

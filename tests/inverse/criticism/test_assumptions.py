@@ -116,8 +116,7 @@ def test_a_model_without_an_answer_says_nothing_and_stops_nothing():
     data = Measurements.of(np.ones(2), np.ones(2), [0, 0], [0, 1], ["u", "v"])
     assumed = Assumptions(data, NUMBERS, of_data([data], {"u": "m"}, 0.0), np.ones(1), {"u": "m"}, lost)
     changes = assumed.changes(np.zeros((1, 2)), None)
-    assert np.isnan(changes[0, 0]).all()
-    np.testing.assert_array_equal(changes[0, 1:], [[-PART, 0.0], [0.0, -PART]])
+    assert np.isnan(changes).all()
     assert [one.name for one in assumed.all] == ["s", "data.scale.displacement", "data.scale.v"]
 
 
@@ -185,7 +184,8 @@ def test_what_is_too_uncertain_for_first_order_is_said():
     )
     np.testing.assert_allclose(assumed.bends(np.array([1.0, -1.0]), None), [B[:, 0] * 0.25, np.zeros(8)], atol=1e-12)
     rows = assumed.shared(np.array([1.0, -1.0]))["uncertain"]
-    np.testing.assert_allclose(rows, [6 * B[:, 0] * 0.5, np.full(8, -PART)], rtol=1e-12)
+    predicted = A @ [1.0, -1.0] + 9 * B[:, 0]
+    np.testing.assert_allclose(rows, [6 * B[:, 0] * 0.5, -PART * predicted], rtol=1e-12)
     (one,) = bent(["s", "scales"], ["a", "b"], np.array([[0.1, -0.31], [0.2, np.nan]]))
     assert one.severity == "warning"
     assert one.text == (

@@ -166,10 +166,13 @@ def test_what_is_uncertain_is_among_the_errors(folder):
         out = folder / f"uncertain-{number}"
         assert ran(folder / "stated.toml", out, change) == 0
         one = results(out).isel(data_set=0)
-        parts = [VALUES * 0.2] if number == 0 else [VALUES * 0.2 * apart, VALUES * 0.2 * np.subtract(1, apart)]
-        errors = np.diag(SIGMA**2) + np.transpose(parts) @ parts
-        covariance = np.linalg.inv(B.T @ np.linalg.solve(errors, B) + np.diag(STD**-2.0))
-        mode = covariance @ (B.T @ np.linalg.solve(errors, VALUES) + MEAN / STD**2)
+        mode = MEAN
+        for _ in range(2):  # of what is predicted at the mean of the prior, and then at the mode
+            scaled = 0.2 * B @ mode
+            parts = [scaled] if number == 0 else [scaled * apart, scaled * np.subtract(1, apart)]
+            errors = np.diag(SIGMA**2) + np.transpose(parts) @ parts
+            covariance = np.linalg.inv(B.T @ np.linalg.solve(errors, B) + np.diag(STD**-2.0))
+            mode = covariance @ (B.T @ np.linalg.solve(errors, VALUES) + MEAN / STD**2)
         np.testing.assert_allclose(one["mode"], mode, rtol=1e-6)
         np.testing.assert_allclose(one["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-6)
         assert "motion_eigenvalue" not in one
