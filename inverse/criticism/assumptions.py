@@ -240,7 +240,7 @@ class Assumptions:
 
         At parameters (n, d) or values of a field (1, N), from a prediction of the states. Of scales it is that of what
         was measured or, where it becomes an error that data share, `predicted`: else noise would count as signal, and
-        answers be drawn to smaller data (R. W. Peelle's puzzle; G. D'Agostini, Nucl. Instrum. Methods A 346 (1994) 306).
+        answers be drawn to smaller data (Peelle's puzzle; G. D'Agostini, Nucl. Instrum. Methods A 346 (1994) 306–311).
         """
         n, m, moved = len(points), len(self.data), self.moved
         by_shift = {one.name: one.size for one in self.beside if one.name.startswith("data.shift.")}
