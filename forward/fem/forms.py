@@ -113,7 +113,8 @@ class Forms:
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
         # Virtual works of those loads that act in contact, and what they are written with.
         self._tools: list[tuple[Any, Term, Place]] = []
-        self._curved = spaces.constant(self.mesh, 1.0)  # 0 takes the curvature of tools out of the stiffness
+        self._expected = spaces.constant(self.mesh, 0.0)  # 1: they are linearised where the last step was to lead
+        self._last = [spaces.function(self.unknowns.whole) for _ in range(2 if self._shifts else 0)]
         self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
         self._stiffer = spaces.constant(self.mesh, 1.0)  # factor on their stiffness
         self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
@@ -323,6 +324,7 @@ class Forms:
             bounds=self.spec.body.bounds,
             stiffer=self._stiffer,
             since=since,
+            last=tuple(self.unknowns.split(one)[0] for one in self._last) or None,
         )
 
     def tool(self, label: str) -> tuple[Any, Place]:
@@ -361,14 +363,18 @@ class Forms:
         return sum(terms[1:], terms[0]) if terms else None
 
     def stiffness_form(self, imbalance: Any) -> Any:
-        """Derivative of the imbalance by the state, in which the curvature of tools can be left out."""
+        """Derivative of the imbalance by the state, with tools as they are or as they are expected."""
         trial = ufl.TrialFunction(self.unknowns.whole)
         exact = self.derivative(imbalance, trial)
         along, _ = self.unknowns.split(trial)
         for work, load, at in self._tools:
-            left_out = load.straight_stiffness(at, along) - self.derivative(work, trial)
-            exact += (1 - self._curved) * left_out
+            exact += self._expected * (load.expected(at, along)[0] - self.derivative(work, trial))
         return exact
+
+    @cached_property
+    def _beyond(self) -> assembly.VectorAssembler:
+        works = [load.expected(at, at.u)[1] for _, load, at in self._tools]
+        return self.vector(sum(works[1:], works[0]), often=True)
 
     @cached_property
     def _weighted_imbalance(self) -> assembly.VectorAssembler:

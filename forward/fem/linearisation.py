@@ -328,18 +328,22 @@ class Linearisation(Forms):
     def _symmetric_part(self) -> LinearSolver:
         return self.new_symmetric_solver()
 
-    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
-        """Assemble and factorise the stiffness at u (U_local,), with the curvature of tools or without."""
+    def factorise(self, u: FloatArray, last: tuple[FloatArray, FloatArray] | None = None) -> FloatArray | float:
+        """Assemble and factorise the stiffness at u (U_local,), as `System.factorise`."""
+        expected = last is not None and bool(self._tools)
+        for function, values in zip(self._last, last or (), strict=False):
+            self.unknowns.give(function, values)
         self.set_state(u)
         self.work.assemblies += 1
         self.work.factorisations += 1
         self.linearisation_point.factorised = None  # a factorisation that fails leaves no factor
-        self._curved.value = float(curved)
+        self._expected.value = float(expected)
         try:
             self._solver.factorise()
         finally:
-            self._curved.value = 1.0
+            self._expected.value = 0.0
         self.linearisation_point.factorised_at = u
+        return self._beyond() * self.free_displacements if expected else 0.0
 
     def release(self) -> None:
         """Free the factor, if there is one."""

@@ -123,8 +123,11 @@ class System(Protocol):
     def rounding(self, u: FloatArray, scale: float) -> float:
         """Size (N) below which a residual with this scale cannot be expected to fall at u, whatever the loads."""
 
-    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
-        """Assemble and factorise the stiffness at u; if not `curved`, without the curvature of surfaces in contact.
+    def factorise(self, u: FloatArray, last: tuple[FloatArray, FloatArray] | None = None) -> FloatArray | float:
+        """Assemble and factorise the stiffness at u.
+
+        After the `last` step, given by where it began and the whole of it, surfaces in contact are linearised where
+        that was to lead; what their imbalance is then beyond that at u is returned.
 
         Raises
         ------

@@ -92,6 +92,8 @@ class Place:
         Factor on the stiffness of tools, which is raised where the body enters them too far.
     since
         The increment of the load; None where nothing depends on it.
+    last
+        Displacement (m) before the last step of Newton's method, and the whole of that step; None where no tool acts.
     """
 
     u: Any
@@ -110,6 +112,7 @@ class Place:
     bounds: tuple[tuple[float, float], ...]
     stiffer: Any
     since: Since | None = None
+    last: tuple[Any, Any] | None = None
 
 
 class Term(Named):
@@ -126,11 +129,13 @@ class Term(Named):
         """
         return None
 
-    def straight_stiffness(self, at: Place, direction: Any) -> Any:
-        """Return its stiffness along a direction, as a bilinear form without the curvature of the surface touched.
+    def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
+        """Return what it is like where the last step was to lead, to first order, as two forms.
 
-        Only of loads that act in contact: far from equilibrium, pressures are so large that this curvature makes the
-        stiffness indefinite.
+        They are its stiffness along a direction, without the curvature of the surface touched, and the virtual work
+        that its law, linearised at the gaps expected there, has at the gaps here, less its own. Only of loads that act
+        in contact: far from equilibrium, pressures at the gaps here are so large that their curvature makes the
+        stiffness indefinite, and points go to and fro between touching and not.
         """
         raise NotImplementedError
 
