@@ -113,8 +113,9 @@ class Forms:
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
         # Virtual works of those loads that act in contact, and what they are written with.
         self._tools: list[tuple[Any, Term, Place]] = []
-        self._expected = spaces.constant(self.mesh, 0.0)  # 1: they are linearised where the last step was to lead
+        self._curved = spaces.constant(self.mesh, 1.0)  # 0 takes the curvature of tools out of the stiffness
         self._last = [spaces.function(self.unknowns.whole) for _ in range(2 if self._shifts else 0)]
+        self._left = {label: spaces.constant(self.mesh, 0.0) for label in self._shifts}  # 1: linearised where expected
         self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
         self._stiffer = spaces.constant(self.mesh, 1.0)  # factor on their stiffness
         self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
@@ -325,6 +326,7 @@ class Forms:
             stiffer=self._stiffer,
             since=since,
             last=tuple(self.unknowns.split(one)[0] for one in self._last) or None,
+            left=self._left.get(label, 0.0),
         )
 
     def tool(self, label: str) -> tuple[Any, Place]:
@@ -363,18 +365,13 @@ class Forms:
         return sum(terms[1:], terms[0]) if terms else None
 
     def stiffness_form(self, imbalance: Any) -> Any:
-        """Derivative of the imbalance by the state, with tools as they are or as they are expected."""
+        """Derivative of the imbalance by the state, with tools as they are or without their curvature."""
         trial = ufl.TrialFunction(self.unknowns.whole)
         exact = self.derivative(imbalance, trial)
         along, _ = self.unknowns.split(trial)
         for work, load, at in self._tools:
-            exact += self._expected * (load.expected(at, along)[0] - self.derivative(work, trial))
+            exact += (1 - self._curved) * (load.expected(at, along)[0] - self.derivative(work, trial))
         return exact
-
-    @cached_property
-    def _beyond(self) -> assembly.VectorAssembler:
-        works = [load.expected(at, at.u)[1] for _, load, at in self._tools]
-        return self.vector(sum(works[1:], works[0]), often=True)
 
     @cached_property
     def _weighted_imbalance(self) -> assembly.VectorAssembler:

@@ -9,15 +9,14 @@ from forward.solvers.acceptance import Diverged, accepted, converged, instabilit
 from forward.solvers.corrections import mix
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import finish, plain
-from forward.solvers.system import Found, NoConvergence, Residual, System
+from forward.solvers.system import Found, Move, NoConvergence, Residual, System
 
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
 NEAR = 0.2  # below this fraction of the last Newton step, a factor is used for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 SEARCHES, ENOUGH = 8, 0.6  # residuals along a line, and the part of the slope that may be left
 TOUCHING = 2  # times the iterations that are allowed, where the area in contact is yet to be found
-CURVED = 0.1  # relative residual below which tools are linearised at the state, with their curvature
-WHOLE = 0.99  # part of a step that counts as the whole; one that is cut does not lead where it was to lead
+CURVED = 0.1  # relative residual below which the stiffness has the curvature of tools
 ASTRAY = 0.6  # distance from where the first step leads, over its length, beyond which a branch is left
 
 
@@ -58,9 +57,10 @@ def _iterate(
     near: bool,
 ) -> tuple[Found, int]:
     residual = system.residual(u)
-    predicted, last = u, (u, np.zeros_like(u))
+    predicted = u
+    last: Move | None = None
     sizes: list[float] = []
-    longest, shortest, length, first = 0.0, np.inf, np.inf, 0.0
+    longest, length, first = 0.0, np.inf, 0.0
     if not np.isfinite(residual.size):
         raise Diverged("the starting state has no finite residual")
     for iteration in range(limit + 1):
@@ -72,13 +72,13 @@ def _iterate(
             break
         beyond: FloatArray | float = 0.0
         if not (near and iteration == 0 and system.has_factor(u)):
-            beyond = factorise(system, u, last if residual.size >= CURVED * residual.scale else None)
+            curved = not system.contact or residual.relative < CURVED
+            beyond = factorise(system, u, curved=curved, last=last)
         step = system.solve(-residual.vector - beyond)
         before, length = length, system.norm(step)
         if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest and not system.contact):
             raise Diverged("the Newton steps grow" + instability(system))
-        led, longest, shortest = length < shortest, max(longest, length), min(shortest, length)
-        began = u
+        longest, last = max(longest, length), (u, step)
         if system.contact and residual.gap == 0:
             u, residual = searched_step(system, settings, u, residual, step)
         else:
@@ -87,8 +87,6 @@ def _iterate(
             u, residual = admissible_step(system, settings, u, step)
             if near and system.norm(u - predicted) > ASTRAY * first:
                 raise Diverged("the state leaves the tangent's prediction" + instability(system))
-        # Other steps have led elsewhere than they were to lead, or go to and fro.
-        last = (began, step) if led and system.norm(u - began) > WHOLE * length else (u, np.zeros_like(u))
         if settings.kind != "newton" and length < NEAR * before < np.inf:
             polish = mix(system, settings.tolerance, u, residual, plain, POLISH, history)
             u, residual, reached, _ = finish(polish, system.solve)
@@ -104,10 +102,10 @@ def _accepted(system: System, settings: SolverSettings, u: FloatArray, residual:
     return finish(accepted(system, settings, u, residual), system.solve)
 
 
-def factorise(system: System, u: FloatArray, last: tuple[FloatArray, FloatArray] | None = None) -> FloatArray | float:
+def factorise(system: System, u: FloatArray, *, curved: bool = True, last: Move | None = None) -> FloatArray | float:
     """Factorise the stiffness at u, after the `last` step; raise `Diverged` where it is singular."""
     try:
-        return system.factorise(u, last)
+        return system.factorise(u, curved=curved, last=last)
     except SolveError as error:
         raise Diverged(error.reason) from None
 

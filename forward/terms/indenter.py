@@ -216,14 +216,25 @@ class Indenter(Term):
         touch = self.touch(at, at.X + at.u)
         return tools.energy(at.ops, touch.gap, touch.stiffness, touch.width) * self.measure(at)
 
-    def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
-        """Stiffness ∫ φ''(ĝ) (∇g·v)(∇g·w) dS and that of friction; work ∫ (φ'(ĝ) + φ''(ĝ)(g − ĝ) − φ'(g)) ∇g·v dS."""
+    def expected_gap(self, at: Place) -> Any:
+        """Return the gap ĝ (m) to which the last step was to lead, to first order."""
         import ufl
 
         assert at.last is not None
-        x, before = ufl.variable(at.X + at.u), ufl.variable(at.X + at.last[0])
-        touch, left = self.touch(at, x), self.gap(at.ops, before, at.numbers, at.constant)
-        gap = left + ufl.dot(ufl.diff(left, before), at.last[1])
+        before = ufl.variable(at.X + at.last[0])
+        gap = self.gap(at.ops, before, at.numbers, at.constant)
+        return gap + ufl.dot(ufl.diff(gap, before), at.last[1])
+
+    def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
+        """Stiffness ∫ φ''(ĝ) (∇g·v)(∇g·w) dS and that of friction; work ∫ (φ'(ĝ) + φ''(ĝ)(g − ĝ) − φ'(g)) ∇g·v dS.
+
+        ĝ = g, unless the body has left the tool.
+        """
+        import ufl
+
+        x = ufl.variable(at.X + at.u)
+        touch = self.touch(at, x)
+        gap = touch.gap + at.left * (self.expected_gap(at) - touch.gap)
         here, there = (tools.pressure(at.ops, g, touch.stiffness, touch.width) for g in (touch.gap, gap))
         closed = touch.stiffness * tools.contact(at.ops, gap, touch.width)
         normal = ufl.diff(touch.gap, x)

@@ -94,6 +94,8 @@ class Place:
         The increment of the load; None where nothing depends on it.
     last
         Displacement (m) before the last step of Newton's method, and the whole of that step; None where no tool acts.
+    left
+        1 where that step was to press the body on this tool and has taken it off altogether, otherwise 0.
     """
 
     u: Any
@@ -113,6 +115,7 @@ class Place:
     stiffer: Any
     since: Since | None = None
     last: tuple[Any, Any] | None = None
+    left: Any = 0.0
 
 
 class Term(Named):
@@ -130,12 +133,12 @@ class Term(Named):
         return None
 
     def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
-        """Return what it is like where the last step was to lead, to first order, as two forms.
+        """Return what it is like far from equilibrium, as two forms.
 
         They are its stiffness along a direction, without the curvature of the surface touched, and the virtual work
-        that its law, linearised at the gaps expected there, has at the gaps here, less its own. Only of loads that act
-        in contact: far from equilibrium, pressures at the gaps here are so large that their curvature makes the
-        stiffness indefinite, and points go to and fro between touching and not.
+        of its linearised law at the gaps here, less its own: 0, unless the body has `left` it, which is then linearised
+        at the gaps to which the last step was to lead. Only of loads that act in contact: pressures of states far from
+        equilibrium are so large that their curvature makes the stiffness indefinite.
         """
         raise NotImplementedError
 

@@ -44,7 +44,7 @@ class Springs:
     def tangent(self, u):
         return self.sign * (STIFFNESS + np.diag(3 * u**2))
 
-    def factorise(self, u, last=None):
+    def factorise(self, u, *, curved=True, last=None):
         self.factor = self.tangent(u)
         return 0.0
 

@@ -270,19 +270,37 @@ def test_newtons_method_does_not_go_round_among_points_that_touch(depth, force):
 
 @pytest.mark.fem
 def test_a_tool_is_linearised_where_the_last_step_was_to_lead():
-    """A plane, 2 mm deep at rest: where it was to press, its law goes on as a pull on what has left it by 1 mm."""
+    """A plane, 2 mm deep at rest: its law goes on as a pull on what was to be pressed and has left it by 1 mm."""
     equations = body(only("plane")).build(MPI.COMM_SELF, ()).equations
     equations.at_load(1.0)
     rest = np.zeros(equations.size)
-    left = rest.copy()
+    left, pressed_less = rest.copy(), rest.copy()
     left[2 : 3 * equations.nodes_owned : 3] = -3e-3
+    pressed_less[2 : 3 * equations.nodes_owned : 3] = -1e-3
     pressed, off = (equations.residual(u).vector * equations.free_displacements for u in (rest, left))
     size = np.abs(pressed).max()
     np.testing.assert_allclose(off, 0, atol=1e-9 * size)
-    np.testing.assert_allclose(equations.factorise(left, (rest, rest)), -0.5 * pressed, atol=1e-9 * size)
-    for u in (rest, left):
-        np.testing.assert_allclose(equations.factorise(u, (u, rest)), 0, atol=1e-9 * size)
-        assert np.all(equations.factorise(u) == 0)
+    for curved in (True, False):
+        beyond = equations.factorise(left, curved=curved, last=(rest, rest))
+        np.testing.assert_allclose(beyond, -0.5 * pressed, atol=1e-9 * size)
+        for u, last in ((left, (left, rest)), (pressed_less, (rest, rest)), (rest, (rest, rest)), (left, None)):
+            assert np.all(equations.factorise(u, curved=curved, last=last) == 0)
+
+
+@pytest.mark.fem
+def test_only_the_tool_that_nothing_touches_is_linearised_elsewhere():
+    """Two planes, 2 mm and 4 mm deep at rest, over what has moved by 3 mm: only the first one draws it back."""
+    planes = [only("plane") | {"name": name, "depth": depth} for name, depth in (("near", 2e-3), ("far", 4e-3))]
+    two, one = (body(*loads, outputs=OUTPUTS[2:]).build(MPI.COMM_SELF, ()).equations for loads in (planes, planes[:1]))
+    found = []
+    for equations in (two, one):
+        equations.at_load(1.0)
+        rest = np.zeros(equations.size)
+        left = rest.copy()
+        left[2 : 3 * equations.nodes_owned : 3] = -3e-3
+        found.append(equations.factorise(left, last=(rest, rest)))
+    np.testing.assert_allclose(*found, atol=1e-9 * np.abs(found[1]).max())
+    assert np.abs(found[1]).max() > 0
 
 
 @pytest.mark.fem
