@@ -114,6 +114,8 @@ class Forms:
         # Virtual works of those loads that act in contact, and what they are written with.
         self._tools: list[tuple[Any, Term, Place]] = []
         self._curved = spaces.constant(self.mesh, 1.0)  # 0 takes the curvature of tools out of the stiffness
+        self._last = [spaces.function(self.unknowns.whole) for _ in range(2 if self._shifts else 0)]
+        self._left = {label: spaces.constant(self.mesh, 0.0) for label in self._shifts}  # 1: linearised where expected
         self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
         self._stiffer = spaces.constant(self.mesh, 1.0)  # factor on their stiffness
         self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
@@ -323,6 +325,8 @@ class Forms:
             bounds=self.spec.body.bounds,
             stiffer=self._stiffer,
             since=since,
+            last=tuple(self.unknowns.split(one)[0] for one in self._last) or None,
+            left=self._left.get(label, 0.0),
         )
 
     def tool(self, label: str) -> tuple[Any, Place]:
@@ -361,13 +365,12 @@ class Forms:
         return sum(terms[1:], terms[0]) if terms else None
 
     def stiffness_form(self, imbalance: Any) -> Any:
-        """Derivative of the imbalance by the state, in which the curvature of tools can be left out."""
+        """Derivative of the imbalance by the state, with tools as they are or without their curvature."""
         trial = ufl.TrialFunction(self.unknowns.whole)
         exact = self.derivative(imbalance, trial)
         along, _ = self.unknowns.split(trial)
         for work, load, at in self._tools:
-            left_out = load.straight_stiffness(at, along) - self.derivative(work, trial)
-            exact += (1 - self._curved) * left_out
+            exact += (1 - self._curved) * (load.expected(at, along)[0] - self.derivative(work, trial))
         return exact
 
     @cached_property

@@ -20,7 +20,7 @@ from forward.fem.forms import Forms
 from forward.fem.items import Items
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Work
-from forward.solvers.system import ROUGH, TIGHT, LinearSolver
+from forward.solvers.system import ROUGH, TIGHT, LinearSolver, Move
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -328,18 +328,49 @@ class Linearisation(Forms):
     def _symmetric_part(self) -> LinearSolver:
         return self.new_symmetric_solver()
 
-    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
-        """Assemble and factorise the stiffness at u (U_local,), with the curvature of tools or without."""
+    def factorise(self, u: FloatArray, *, curved: bool = True, last: Move | None = None) -> FloatArray | float:
+        """Assemble and factorise the stiffness at u (U_local,), as `System.factorise`."""
         self.set_state(u)
+        left = last is not None and self._off_tools(*last)
         self.work.assemblies += 1
         self.work.factorisations += 1
         self.linearisation_point.factorised = None  # a factorisation that fails leaves no factor
-        self._curved.value = float(curved)
+        self._curved.value = float(curved and not left)
         try:
             self._solver.factorise()
+            beyond = self._beyond() * self.free_displacements if left else 0.0
         finally:
             self._curved.value = 1.0
+            for one in self._left.values():
+                one.value = 0.0
         self.linearisation_point.factorised_at = u
+        return beyond
+
+    def _off_tools(self, before: FloatArray, step: FloatArray) -> bool:
+        """Note which tools the body has left altogether, at the state that is set, though a step was to press it."""
+        off = [not self._inside(gaps) for _, gaps in self._gaps]
+        if not any(off):
+            return False
+        for function, values in zip(self._last, (before, step), strict=True):
+            self.unknowns.give(function, values)
+        left = [one and self._inside(gaps) for one, gaps in zip(off, self._expected_gaps, strict=True)]
+        for (load, _), one in zip(self._gaps, left, strict=True):
+            self._left[load.label].value = one
+        return any(left)
+
+    def _inside(self, gaps: assembly.FacetValues) -> bool:
+        return ranks.smallest(self.comm, float(gaps().min(initial=np.inf))) < 0
+
+    @cached_property
+    def _expected_gaps(self) -> list[assembly.FacetValues]:
+        """As `_gaps`, where the last step was to lead."""
+        every: list[tuple[Any, Any]] = [(load, at) for _, load, at in self._tools]
+        return [self.on_facets(load.expected_gap(at), load.on, load.degree) for load, at in every]
+
+    @cached_property
+    def _beyond(self) -> assembly.VectorAssembler:
+        works = [load.expected(at, at.u)[1] for _, load, at in self._tools]
+        return self.vector(sum(works[1:], works[0]), often=True)
 
     def release(self) -> None:
         """Free the factor, if there is one."""

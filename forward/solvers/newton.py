@@ -9,7 +9,7 @@ from forward.solvers.acceptance import Diverged, accepted, converged, instabilit
 from forward.solvers.corrections import mix
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import finish, plain
-from forward.solvers.system import Found, NoConvergence, Residual, System
+from forward.solvers.system import Found, Move, NoConvergence, Residual, System
 
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
 NEAR = 0.2  # below this fraction of the last Newton step, a factor is used for more than one correction
@@ -58,6 +58,7 @@ def _iterate(
 ) -> tuple[Found, int]:
     residual = system.residual(u)
     predicted = u
+    last: Move | None = None
     sizes: list[float] = []
     longest, length, first = 0.0, np.inf, 0.0
     if not np.isfinite(residual.size):
@@ -69,13 +70,15 @@ def _iterate(
             return Found(u, residual.relative, stability=stability, predicted=predicted), iteration
         if iteration == limit:
             break
+        beyond: FloatArray | float = 0.0
         if not (near and iteration == 0 and system.has_factor(u)):
-            factorise(system, u, curved=not system.contact or residual.relative < CURVED)
-        step = system.solve(-residual.vector)
+            curved = not system.contact or residual.relative < CURVED
+            beyond = factorise(system, u, curved=curved, last=last)
+        step = system.solve(-residual.vector - beyond)
         before, length = length, system.norm(step)
         if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest and not system.contact):
             raise Diverged("the Newton steps grow" + instability(system))
-        longest = max(longest, length)
+        longest, last = max(longest, length), (u, step)
         if system.contact and residual.gap == 0:
             u, residual = searched_step(system, settings, u, residual, step)
         else:
@@ -99,10 +102,10 @@ def _accepted(system: System, settings: SolverSettings, u: FloatArray, residual:
     return finish(accepted(system, settings, u, residual), system.solve)
 
 
-def factorise(system: System, u: FloatArray, *, curved: bool = True) -> None:
-    """Factorise the stiffness at u; raise `Diverged` where it is singular."""
+def factorise(system: System, u: FloatArray, *, curved: bool = True, last: Move | None = None) -> FloatArray | float:
+    """Factorise the stiffness at u, after the `last` step; raise `Diverged` where it is singular."""
     try:
-        system.factorise(u, curved=curved)
+        return system.factorise(u, curved=curved, last=last)
     except SolveError as error:
         raise Diverged(error.reason) from None
 

@@ -9,6 +9,7 @@ from forward.model import FloatArray, SolveError, Stability, Work
 
 TIGHT = 1e-10  # tolerance of solutions on which derivatives rest
 ROUGH = 1e-2  # of steps of Newton's method, which correct each other
+Move = tuple[FloatArray, FloatArray]  # where a step of Newton's method begins, and the whole of it
 
 
 class NoConvergence(SolveError):  # noqa: N818 - what has happened
@@ -123,8 +124,11 @@ class System(Protocol):
     def rounding(self, u: FloatArray, scale: float) -> float:
         """Size (N) below which a residual with this scale cannot be expected to fall at u, whatever the loads."""
 
-    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
+    def factorise(self, u: FloatArray, *, curved: bool = True, last: Move | None = None) -> FloatArray | float:
         """Assemble and factorise the stiffness at u; if not `curved`, without the curvature of surfaces in contact.
+
+        Those on which the `last` step was to press the body, and which nothing touches at u, are linearised where it
+        was to lead; what their imbalance is then beyond that at u is returned.
 
         Raises
         ------

@@ -216,16 +216,33 @@ class Indenter(Term):
         touch = self.touch(at, at.X + at.u)
         return tools.energy(at.ops, touch.gap, touch.stiffness, touch.width) * self.measure(at)
 
-    def straight_stiffness(self, at: Place, direction: Any) -> Any:
-        """Stiffness ∫ φ''(g) (∇g·v)(∇g·w) dS, without that of ∇∇g, and that of friction."""
+    def expected_gap(self, at: Place) -> Any:
+        """Return the gap ĝ (m) to which the last step was to lead, to first order."""
+        import ufl
+
+        assert at.last is not None
+        before = ufl.variable(at.X + at.last[0])
+        gap = self.gap(at.ops, before, at.numbers, at.constant)
+        return gap + ufl.dot(ufl.diff(gap, before), at.last[1])
+
+    def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
+        """Stiffness ∫ φ''(ĝ) (∇g·v)(∇g·w) dS and that of friction; work ∫ (φ'(ĝ) + φ''(ĝ)(g − ĝ) − φ'(g)) ∇g·v dS.
+
+        ĝ = g, unless the body has left the tool.
+        """
         import ufl
 
         x = ufl.variable(at.X + at.u)
         touch = self.touch(at, x)
+        gap = touch.gap + at.left * (self.expected_gap(at) - touch.gap)
+        here, there = (tools.pressure(at.ops, g, touch.stiffness, touch.width) for g in (touch.gap, gap))
+        closed = touch.stiffness * tools.contact(at.ops, gap, touch.width)
         normal = ufl.diff(touch.gap, x)
-        product = ufl.dot(normal, at.v) * ufl.dot(normal, direction)
-        pressed = touch.stiffness * tools.contact(at.ops, touch.gap, touch.width) * product * self.measure(at)
-        return pressed + self.rubbing_stiffness(at, direction, secant=True) if self.friction else pressed
+        stiffness = closed * ufl.dot(normal, at.v) * ufl.dot(normal, direction) * self.measure(at)
+        if self.friction:
+            stiffness += self.rubbing_stiffness(at, direction, secant=True)
+        beyond = here - there + closed * (touch.gap - gap)
+        return stiffness, beyond * ufl.dot(normal, at.v) * self.measure(at)
 
     @property
     def symmetric(self) -> bool:

@@ -92,6 +92,10 @@ class Place:
         Factor on the stiffness of tools, which is raised where the body enters them too far.
     since
         The increment of the load; None where nothing depends on it.
+    last
+        Displacement (m) before the last step of Newton's method, and the whole of that step; None where no tool acts.
+    left
+        1 where that step was to press the body on this tool and has taken it off altogether, otherwise 0.
     """
 
     u: Any
@@ -110,6 +114,8 @@ class Place:
     bounds: tuple[tuple[float, float], ...]
     stiffer: Any
     since: Since | None = None
+    last: tuple[Any, Any] | None = None
+    left: Any = 0.0
 
 
 class Term(Named):
@@ -126,11 +132,13 @@ class Term(Named):
         """
         return None
 
-    def straight_stiffness(self, at: Place, direction: Any) -> Any:
-        """Return its stiffness along a direction, as a bilinear form without the curvature of the surface touched.
+    def expected(self, at: Place, direction: Any) -> tuple[Any, Any]:
+        """Return what it is like far from equilibrium, as two forms.
 
-        Only of loads that act in contact: far from equilibrium, pressures are so large that this curvature makes the
-        stiffness indefinite.
+        They are its stiffness along a direction, without the curvature of the surface touched, and the virtual work
+        of its linearised law at the gaps here, less its own: 0, unless the body has `left` it, which is then linearised
+        at the gaps to which the last step was to lead. Only of loads that act in contact: pressures of states far from
+        equilibrium are so large that their curvature makes the stiffness indefinite.
         """
         raise NotImplementedError
 
