@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -358,7 +358,9 @@ def of_outputs(
     Nothing is said of outputs whose deviations are not known.
     """
     shifts = np.divide(changes, spread, out=np.full(changes.shape, np.nan), where=spread > 0)
-    return [replace(one, code="not-random") for one in findings(assumed, outputs, shifts)]
+    return [
+        Finding("not-random", "note", {"listed": one.values["listed"]}) for one in findings(assumed, outputs, shifts)
+    ]
 
 
 def bent(names: Sequence[str], answers: Sequence[str], shifts: FloatArray) -> list[Finding]:
