@@ -48,8 +48,8 @@ class Case:
     truth: FloatArray
 
 
-def cube(cells: int = 3) -> Case:
-    """A lump in a cube, from displacements in two load cases with errors of 1 % of the largest."""
+def cube_spec(cells: int) -> Specimen:
+    """Return a lump in a cube, in two load cases."""
     lump = {"name": "lump", "x": 0.025, "y": 0.025, "z": 0.03, "radius": 0.014, "contrast": 3, "width": 8e-3}
     blocks = {
         "body": _block(0.05, cells),
@@ -60,7 +60,12 @@ def cube(cells: int = 3) -> Case:
             {"name": "pull", "clamp": ["z-min"], "loads": [_traction([0, 0, 1], 200), _gravity(1000)]},
         ],
     }  # fmt: skip
-    spec = Specimen.model_validate(blocks)
+    return Specimen.model_validate(blocks)
+
+
+def cube(cells: int = 3) -> Case:
+    """A lump in a cube, from displacements in two load cases with errors of 1 % of the largest."""
+    spec = cube_spec(cells)
     inputs = Inputs(
         {
             "material.mu": LogNormal(mean=1000, std=300),

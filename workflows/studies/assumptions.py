@@ -124,9 +124,9 @@ class TakenForGranted:
     def _as_stated(self, one: Assumption) -> Assumption:
         for name, how in self.stated.items():
             if means(name, one.name):
-                if how.std is None:
-                    assert how.relative is not None
-                    return one._replace(size=one.size / PART * how.relative, part=how.relative)
+                if how.relative is not None:  # a place or a direction has no part of itself, which is refused
+                    return one._replace(size=one.size / PART * how.relative, part=how.relative) if one.part else one
+                assert how.std is not None
                 return one._replace(size=how.std, part=how.std if one.name.startswith("data.scale.") else 0.0)
         return one
 

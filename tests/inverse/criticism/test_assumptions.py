@@ -30,7 +30,7 @@ from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.studies.assumptions import of_numbers
+from workflows.studies.assumptions import TakenForGranted, Uncertain, of_numbers
 
 RNG = np.random.default_rng(3)
 A, B = RNG.standard_normal((8, 2)), RNG.standard_normal((8, 1))
@@ -142,6 +142,26 @@ def test_what_is_otherwise_and_by_how_much():
     assert found["cases.two.displacements.z-max.x"].size == 0  # of which nothing is known
     shared = of_numbers(Specimen.model_validate(blocks).every_scalar, ["loads.gravity.density"], 0.04)
     assert "cases.one.loads.gravity.density" not in {one.name for one in shared}
+
+
+@pytest.mark.unit
+def test_a_place_is_no_part_of_itself():
+    """A relative deviation of a coordinate means nothing, and is refused; one of a radius is what it says."""
+    spec, unknown = bench.cube_spec(1), ("material.mu",)
+    for name, refused in (
+        ("inclusions.lump.x", True),
+        ("inclusions.lump.radius", False),
+        ("loads.traction.size", False),
+    ):
+        taken = TakenForGranted(spec, unknown, (), {name: Uncertain(relative=0.1)})
+        assert [place for place, _, _ in taken.mistakes()] == ([("uncertain", name)] if refused else [])
+    (radius,) = (one for one in taken.numbers if one.name == "inclusions.lump.radius")
+    assert radius.size == pytest.approx(0.01 * 0.014)
+    both = [one.size for one in taken.numbers if one.name.endswith("traction.size")]
+    assert both == pytest.approx([15.0, 20.0])
+    np.testing.assert_array_equal(
+        taken.groups["loads.traction.size"], [one.name.endswith("traction.size") for one in taken.all]
+    )
 
 
 @pytest.mark.unit
