@@ -56,7 +56,7 @@ class Assumption(NamedTuple):
         """Say what is otherwise."""
         kind, _, what = self.name.removeprefix("data.").partition(".")
         far = f"{100 * self.part:g} %" if self.part else told(self.size, self.unit)
-        if self.name.startswith("data."):
+        if self.name.startswith("data.") and what:
             return f"points are {far} farther along {what}" if kind == "shift" else f"measured {what} is {far} larger"
         return f"{self.name} is {far} larger"
 
@@ -193,6 +193,24 @@ class Moved:
         return found
 
 
+def together(assumed: Sequence[Assumption], groups: Mapping[str, FloatArray]) -> tuple[list[Assumption], FloatArray]:
+    """Return what is told of, and the weights (r, k) of all in it: what is uncertain together is one, in its place.
+
+    That of several kinds is told of by their standard deviation.
+    """
+    used, shown, rows = np.zeros(len(assumed), dtype=bool), list[Assumption](), list[FloatArray]()
+    for name, weights in groups.items():
+        members = [one for one, weight in zip(assumed, weights, strict=True) if weight]
+        alike = {one.part for one in members if one.name.endswith(name) or one.name.startswith(name)}
+        part = alike.pop() if len(alike) == 1 and len(members) > 1 else 0.0
+        alone = members[0] if len(members) == 1 else Assumption(name, 1.0, "standard deviation")
+        shown.append(alone._replace(name=name, size=part, unit="1", part=part) if part else alone)
+        rows.append(weights)
+        used |= weights > 0
+    shown += [one for one, gone in zip(assumed, used, strict=True) if not gone]
+    return shown, np.vstack([*rows, np.eye(len(assumed))[~used]])
+
+
 @dataclass(frozen=True, eq=False)
 class Assumptions:
     """What is taken for granted of m data, numbers of the model first.
@@ -229,6 +247,11 @@ class Assumptions:
     def all(self) -> list[Assumption]:
         """All of them."""
         return [*self.numbers, *self.beside]
+
+    @cached_property
+    def told(self) -> tuple[list[Assumption], FloatArray]:
+        """What is told of, as `together`."""
+        return together(self.all, self.groups)
 
     @property
     def weights(self) -> FloatArray:
@@ -323,7 +346,7 @@ def moved_by(posterior: Posterior, gaussian: Laplace, at: Density, assumed: Assu
     d, noise, scale = len(posterior.inputs.names), posterior.noise, posterior.scale(at.x)[0]
     mode, L = gaussian.mode[:d], np.linalg.cholesky(np.linalg.inv(gaussian.hessian[:d, :d]))
     points, slopes = posterior.inputs.from_normals(np.vstack([mode, mode + BESIDE * L.T]))
-    here, *beside = assumed.changes(points, posterior.start)
+    here, *beside = assumed.told[1] @ assumed.changes(points, posterior.start)
     residual = posterior.residuals(at.outputs, at.x)[0]
     pull, A = noise.whitened(noise.score(residual)) / scale, posterior.sensitivities(at)[0]
 

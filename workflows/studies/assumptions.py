@@ -25,6 +25,7 @@ from inverse.criticism.assumptions import (
     by_evaluation,
     of_data,
     of_outputs,
+    together,
 )
 from inverse.data.measurements import Measurements
 from uq.findings import add
@@ -151,6 +152,11 @@ class TakenForGranted:
     def all(self) -> list[Assumption]:
         """All of them, in this order."""
         return [*self.numbers, *self.beside]
+
+    @property
+    def told(self) -> list[Assumption]:
+        """What is told of: what is uncertain together is one."""
+        return together(self.all, self.groups)[0]
 
     def described(self, *, field: bool) -> str:
         """Say what is looked at, and how many solves that takes."""

@@ -90,7 +90,7 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
     if study.taken is not None and "assumption_shift" in held:
-        assumed = study.taken.all
+        assumed = study.taken.told
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
         held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
     if study.predict is not None:
@@ -254,7 +254,7 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
     found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
     if study.taken is not None and "assumption_shift" in one:
-        found += findings_of_assumed(study.taken.all, names, one["assumption_shift"].to_numpy())
+        found += findings_of_assumed(study.taken.told, names, one["assumption_shift"].to_numpy())
         found += bent(list(study.taken.groups), names, one["assumption_bend"].to_numpy())
     seen = np.isfinite(one["measured"].to_numpy())
     residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]

@@ -176,7 +176,9 @@ def test_what_is_uncertain_is_among_the_errors(folder):
         np.testing.assert_allclose(one["mode"], mode, rtol=1e-6)
         np.testing.assert_allclose(one["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-6)
         assert "motion_eigenvalue" not in one
-        assert one["assumption_part"].values.tolist() == [0.2, 0.2]
+        told = ["data.scale"] if number == 0 else ["data.scale.displacement", "data.scale.w"]
+        assert one["assumption"].values.tolist() == told
+        assert one["assumption_part"].values.tolist() == [0.2] * len(told)
 
 
 @pytest.mark.parametrize(
