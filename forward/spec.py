@@ -92,7 +92,8 @@ class ModelSpec(Settings):
     @property
     def every_scalar(self) -> Mapping[str, Scalar]:
         """Every number that `build` takes by its path alone: what acts in one load case only is apart there."""
-        return {path: number for path, number in self.scalars.items() if path not in self.unavailable}
+        without = self.unavailable
+        return {path: number for path, number in self.scalars.items() if path not in without}
 
     @abstractmethod
     def build(self, comm: Any, parameters: tuple[str, ...]) -> ForwardModel:

@@ -151,7 +151,8 @@ class PathSolution(CombinedSolution):
 
 def path(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathModel:
     """Return a body along a path as a model; collective. Parameters as of `HyperelasticModel`."""
-    own = tuple(path for path in parameters if path in {*spec.scalars, *spec.coefficients})
+    known = {*spec.scalars, *spec.coefficients}
+    own = tuple(path for path in parameters if path in known)
     whole = HyperelasticModel(spec.whole, comm, (*own, *spec.stepped))
     bodies = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
     values = np.array(list(spec.stepped.values())).T
@@ -320,16 +321,18 @@ def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel
     ValueError
         For a path that is not a number of any load case.
     """
-    known = {*spec.scalars, *spec.every_scalar, *spec.coefficients}
+    of_cases = [(case, spec.loaded(case)) for case in spec.cases]
+    owns = [
+        {path: path for path in (*loaded.scalars, *loaded.coefficients)}
+        | {spec.path_in(case, path): path for path in loaded.scalars}
+        for case, loaded in of_cases
+    ]
     for path in parameters:
-        if path not in known:
+        if not any(path in own for own in owns):
             raise ValueError(f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}")
     bodies: list[HyperelasticModel] = []
     models: list[Mapped] = []
-    for case in spec.cases:
-        loaded = spec.loaded(case)
-        own = {path: path for path in (*loaded.scalars, *loaded.coefficients)}
-        own |= {spec.path_in(case, path): path for path in loaded.scalars}
+    for own, (_, loaded) in zip(owns, of_cases, strict=True):
         where = [i for i, path in enumerate(parameters) if path in own]
         bodies.append(loaded.build(comm, tuple(own[parameters[i]] for i in where)))
         models.append(taking(bodies[-1], where, parameters))

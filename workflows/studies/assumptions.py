@@ -108,13 +108,18 @@ class TakenForGranted:
     stated: Mapping[str, Uncertain] = field(default_factory=dict)
 
     @cached_property
+    def _scalars(self) -> Mapping[str, Scalar]:
+        found: Mapping[str, Scalar] = self.spec.every_scalar
+        return found
+
+    @cached_property
     def _extent(self) -> float:
         return max((high - low for one in self.spec.bodies for low, high in one.body.bounds), default=0.0)
 
     @cached_property
     def numbers(self) -> list[Assumption]:
         """Numbers of the model, but for those that are zero, and not stated to be uncertain."""
-        found = of_numbers(self.spec.every_scalar, self.unknown, self._extent)
+        found = of_numbers(self._scalars, self.unknown, self._extent)
         return [one for one in map(self._as_stated, found) if one.size]
 
     @cached_property
@@ -167,7 +172,7 @@ class TakenForGranted:
     @property
     def values(self) -> FloatArray:
         """Values (k,) of the numbers as stated."""
-        return np.array([self.spec.every_scalar[one.name].value for one in self.numbers])
+        return np.array([self._scalars[one.name].value for one in self.numbers])
 
     def build(self, comm: Any) -> Any:
         """Make the model with all of these numbers among its parameters; collective."""

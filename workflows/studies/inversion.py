@@ -182,7 +182,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         if self.uncertain and (self.method.expansion is not None or self.method.reduced is not None):
             message = "what is uncertain beside the parameters needs solves of the model itself, expected neither "
             yield ("uncertain",), f"{message}method.expansion nor method.reduced", list(self.uncertain)
-        elif self.taken is not None:
+        elif self.uncertain and self.taken is not None:
             yield from self.taken.mistakes()
 
     def _of_specimen(self) -> Iterator[Mistake]:

@@ -214,11 +214,9 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
 
     def _of_uncertain(self) -> Iterator[Mistake]:
         """Find what is stated to be uncertain of which no candidate takes anything for granted."""
-        each = [
-            {place: (place, message, given) for place, message, given in taken.mistakes()}
-            for taken in (self.takes(name, []) for name in self.candidates if self.uncertain)
-        ]
-        yield from (one for place, one in (each[0] if each else {}).items() if all(place in other for other in each))
+        if self.uncertain:
+            each = [{one[0]: one for one in self.takes(name, []).mistakes()} for name in self.candidates]
+            yield from (one for place, one in each[0].items() if all(place in other for other in each))
 
     def _of_tests(self) -> Iterator[Mistake]:
         """Find several tests of one name in a group, words about meshes, and candidates that are no materials."""
