@@ -30,6 +30,8 @@ from inverse.data.shared_motion import Shared
 from uq.evaluation.request import Evaluate, Request, Start
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from inverse.low_dimensional.laplace import Laplace
     from inverse.low_dimensional.posterior import Density, Posterior
 
@@ -193,22 +195,20 @@ class Moved:
         return found
 
 
-def together(assumed: Sequence[Assumption], groups: Mapping[str, FloatArray]) -> tuple[list[Assumption], FloatArray]:
-    """Return what is told of, and the weights (r, k) of all in it: what is uncertain together is one, in its place.
+def merged(assumed: Sequence[Assumption], groups: Mapping[str, FloatArray]) -> tuple[list[Assumption], FloatArray]:
+    """Return what is told of, and the weights (r, k) of all in it: what is uncertain together is one, before the rest.
 
-    That of several kinds is told of by their standard deviation.
+    That which is not otherwise by one part is told of by its standard deviation.
     """
-    used, shown, rows = np.zeros(len(assumed), dtype=bool), list[Assumption](), list[FloatArray]()
-    for name, weights in groups.items():
-        members = [one for one, weight in zip(assumed, weights, strict=True) if weight]
-        alike = {one.part for one in members if one.name.endswith(name) or one.name.startswith(name)}
-        part = alike.pop() if len(alike) == 1 and len(members) > 1 else 0.0
-        alone = members[0] if len(members) == 1 else Assumption(name, 1.0, "standard deviation")
-        shown.append(alone._replace(name=name, size=part, unit="1", part=part) if part else alone)
-        rows.append(weights)
-        used |= weights > 0
-    shown += [one for one, gone in zip(assumed, used, strict=True) if not gone]
-    return shown, np.vstack([*rows, np.eye(len(assumed))[~used]])
+    shown, weights = list[Assumption](), np.array(list(groups.values())).reshape(len(groups), len(assumed))
+    for name, row in zip(groups, weights, strict=True):
+        members = [one for one, weight in zip(assumed, row, strict=True) if weight]
+        parts = {one.part for one in members}
+        part = parts.pop() if len(parts) == 1 else 0.0
+        by_part = Assumption(name, part, "1", part) if part else Assumption(name, 1.0, "standard deviation")
+        shown.append(by_part if len(members) > 1 else members[0])
+    alone = ~weights.any(axis=0)
+    return [*shown, *(assumed[k] for k in np.flatnonzero(alone))], np.vstack([weights, np.eye(len(assumed))[alone]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,9 +249,9 @@ class Assumptions:
         return [*self.numbers, *self.beside]
 
     @cached_property
-    def told(self) -> tuple[list[Assumption], FloatArray]:
-        """What is told of, as `together`."""
-        return together(self.all, self.groups)
+    def shown(self) -> tuple[list[Assumption], FloatArray]:
+        """What is told of, as `merged`."""
+        return merged(self.all, self.groups)
 
     @property
     def weights(self) -> FloatArray:
@@ -346,7 +346,7 @@ def moved_by(posterior: Posterior, gaussian: Laplace, at: Density, assumed: Assu
     d, noise, scale = len(posterior.inputs.names), posterior.noise, posterior.scale(at.x)[0]
     mode, L = gaussian.mode[:d], np.linalg.cholesky(np.linalg.inv(gaussian.hessian[:d, :d]))
     points, slopes = posterior.inputs.from_normals(np.vstack([mode, mode + BESIDE * L.T]))
-    here, *beside = assumed.told[1] @ assumed.changes(points, posterior.start)
+    here, *beside = assumed.shown[1] @ assumed.changes(points, posterior.start)
     residual = posterior.residuals(at.outputs, at.x)[0]
     pull, A = noise.whitened(noise.score(residual)) / scale, posterior.sensitivities(at)[0]
 
@@ -383,6 +383,25 @@ def of_outputs(
     shifts = np.divide(changes, spread, out=np.full(changes.shape, np.nan), where=spread > 0)
     return [
         Finding("not-random", "note", {"listed": one.values["listed"]}) for one in findings(assumed, outputs, shifts)
+    ]
+
+
+def kept_in(of: xr.Dataset) -> list[Assumption]:
+    """Return what results take for granted."""
+    keys = (of[f"assumption{key}"].to_numpy().tolist() for key in ("", "_size", "_unit", "_part"))
+    return [Assumption(str(name), size, str(unit), part) for name, size, unit, part in zip(*keys, strict=True)]
+
+
+def findings_in(of: xr.Dataset) -> list[Finding]:
+    """Return what the results of one data set, or of a candidate for one group, say of what is taken for granted."""
+    answers = [str(name) for name in of["parameter"].values]
+    shifts, bends = (
+        of[f"assumption_{name}"].transpose(dim, "parameter").to_numpy()
+        for name, dim in (("shift", "assumption"), ("bend", "uncertain"))
+    )
+    return [
+        *findings(kept_in(of), answers, shifts),
+        *bent([str(name) for name in of["uncertain"].values], answers, bends),
     ]
 
 

@@ -261,7 +261,7 @@ def comparison(
         variables["chain_effective"] = table({k: np.nan if one is None else one.ess for k, one in chains.items()})
     if all(one.mesh is not None for one in found.values()):
         variables |= _meshes(names, data_groups, parameters, found)
-    held = list(dict.fromkeys(taken.name for one in found.values() if one.assumed for taken in one.assumed[0].told[0]))
+    held = list(dict.fromkeys(taken.name for one in found.values() if one.assumed for taken in one.assumed[0].shown[0]))
     bends = list(dict.fromkeys(name for one in found.values() if one.assumed for name in one.assumed[0].groups))
     if held:
         variables |= _assumptions(names, groups, parameters, held, bends, found)
@@ -407,13 +407,13 @@ def _assumptions(
         if one.assumed is None:
             continue
         taken, moves = one.assumed
-        rows, mine = [held.index(each.name) for each in taken.told[0]], columns[: len(one.posterior.inputs.names)]
+        rows, mine = [held.index(each.name) for each in taken.shown[0]], columns[: len(one.posterior.inputs.names)]
         std = answer(one.posterior, one.assessment).std[: len(mine)]
         shift[k, g][np.ix_(rows, mine)] = moves.parameters / std
         bend[k, g][np.ix_([uncertain.index(name) for name in taken.groups], mine)] = moves.bends / std
         added[k, g, rows] = moves.log_evidence
-        size[k, rows], part[k, rows] = [each.size for each in taken.told[0]], [each.part for each in taken.told[0]]
-        unit |= {each.name: each.unit for each in taken.told[0]}
+        size[k, rows], part[k, rows] = [each.size for each in taken.shown[0]], [each.part for each in taken.shown[0]]
+        unit |= {each.name: each.unit for each in taken.shown[0]}
     return {
         "assumption_shift": ((*dims, "parameter"), shift),
         "assumption_bend": (("model", "group", "uncertain", "parameter"), bend),

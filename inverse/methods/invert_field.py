@@ -171,7 +171,7 @@ def _of_assumed(solved: SolvedField, assumed: Assumptions, g: FloatArray, std: F
     state = np.asarray(point.solution.state)
     found: Record = {}
     for name, changes in (
-        ("shift", assumed.told[1] @ assumed.changes(point.values[None], state)[0]),
+        ("shift", assumed.shown[1] @ assumed.changes(point.values[None], state)[0]),
         ("bend", assumed.bends(point.values, state)),
     ):
         moves = field_moved(solved, changes)

@@ -92,26 +92,14 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         if predicts != best:
             said.append(Finding("whole-tests-predicted", "warning", {"other": predicts}))
     if "assumption_shift" in dataset:
-        said += _assumptions(dataset.sel(model=best), best)
+        from inverse.criticism.assumptions import findings_in
+
+        said += [one.of(best) for one in findings_in(dataset.sel(model=best).isel(group=0))]  # of several the first
     if "motion_eigenvalue" in dataset:
         from inverse.data.shared_motion import said as determined
 
         said.append(determined(dataset["motion_eigenvalue"].sel(model=best).to_numpy()).of(best))
     return said
-
-
-def _assumptions(of: xr.Dataset, best: str) -> list[Finding]:
-    """Say what moves the constants of the most probable candidate most; of several groups those of the first."""
-    from inverse.criticism.assumptions import Assumption, bent
-    from inverse.criticism.assumptions import findings as moved
-
-    keys = (of[f"assumption{key}"].to_numpy().tolist() for key in ("", "_size", "_unit", "_part"))
-    assumed = [Assumption(str(name), size, str(unit), part) for name, size, unit, part in zip(*keys, strict=True)]
-    answers = [str(name) for name in of.parameter.values]
-    shifts = of["assumption_shift"].isel(group=0).transpose("assumption", "parameter").to_numpy()
-    bends = of["assumption_bend"].isel(group=0).transpose("uncertain", "parameter").to_numpy()
-    found = [*moved(assumed, answers, shifts), *bent(of["uncertain"].values.tolist(), answers, bends)]
-    return [one.of(best) for one in found]
 
 
 def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:

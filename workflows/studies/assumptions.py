@@ -23,9 +23,9 @@ from inverse.criticism.assumptions import (
     Assumptions,
     Moved,
     by_evaluation,
+    merged,
     of_data,
     of_outputs,
-    together,
 )
 from inverse.data.measurements import Measurements
 from uq.findings import add
@@ -159,9 +159,9 @@ class TakenForGranted:
         return [*self.numbers, *self.beside]
 
     @property
-    def told(self) -> list[Assumption]:
+    def shown(self) -> list[Assumption]:
         """What is told of: what is uncertain together is one."""
-        return together(self.all, self.groups)[0]
+        return merged(self.all, self.groups)[0]
 
     def described(self, *, field: bool) -> str:
         """Say what is looked at, and how many solves that takes."""

@@ -16,9 +16,8 @@ from forward.findings import Finding, Severity
 from forward.finer_meshes import counted as counted_on
 from forward.model import FloatArray
 from forward.readable import told
+from inverse.criticism import assumptions
 from inverse.criticism import doubts as criticism
-from inverse.criticism.assumptions import bent
-from inverse.criticism.assumptions import findings as findings_of_assumed
 from inverse.data.shared_motion import said as said_of_motion
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
@@ -90,7 +89,7 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
     if study.taken is not None and "assumption_shift" in held:
-        assumed = study.taken.told
+        assumed = study.taken.shown
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
         held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
     if study.predict is not None:
@@ -253,9 +252,7 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found += criticism.heavy_tails(names, one["outermost"].to_numpy())
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
     found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
-    if study.taken is not None and "assumption_shift" in one:
-        found += findings_of_assumed(study.taken.told, names, one["assumption_shift"].to_numpy())
-        found += bent(list(study.taken.groups), names, one["assumption_bend"].to_numpy())
+    found += assumptions.findings_in(one) if "assumption_shift" in one else []
     seen = np.isfinite(one["measured"].to_numpy())
     residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
     if study.method.noise is not None:

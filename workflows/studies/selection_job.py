@@ -56,8 +56,9 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
             return one.of(data, asked)
 
         shared = {(n, g): motion.errors_by(evaluate.on(f"{n}/{g}/{MOVED}")) for (n, g), motion in motions.items()}
-        both = {pair: together(shared.get(pair), assumed(*pair).shared) for pair in taken}
-        shared = {pair: one for pair, one in both.items() if one is not None}
+        for pair, one in taken.items():
+            if one.groups and (errors := together(shared.get(pair), assumed(*pair).shared)) is not None:
+                shared[pair] = errors
 
         def recorded(name: str, group: str) -> Evaluate:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))

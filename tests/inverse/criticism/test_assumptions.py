@@ -19,10 +19,10 @@ from inverse.criticism.assumptions import (
     bent,
     by_evaluation,
     findings,
+    merged,
     moved_by,
     of_data,
     quantities,
-    together,
 )
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
@@ -150,10 +150,10 @@ def test_what_is_uncertain_together_is_told_of_together():
     sizes = [Assumption(f"cases.{case}.loads.traction.size", 10.0, "Pa", 0.05) for case in ("shear", "pull")]
     others = [Assumption("inclusions.lump.width", 1e-3, "m", 0.1), Assumption("data.shift.x", 1e-3, "m")]
     groups = {"loads.traction.size": np.array([1.0, 1, 0, 0]), "lump": np.array([0.0, 0, 1, 1])}
-    shown, weights = together([*sizes, *others], groups)
+    shown, weights = merged([*sizes, *others], groups)
     assert list(map(str, shown)) == ["loads.traction.size is 5 % larger", "lump is 1 standard deviation larger"]
     np.testing.assert_array_equal(weights, [[1, 1, 0, 0], [0, 0, 1, 1]])
-    shown, weights = together([*sizes, *others], {"inclusions.lump.width": np.array([0.0, 0, 1, 0])})
+    shown, weights = merged([*sizes, *others], {"inclusions.lump.width": np.array([0.0, 0, 1, 0])})
     assert shown == [others[0], *sizes, others[1]]
     np.testing.assert_array_equal(weights, np.eye(4)[[2, 0, 1, 3]])
     assert str(Assumption("data.scale", 0.2, "1", 0.2)) == "data.scale is 20 % larger"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import number, size, spoken
-from inverse.criticism.assumptions import Assumption
+from inverse.criticism.assumptions import kept_in
 from workflows.report.blocks import Block, Folded, Heading, Table, Text
 from workflows.report.section import Results, section
 from workflows.report.sections.bodies import first
@@ -51,9 +51,10 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
         columns.append(("stiffness, where it moves most", one["assumption_stiffness"].to_numpy()))
     if "assumption_log_evidence" in one:
         columns.append(("ln Z", one["assumption_log_evidence"].to_numpy()))
+    assumed = kept_in(one)
     largest = np.nanmax(np.abs(np.column_stack([values for _, values in columns])), axis=1, initial=0.0)
     rows = [
-        (str(_assumption(one, int(k))), *(number(float(values[k]), 2) for _, values in columns))
+        (str(assumed[k]), *(number(float(values[k]), 2) for _, values in columns))
         for k in np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]
     ]
     yield from _folded(("if …", *(title for title, _ in columns)), rows)
@@ -64,21 +65,16 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
 @section("assumption_change", heading="What nobody made uncertain")
 def not_random(results: Results) -> Iterator[Block]:
     """How far outputs change at the mean with the numbers that are not random."""
-    of = results.dataset
+    of, assumed = results.dataset, kept_in(results.dataset)
     yield Text("Changes of the outputs at the mean, to first order, if numbers that are not random are larger.")
     changes = of["assumption_change"].sel(output=results.drawn).transpose("assumption", "output").to_numpy()
     largest, units = np.abs(changes).max(axis=0, initial=0.0), [results.unit(name) for name in results.drawn]
     over = np.abs(np.divide(changes, largest, out=np.zeros(changes.shape), where=largest > 0)).max(axis=1, initial=0.0)
     rows = [
-        (str(_assumption(of, int(k))), *(size(float(x), unit, 3) for x, unit in zip(changes[k], units, strict=True)))
+        (str(assumed[k]), *(size(float(x), unit, 3) for x, unit in zip(changes[k], units, strict=True)))
         for k in np.argsort(-over, kind="stable")
     ]
     yield from _folded(("if …", *results.drawn), rows)
-
-
-def _assumption(of: xr.Dataset, k: int) -> Assumption:
-    far, part = (float(of[f"assumption_{key}"][k]) for key in ("size", "part"))
-    return Assumption(str(of["assumption"].values[k]), far, str(of["assumption_unit"].values[k]), part)
 
 
 def _folded(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[Block]:
