@@ -167,23 +167,23 @@ def _of_assumed(solved: SolvedField, assumed: Assumptions, g: FloatArray, std: F
 
     Of second order the larger of both.
     """
-    point = solved.mode.point
+    point, width, noise = solved.mode.point, np.ravel(of_mean)[0], np.full(np.size(of_mean) - 1, np.nan)
     state = np.asarray(point.solution.state)
-    found: Record = {}
-    for name, changes in (
-        ("shift", assumed.shown[1] @ assumed.changes(point.values[None], state)[0]),
-        ("bend", assumed.bends(point.values, state)),
-    ):
+
+    def moved(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
         moves = field_moved(solved, changes)
-        largest = np.abs(moves / np.maximum(std, 1e-300)).max(axis=1, initial=0.0)
-        rows = np.full((len(moves), np.size(of_mean)), np.nan)
-        rows[:, 0] = moves @ g / np.ravel(of_mean)[0]
-        if name == "shift":
-            found["assumption_stiffness"] = largest
-        else:
-            rows[:, 0] = np.maximum(np.abs(rows[:, 0]), largest)
-        found[f"assumption_{name}"] = rows
-    return found
+        return moves @ g / width, np.abs(moves / np.maximum(std, 1e-300)).max(axis=1, initial=0.0)
+
+    def beside_noise(values: FloatArray) -> FloatArray:
+        return np.column_stack([values, np.broadcast_to(noise, (len(values), len(noise)))])
+
+    shift, largest = moved(assumed.shown[1] @ assumed.changes(point.values[None], state)[0])
+    bends = np.maximum(*map(np.abs, moved(assumed.bends(point.values, state))))
+    return {
+        "assumption_shift": beside_noise(shift),
+        "assumption_stiffness": largest,
+        "assumption_bend": beside_noise(bends),
+    }
 
 
 def _before(posterior: FieldPosterior, finer: Finer, say: Callable[[str], None]) -> float:
