@@ -264,6 +264,11 @@ class Assumptions:
         At parameters (n, d) or values of a field (1, N), from a prediction of the states. Of scales it is that of what
         was measured or, where it becomes an error that data share, `predicted`: else noise would count as signal, and
         answers be drawn to smaller data (Peelle's puzzle; G. D'Agostini, Nucl. Instrum. Methods A 346 (1994) 306–311).
+
+        Raises
+        ------
+        SolveError
+            Of what is predicted, if the model has no answer.
         """
         n, m, moved = len(points), len(self.data), self.moved
         by_shift = {one.name: one.size for one in self.beside if one.name.startswith("data.shift.")}
@@ -272,6 +277,8 @@ class Assumptions:
             try:
                 outputs, slopes = self._asked(points, np.broadcast_to(self.values, (n, len(self.values))), start)
             except SolveError:
+                if predicted:
+                    raise
                 return np.full((n, len(self.all), m), np.nan)
             found |= {one.name: one.size * slopes[:, :m, i] for i, one in enumerate(self.numbers)}
             scaled = outputs[:, :m] if predicted else scaled
@@ -318,11 +325,7 @@ class Assumptions:
             return None
 
         def errors(point: FloatArray) -> Mapping[str, FloatArray]:
-            changes = self.changes(point[None], None, predicted=True)[0]
-            used = self.weights.any(axis=0)
-            if not np.isfinite(changes[used]).all():
-                raise SolveError("the model has no answer, which would tell what uncertain numbers do")
-            return {"uncertain": self.weights[:, used] @ changes[used]}
+            return {"uncertain": self.weights @ self.changes(point[None], None, predicted=True)[0]}
 
         return errors
 

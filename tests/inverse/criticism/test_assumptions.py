@@ -1,5 +1,7 @@
 """What is taken for granted: closed forms, inversions done again, numbers of one load case, points at a face."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -118,6 +120,9 @@ def test_a_model_without_an_answer_says_nothing_and_stops_nothing():
     assumed = Assumptions(data, NUMBERS, of_data([data], {"u": "m"}, 0.0), np.ones(1), {"u": "m"}, lost)
     changes = assumed.changes(np.zeros((1, 2)), None)
     assert np.isnan(changes).all()
+    uncertain = replace(assumed, groups={"s": np.eye(3)[0]}).shared
+    with pytest.raises(SolveError, match="no answer"):  # without which nothing can be inferred
+        uncertain(np.zeros(2))
     assert [one.name for one in assumed.all] == ["s", "data.scale.displacement", "data.scale.v"]
 
 
