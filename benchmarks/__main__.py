@@ -50,6 +50,7 @@ NAMES = (
     "skewed",
     "skewed_posteriors",
     "assumptions",
+    "questions",
     "coverage",
     "quantiles",
     "small_indices",

@@ -180,6 +180,13 @@ TABLE: dict[str, str | Words] = {
         "parameter, with a normal prior",
         short="{name} is too uncertain for its first order",
     ),
+    "called-for": Words(
+        "the data call for {question} ({form}): ln Z is {gain:.2g} larger with it{also}, and {answer} {size:.2g} "
+        "deviations {way}; a right model looks so with a probability of {probability:.2g}. Make it part of the model, "
+        "or a candidate in select",
+        short="the data call for {question}",
+    ),
+    "left-open": Words("what the data do not tell of may move answers: {listed}", short=""),
     "motions": Words(
         "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
         short="",

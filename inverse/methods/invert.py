@@ -88,6 +88,9 @@ class Invert(MeshTreatment, Settings):
     assumptions
         Tell how far what is taken for granted moves the answers: numbers of the model that are not unknown, scales of
         the data and places of its points (one solve, with derivatives by these numbers).
+    question
+        Ask whether data of few parameters call for what the body does not have: another edge or shape of its
+        inclusions, another lump, a layer, a field, fibres (one solve).
     expansion
         Solves of an expansion of the outputs over the prior that all data sets share: they are then inverted with it,
         in about a second each, whatever a solve takes. By default every data set has solves of its own.
@@ -114,6 +117,7 @@ class Invert(MeshTreatment, Settings):
     reduced: ByReduced | None = None
     mesh_check: bool = True
     assumptions: bool = True
+    question: bool = False
 
     @field_validator("reduced", mode="before", json_schema_input_type=ByReduced | str)
     @classmethod

@@ -26,6 +26,7 @@ from inverse.criticism.assessment import (
 )
 from inverse.criticism.assumptions import Assumptions, moved_by
 from inverse.criticism.predictive import examine, spectrum_of
+from inverse.criticism.questions import Questions, asked
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import resampled
 from inverse.data.measurements import Measurements
@@ -156,6 +157,7 @@ def invert_few(
         **_moments(posterior, one, known, points, look),
         **_alone(posterior, gaussian, spectrum, data),
         **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
+        **({} if problem.questions is None else _asked(posterior, gaussian, at, problem.questions, method.seed)),
         **_draws(posterior, *drawn),
         "point": points.values,
         "point_weight": points.weights,
@@ -243,6 +245,21 @@ def _of_assumed(posterior: Posterior, gaussian: Laplace, at: Density, known: Ans
     nans = ((0, 0), (0, len(known.std) - d))
     shift, bend = (np.pad(of / known.std[:d], nans, constant_values=np.nan) for of in (moves.parameters, moves.bends))
     return {"assumption_shift": shift, "assumption_bend": bend}
+
+
+def _asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> Record:
+    """Answers to questions to the shape; how far (q, c) they move the parameters is NaN of the noise."""
+    found = asked(posterior, gaussian, at, questions, seed)
+    nans = ((0, 0), (0, len(posterior.names) - len(posterior.inputs.names)))
+    each = ([one.move for one in found], [one.left for one in found])
+    move, left = (np.pad(np.array(of), nans, constant_values=np.nan) for of in each)
+    return {
+        "question_forms": "; ".join(one.form for one in found),
+        "question_probability": np.array([one.probability for one in found]),
+        "question_log_evidence": np.array([one.log_evidence for one in found]),
+        "question_move": move,
+        "question_left": left,
+    }
 
 
 def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:

@@ -19,6 +19,7 @@ from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.predictive import ResidualTest
+from inverse.criticism.questions import Questions
 from inverse.criticism.verdict import Verdict
 from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
@@ -49,9 +50,9 @@ _NUMBERS = """
     prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products
-    prediction_solves prediction_why
+    prediction_solves prediction_why question_forms
 """
-_WORDS = {"why", "mesh_why", "prediction_why"}
+WORDS = ("why", "mesh_why", "prediction_why", "question_forms")
 _ARRAYS = {
     "parameter": "mode mean std lower upper outermost mesh_shift mesh_left laplace_std together_std reduced_shift",
     "parameter partner": "covariance",
@@ -62,6 +63,8 @@ _ARRAYS = {
     "assumption parameter": "assumption_shift",
     "assumption": "assumption_stiffness",
     "uncertain parameter": "assumption_bend",
+    "question": "question_probability question_log_evidence",
+    "question parameter": "question_move question_left",
     "iteration column": "step",
     "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution",
     "datum axis": "place datum_direction",
@@ -107,6 +110,8 @@ class Problem:
         What keeps what is found of few parameters.
     assumed
         What is taken for granted; None if it is not looked at.
+    questions
+        What the body does not have, to be asked about; None if nothing is asked.
     """
 
     data: Measurements
@@ -117,6 +122,7 @@ class Problem:
     say: Callable[[str], None] = field(default=lambda line: None)
     steps: Steps = ALL_AGAIN
     assumed: Assumptions | None = None
+    questions: Questions | None = None
 
     @property
     def noise(self) -> Noise:
@@ -128,7 +134,7 @@ def as_dataset(record: Record) -> xr.Dataset:
     """Return the results of an inversion, numbers and sentences, as a dataset."""
     import xarray as xr
 
-    kinds = {name: str if name in _WORDS else float for name in DIMS if name in record}
+    kinds = {name: str if name in WORDS else float for name in DIMS if name in record}
     return xr.Dataset({name: (DIMS[name], np.asarray(record[name], kind)) for name, kind in kinds.items()})
 
 

@@ -219,6 +219,7 @@ SECTIONS = Kinds(
         "posterior": f"{_HERE}.posterior:posterior",
         "posterior-field": f"{_HERE}.posterior:field_posterior",
         "taken-for-granted": f"{_HERE}.assumptions:taken_for_granted",
+        "questions": f"{_HERE}.assumptions:questions_to_shape",
         "places": f"{_HERE}.bodies:places",
         "finer-meshes": f"{_HERE}.errors:finer_meshes",
         "dependence": f"{_HERE}.selection:dependence",

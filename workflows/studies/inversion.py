@@ -12,6 +12,7 @@ from forward.findings import Finding
 from forward.model import ModelError
 from forward.scalars import Mistake
 from forward.settings import nearest
+from forward.solid import Solid
 from inverse.criticism.assessment import NEEDED
 from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import not_installed
@@ -172,6 +173,10 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
         yield from self._of_uncertain()
+        itself = self.method.expansion is None and self.method.reduced is None and not self.field
+        if self.method.question and not (itself and isinstance(self.spec, Solid)):
+            message = "is asked of one body that is solved itself for few parameters, with no expansion, reduced model "
+            yield ("method", "question"), f"{message}or field of nodal values; expected false", True
         if self.predict is not None:
             from workflows.studies.predicted import mistakes
 

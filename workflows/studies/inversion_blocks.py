@@ -162,6 +162,15 @@ class InversionBlocks(OneModel):
             return None
         return TakenForGranted(self.spec, self.unknown, self.measurements, self.uncertain)
 
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Names of the questions to the shape; none where nothing is asked."""
+        if not self.method.question:
+            return ()
+        from forward.enlargements import asked_of
+
+        return asked_of(self.spec)
+
     # --- the data ----------------------------------------------------------------------------------------------------
 
     @property

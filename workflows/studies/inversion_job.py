@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     from forward.fem.finer import FinerMeshes
     from forward.joined_models import JoinedMeshes
+    from inverse.criticism.questions import Questions
     from inverse.data.shared_motion import SharedMotion
     from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
@@ -89,12 +90,15 @@ class _Observed:
         What errors the data share, and the model that tells what they are; None if they are independent.
     held
         The model with the numbers that are taken for granted; None where it is not asked.
+    questions
+        Questions to its shape; None where there are none.
     """
 
     model: ForwardModel
     there: There
     shared: tuple[SharedMotion, ForwardModel] | None = None
     held: ForwardModel | None = None
+    questions: Questions | None = None
 
 
 @dataclass(frozen=True)
@@ -130,8 +134,8 @@ def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
         there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
-    held = _holding(study, ensemble)
-    return _Made(model, lambda number: _Observed(model, there, held=held(number)))
+    held, asked = _holding(study, ensemble), _asking(study, ensemble)
+    return _Made(model, lambda number: _Observed(model, there, held=held(number), questions=asked(number)))
 
 
 def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], ForwardModel | None]:
@@ -143,13 +147,23 @@ def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Forw
     return lambda number: taken.observed(model, study.measurements[number])
 
 
+def _asking(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Questions | None]:
+    """Return what makes the questions to the shape for a data set, by its number; collective."""
+    if not study.method.question:
+        return lambda number: None
+    from workflows.studies.questions import asking
+
+    of = asking(study.spec, study.inputs.names, ensemble.group)
+    return lambda number: of(study.measurements[number])
+
+
 def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
     model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
     meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
-    held = _holding(study, ensemble)
+    held, asked = _holding(study, ensemble), _asking(study, ensemble)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
@@ -163,7 +177,7 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep)
         there = None if meshes is None else meshes.of(own)
         motion = motion_of(data, study.model.body)
         shared = None if motion is None else (motion, model.observing(*motion.observed))
-        return _Observed(own, (there, why), shared, held(number))
+        return _Observed(own, (there, why), shared, held(number), asked(number))
 
     return _Made(model, observed, vertices, look)
 
@@ -213,7 +227,7 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensem
             ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
         assumed = taken.of(data, ask)
         shared = together(shared, assumed.shared)
-    return Problem(data, study.method, study.data.errors, finer, shared, ensemble.say, steps, assumed)
+    return Problem(data, study.method, study.data.errors, finer, shared, ensemble.say, steps, assumed, seen.questions)
 
 
 def _inverted(

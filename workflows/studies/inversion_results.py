@@ -16,11 +16,11 @@ from forward.findings import Finding, Severity
 from forward.finer_meshes import counted as counted_on
 from forward.model import FloatArray
 from forward.readable import told
-from inverse.criticism import assumptions
+from inverse.criticism import assumptions, questions
 from inverse.criticism import doubts as criticism
 from inverse.data.shared_motion import said as said_of_motion
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
+from inverse.methods.record import COLUMNS, ENDS, WORDS, stacked, usual_sizes
 from uq.findings import add
 from uq.inputs.distributions import Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
@@ -61,7 +61,7 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
     record = stacked(each, usual_sizes(study.method, field=study.field) | {"case": len(study.parts)})
     held: dict[str, Any] = dict(record)
     first = next(one for one in each if one is not None)
-    for name in ("why", "mesh_why", "prediction_why"):
+    for name in WORDS:
         if name in first:
             lost = [one.reason if name == "why" else "" for one in outcomes]
             words = [no if one is None else str(one[name].item()) for one, no in zip(each, lost, strict=True)]
@@ -92,6 +92,8 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         assumed = study.taken.shown
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
         held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
+    if study.asked:
+        coordinates["question"] = list(study.asked)
     if study.predict is not None:
         goals = study.predicted.returned
         coordinates["goal"] = [one.name for one in goals]
@@ -253,6 +255,7 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
     found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
     found += assumptions.findings_in(one) if "assumption_shift" in one else []
+    found += questions.findings_in(one) if study.asked else []
     seen = np.isfinite(one["measured"].to_numpy())
     residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
     if study.method.noise is not None:

@@ -164,6 +164,9 @@ def of_inversion(study: InversionBlocks) -> list[str]:
     lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
     lines += only_needed(method.chains, method.chains_when, method.chain_solves(len(study.names), field=study.field))
     lines += [] if study.taken is None else [f"assumed     {study.taken.described(field=study.field)}"]
+    lines += (
+        [f"asked       {', '.join(study.asked)}: whether the data call for them, by 1 solve"] if study.asked else []
+    )
     refused = (f"warning     {one.refused}" for one in study.data.sets if one.refused)
     return [f"method      {method.kind}", *lines, *refused]
 

@@ -17,6 +17,7 @@ import inverse.methods.invert_field
 from benchmarks import buckling
 from forward.model import SolveError, Stability
 from forward.pointwise import FunctionModel
+from inverse.criticism import questions
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.measurements import Measurements
 from inverse.data.rigid import turned
@@ -580,6 +581,7 @@ def test_fewer_data_sets_than_ranks(folder):
 
 
 REPORTED = "method.mesh_error='report'"
+ASKED = ("data.files=['data/made-1.csv']", REPORTED, "method.question=true")
 
 
 @pytest.fixture(scope="module")
@@ -587,7 +589,7 @@ def single(folder):
     """The results of one data set on two cells along an edge: the program finds itself that they are too few."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(study_runs, "_report", lambda directory: None)
-        assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']", REPORTED) == 3
+        assert here(folder / "few.toml", folder / "single", *ASKED) == 3
     return folder / "single"
 
 
@@ -617,10 +619,26 @@ def test_one_data_set_and_what_others_read_of_it(folder, single):
     assert not any("its mesh is too coarse" in text for text in said)
 
 
+def test_it_is_asked_what_the_body_could_have(single):
+    """Of errors of the mesh, which are not corrected here, the data make something else: it is said, with its form."""
+    found = xr.open_dataset(single / "results.nc", engine="h5netcdf")
+    names = ["edge of lump", "shape of lump", "another lump", "a layer", "a field", "fibres"]
+    assert found["question"].values.tolist() == names
+    one = found.isel(data_set=0)
+    assert one["question_move"].dims == ("question", "parameter")
+    assert np.isfinite(one["question_left"]).all()
+    assert len(str(one["question_forms"].item()).split("; ")) == len(names)
+    called = questions.findings_in(one)[0]
+    assert called.severity == "warning"
+    assert called.values["probability"] == float(one["question_probability"].min())
+    verdict = json.loads((single / "summary.json").read_text())["verdict"]
+    assert f"the data call for {called.values['question']}" in verdict
+
+
 @pytest.mark.mpi
 def test_all_groups_share_one_data_set(folder, single):
     """The same bytes as of one rank, the solve on the finer mesh among them."""
-    changes = ("--set", "data.files=['data/made-1.csv']", "--set", REPORTED)
+    changes = tuple(word for one in ASKED for word in ("--set", one))
     done = on_kept_ranks(2, COARSELY, "run", folder / "few.toml", "--out", folder / "shared", *changes)
     assert done.returncode == 3, done.stderr
     assert (single / "results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
@@ -728,6 +746,7 @@ def test_a_field_and_its_report(folder):
         (FEW, "draws = 50", 'noise = { kind = "normal", mean = 1, std = 1 }', "method.noise: reaches -.*is positive"),
         (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
         (FEW, "lower = 1,", "lower = -1,", "lower"),
+        (FIELD, "draws = 20", "question = true", "method.question: is asked of one body that is solved itself"),
         (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',
          "a field of nodal values is inverted alone"),
         (FIELD, "draws = 20", 'chains = "emcee"', "expected 'pcn'"),

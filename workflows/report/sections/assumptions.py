@@ -23,6 +23,13 @@ SAID = (
     "unknowns swallow the change."
 )
 
+ASKED = (
+    "What the body could have beside what the model says of it, in the form that the data like best. p is the "
+    "probability with which a right model makes one of all questions look as much called for; where it is at most "
+    "0.05 the evidence, and by how many posterior deviations each answer would be larger, are by Laplace's method "
+    "with that in the model, else to first order. What stands after ± is what the data leave open."
+)
+
 
 @section("assumption_shift", heading="Taken for granted")
 def taken_for_granted(results: Results) -> Iterator[Block]:
@@ -60,6 +67,32 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
     yield from _folded(("if …", *(title for title, _ in columns)), rows)
     if not known.all():
         yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")
+
+
+@section("question_probability", heading="Questions to the shape")
+def questions_to_shape(results: Results) -> Iterator[Block]:
+    """What the body could have beside what the model says: whether data call for it, and what the answers would be."""
+    yield Text(ASKED)
+    for one in first(results):
+        if len(results.dataset["data_set"]) > 1:
+            yield Heading(str(one["data_set"].item()), level=3)
+        moves, left = (
+            one[f"question_{name}"].transpose("question", "parameter").to_numpy() for name in ("move", "left")
+        )
+        answers = [i for i in range(moves.shape[1]) if np.isfinite(moves[:, i]).any()]
+        order = np.argsort(one["question_probability"].to_numpy(), kind="stable")
+        forms = str(one["question_forms"].item()).split("; ")
+        rows = [
+            (
+                f"{one['question'].values[k]}, {forms[k]}",
+                number(float(one["question_probability"][k]), 2),
+                number(float(one["question_log_evidence"][k]), 2),
+                *(f"{number(float(moves[k, i]), 2)} ± {number(float(left[k, i]), 2)}" for i in answers),
+            )
+            for k in order
+        ]
+        names = [spoken(str(one["parameter"].values[i])) for i in answers]
+        yield Table(("what there could be", "p", "ln Z more", *names), rows)
 
 
 @section("assumption_change", heading="What nobody made uncertain")

@@ -1,0 +1,177 @@
+"""What a body could have beside what a model says of it: other edges and shapes of its lumps, more lumps, and others.
+
+An enlargement takes one of several forms, such as a lump at one of many places. Each form has a few patterns, of which
+the strengths are standard normal beforehand: changes of ln of the stiffness at the vertices, or fibres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from forward.bodies.geometry import Body
+from forward.bodies.inclusions import RADII, Ellipsoid, Sphere, log_factor
+from forward.bodies.random_fields import RandomField
+from forward.bodies.surface import Surface, facets, fan
+from forward.model import FloatArray
+from forward.readable import number, place, told
+from forward.solid import Solid
+from forward.specimen import Specimen
+from forward.terms.fibres import QUARTICS, Fibres, quartics
+
+# Standard deviations beforehand: of ln of an edge's width, of ln of the ratio of two radii over 2, of ln of stiffness.
+EDGE, RATIO, STIFFNESS = np.log(2), 0.25, np.log(2)
+STEP, TINY = 1e-4, 1e-6  # of these, by which they are changed for derivatives; of a field that is none
+SIZES = (1.0, 0.6)  # of another lump, over that of the one that there is
+SPACING = 0.6  # of its radius, between the places where it may be
+DEPTHS = (0.1, 0.2)  # of a layer, over the smallest extent of the body
+LENGTH, MODES = 0.5, 16  # of a field: its correlation length over the smallest extent, and its modes
+DIRECTIONS = 48  # of fibres
+ASKED = "asked"  # name of what is added
+
+
+def enlarged(spec: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return a body with a field of ln of its stiffness and with fibres, and the paths of what they depend on.
+
+    Where all of these numbers are zero it is as it was.
+    """
+    field = RandomField(of="stiffness", name=ASKED, length=1.0, std=TINY, basis="nodes")
+    fibres = Fibres(kind="fibres", name=ASKED)
+    more: dict[str, Any] = {"fields": (*spec.fields, field)}
+    if isinstance(spec, Specimen):
+        more["cases"] = tuple(case.model_copy(update={"loads": (*case.loads, fibres)}) for case in spec.cases)
+    else:
+        more["loads"] = (*spec.loads, fibres)
+    paths = (*field.paths(spec.body), *(f"loads.{ASKED}.{name}" for name in QUARTICS))
+    return spec.model_copy(update=more), paths
+
+
+def asked_of(spec: Any) -> tuple[str, ...]:
+    """Return the names of the enlargements of a body."""
+    shapes = [("edge", *(["shape"] if isinstance(one, Sphere) else [])) for one in spec.inclusions]
+    own = [f"{what} of {one.label}" for one, each in zip(spec.inclusions, shapes, strict=True) for what in each]
+    return (*own, "another lump" if own else "a lump", "a layer", "a field", "fibres")
+
+
+def enlargements(
+    spec: Solid, parameters: Sequence[str], point: FloatArray, places: FloatArray
+) -> dict[str, dict[str, FloatArray]]:
+    """Return what a body with inclusions could have beside them, by names: its forms by names.
+
+    Each is an array (k, N + 15) of its patterns: of ln of the stiffness at the vertices, and of fibres.
+
+    Parameters
+    ----------
+    spec
+        The body.
+    parameters, point
+        Paths of the parameters, and their values (d,), of which some may be numbers of the inclusions.
+    places
+        The vertices (N, 3) of the body, in canonical order (m).
+    """
+    body, now = spec.body, [_at(one, parameters, point) for one in spec.inclusions]
+    found: list[dict[str, FloatArray]] = []
+    for one in now:
+        found.append({"another width": _slope(one, {"width": EDGE}, places)[None]})
+        if isinstance(one, Sphere):
+            found.append({"an ellipsoid": np.array(list(_squeezed(one, places)))})
+    found += [dict(_lumps(body, now, places)), dict(_layers(body, places)), {"all over the body": _field(body)}]
+    whole = [{label: np.pad(rows, ((0, 0), (0, len(QUARTICS)))) for label, rows in forms.items()} for forms in found]
+    none = np.zeros(len(places))
+    modulus = STIFFNESS * spec.contact_modulus
+    along = {_told(a): np.append(none, modulus * quartics(a))[None] for a in _directions()}
+    return dict(zip(asked_of(spec), [*whole, along], strict=True))
+
+
+def _extent(body: Body) -> float:
+    return min(high - low for low, high in body.bounds)
+
+
+def _at(one: Sphere | Ellipsoid, parameters: Sequence[str], point: FloatArray) -> Sphere | Ellipsoid:
+    """Return an inclusion with its numbers at parameters (d,)."""
+    path = f"inclusions.{one.label}."
+    known = {name[len(path) :]: float(x) for name, x in zip(parameters, point, strict=True) if name.startswith(path)}
+    return one.model_copy(update={"name": one.label, **known})
+
+
+def _radius(one: Sphere | Ellipsoid) -> float:
+    """Geometric mean of the radii (m)."""
+    return float(np.prod([getattr(one, name) for name in RADII[one.kind]]) ** (1 / 3))
+
+
+def _slope(one: Sphere | Ellipsoid, logs: Mapping[str, float], places: FloatArray) -> FloatArray:
+    """Return the derivative (N,) of ln of the stiffness by the logarithms of numbers, of which each counts so much."""
+    changed = [
+        one.model_copy(update={name: getattr(one, name) * np.exp(sign * STEP * size) for name, size in logs.items()})
+        for sign in (1, -1)
+    ]
+    ahead, back = (log_factor([other], (), np.zeros((1, 0)), places)[0] for other in changed)
+    return np.asarray((ahead - back) / (2 * STEP))
+
+
+def _squeezed(ball: Sphere, places: FloatArray) -> Iterator[FloatArray]:
+    """Yield the changes (N,) to ellipsoids of the same volume: along two axes, and between the axes of each plane."""
+    r, same = ball.radius, ball.model_dump(include={"x", "y", "z", "contrast", "width"})
+    plain = Ellipsoid(a=r, b=r, c=r, **same)
+    third = RATIO / np.sqrt(3)  # all five are equally large in the mean over directions
+    yield _slope(plain, {"a": RATIO, "b": -RATIO}, places)
+    yield _slope(plain, {"a": third, "b": third, "c": -2 * third}, places)
+    for turn, grown, shrunk in (("turn_z", "a", "b"), ("turn_x", "b", "c"), ("turn_y", "c", "a")):
+        turned = plain.model_copy(update={turn: np.pi / 4})
+        yield _slope(turned, {grown: RATIO, shrunk: -RATIO}, places)
+
+
+def _lumps(
+    body: Body, inclusions: Sequence[Sphere | Ellipsoid], places: FloatArray
+) -> Iterator[tuple[str, FloatArray]]:
+    """Yield lumps at places all over the body, as large as those that it has, or somewhat smaller."""
+    cell = body.longest_edge
+    usual = [_radius(one) for one in inclusions] or [_extent(body) / 4]
+    width = min([one.width for one in inclusions], default=usual[0] / 2)
+    for radius in sorted({max(size * max(usual), cell) for size in SIZES}, reverse=True):
+        lattice = np.floor(places / (SPACING * radius) + 0.5).astype(int)
+        _, chosen = np.unique(lattice, axis=0, return_index=True)
+        centres = places[np.sort(chosen)]
+        same = np.zeros(len(centres), dtype=bool)
+        for one in inclusions:
+            same |= np.linalg.norm(centres - (one.x, one.y, one.z), axis=1) < _radius(one)
+        for x, y, z in (centres if same.all() else centres[~same]).tolist():
+            lump = Sphere(x=x, y=y, z=z, radius=radius, contrast=np.exp(STIFFNESS), width=max(width, cell / 2))
+            label = f"at {place((x, y, z))}, radius {told(radius, 'm')}"
+            yield label, log_factor([lump], (), np.zeros((1, 0)), places)
+
+
+def _layers(body: Body, places: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Yield layers along each boundary."""
+    depths = sorted({max(depth * _extent(body), body.longest_edge) for depth in DEPTHS})
+    for name in body.boundaries:
+        surface = Surface(fan(facets(body, name)))
+        far = np.linalg.norm(surface.nearest(places)[0] - places, axis=1)
+        for depth in depths:
+            label = f"along {name}, {told(depth, 'm')} deep"
+            yield label, STIFFNESS * (1 - np.tanh((far - depth) / (depth / 2)))[None] / 2
+
+
+def _directions() -> FloatArray:
+    """Return unit vectors (n, 3) that are spread evenly over half of the sphere, the axes first.
+
+    Along a spiral (E. B. Saff, A. B. J. Kuijlaars, Math. Intelligencer 19 (1997) 5–11).
+    """
+    z = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
+    angle, r = np.pi * (1 + np.sqrt(5)) * np.arange(DIRECTIONS), np.sqrt(1 - z**2)
+    return np.concatenate([np.eye(3), np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)])
+
+
+def _told(direction: FloatArray) -> str:
+    return f"along ({', '.join(number(x, 2) for x in direction)})"
+
+
+def _field(body: Body) -> FloatArray:
+    """Return the modes (k, N) of a random field."""
+    count = min(MODES, body.vertex_count)
+    field = RandomField(of="stiffness", length=LENGTH * _extent(body), std=0.5, modes=count)
+    modes = field.on(body).modes
+    assert modes is not None
+    return modes.T

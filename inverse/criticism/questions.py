@@ -1,0 +1,275 @@
+"""Questions to the shape: whether data call for what a model does not have, and what its answers would be with it.
+
+Let A be the derivatives of the residuals r, over the errors, by the unknowns, and G those by strengths e of an
+enlargement in one of its forms, of which N(0, I) is the prior. To first order at the mode the data are N(0, S) without
+it, S = I + AAᵀ, and
+
+    s = −Gᵀr ~ N(0, C),   C = GᵀS⁻¹G,   ln B = ½ sᵀ(C + I)⁻¹s − ½ ln det(C + I)
+
+is the score, which the residuals at the mode hold since r = S⁻¹r₀, and what the enlargement adds to ln of the evidence
+(C. R. Rao, Proc. Camb. Phil. Soc. 44 (1948) 50–57; C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine
+Learning (2006), section 2.7). The B of an enlargement is the mean over its forms. How large it becomes by chance is
+seen from draws of s: the best of many places is a maximum, and no χ². All questions together are judged by the smallest
+of their probabilities in the same draws (P. H. Westfall, S. S. Young, Resampling-Based Multiple Testing (1993), ch. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from forward.findings import Finding
+from forward.model import FloatArray, ForwardModel, SolveError
+from forward.readable import number
+from inverse.criticism.finer import parameters_moved
+from inverse.low_dimensional.laplace import laplace
+from uq.evaluation.request import Evaluate
+from uq.inputs.distributions import Normal
+from uq.surrogates.linearisation import linearise
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from inverse.low_dimensional.laplace import Laplace
+    from inverse.low_dimensional.posterior import Density, Posterior
+
+DRAWS = 4000  # of scores as they are by chance
+CALLED = 0.05  # probability up to which data call for something
+OPEN, SHOWN = 1.0, 3  # deviations that data leave open from which on that is told, and of how many
+Forms = Mapping[str, Mapping[str, FloatArray]]  # names of enlargements → names of their forms → patterns (k, N)
+
+
+class Answer(NamedTuple):
+    """What data say of an enlargement.
+
+    Attributes
+    ----------
+    name, form
+        What it is called, and the form that the data like best.
+    probability
+        That questions to a right model make one of them look as much called for by chance.
+    log_evidence
+        What it adds to ln Z, to first order.
+    move, left
+        By how much answers (d,) are larger with it, in their deviations, and the deviation of that: what the data do
+        not tell of it.
+    strengths, patterns
+        Most probable strengths (k,) of that form, and its patterns (k, N).
+    searched
+        What the search among all forms costs: ln of the mean of B over them, over the largest.
+    """
+
+    name: str
+    form: str
+    probability: float
+    log_evidence: float
+    move: FloatArray
+    left: FloatArray
+    strengths: FloatArray
+    patterns: FloatArray
+    searched: float
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """A model with d parameters, and N numbers behind them that are zero of a body without enlargements; and these.
+
+    Attributes
+    ----------
+    model
+        The model.
+    forms
+        Parameters (d,) → the enlargements there.
+    having
+        Names of parameters, strengths of patterns (k, N) behind the d of the model, and these → the model of these.
+    """
+
+    model: ForwardModel
+    forms: Callable[[FloatArray], Forms]
+    having: Callable[[Sequence[str], FloatArray], Evaluate]
+
+    def changes(self, posterior: Posterior, point: FloatArray, patterns: FloatArray) -> FloatArray:
+        """Return derivatives (k, M) of the outputs by strengths of patterns (k, N) at parameters (d,); collective.
+
+        By tangents or by adjoints, whichever are fewer.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer.
+        """
+        guess = None if posterior.start is None else replace(posterior.start.on(self.model)(point), reference=None)
+        solution, d = self.model.solve(np.append(point, np.zeros(patterns.shape[1])), guess), len(point)
+        m = len(self.model.outputs)
+        if len(patterns) <= m:
+            return np.asarray(solution.tangent(np.pad(patterns, ((0, 0), (d, 0)))))
+        return np.asarray(patterns @ solution.adjoint(np.eye(m))[:, d:].T)
+
+
+def asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
+    """Ask all questions, and solve for the posterior with each enlargement that data call for.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the mode.
+    """
+    found = answers(posterior, gaussian, at, questions, seed)
+    return [_solved(posterior, gaussian, questions, one) if one.probability <= CALLED else one for one in found]
+
+
+def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answer: Answer) -> Answer:
+    """Return an answer with evidence and moves by Laplace's Gaussian of the posterior with the enlargement.
+
+    To first order if the model has no answer there.
+    """
+    own, d = posterior.inputs, len(posterior.inputs.names)
+    names = [f"{answer.name}, strength {k}" for k in range(len(answer.patterns))]
+    inputs = replace(own, own=own.own | dict.fromkeys(names, Normal(mean=0.0, std=1.0)))
+    old, new = ([inputs.names.index(name) for name in some] for some in (own.names, names))
+
+    def wider(rows: FloatArray) -> FloatArray:
+        found = np.zeros((len(rows), len(inputs.names)))
+        found[:, old] = rows
+        return found
+
+    x = wider(gaussian.mode[None, :d])
+    x[0, new] = answer.strengths
+    noise, evaluate = posterior.noise, questions.having(inputs.names, answer.patterns)
+    if noise.model is not None and noise.model.slopes.size:
+        more = {"point": wider(noise.model.point[None])[0], "slopes": wider(noise.model.slopes)}
+        noise = replace(noise, model=replace(noise.model, **more))
+    try:
+        start = linearise(inputs, evaluate, inputs.from_normals(x)[0][0]).prediction
+        larger = replace(posterior, inputs=inputs, evaluate=evaluate, noise=noise, start=start)
+        found = laplace(larger, starts=1, first=np.append(x[0], gaussian.mode[d:]))
+    except SolveError:
+        return answer
+    move = larger.physical(found.mode[None])[0, old] - posterior.physical(gaussian.mode[None])[0, :d]
+    gain = found.log_evidence - gaussian.log_evidence + answer.searched
+    return answer._replace(log_evidence=gain, move=move / _deviations(posterior, gaussian))
+
+
+def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
+    """Ask all questions to a posterior, given it at its mode, with derivatives; collective over ranks of the model.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the mode.
+    """
+    noise, scale = posterior.noise, posterior.scale(at.x)[0]
+    forms = questions.forms(at.parameters[0])
+    flat = [(name, label, patterns) for name, by in forms.items() for label, patterns in by.items()]
+    changes = questions.changes(posterior, at.parameters[0], np.concatenate([patterns for *_, patterns in flat]))
+    residual = posterior.residuals(at.outputs, at.x)[0]
+    root = np.sqrt(noise.information(residual))
+    G, A = noise.whitened(changes[:, posterior.which] / scale), posterior.sensitivities(at)[0] * root[:, None]
+    scores, H = -G @ noise.score(residual), _without(A, G * root)
+    by_chance = np.random.default_rng(seed).standard_normal((DRAWS, H.shape[1])) @ H.T
+    moves = parameters_moved(posterior, gaussian, A, (G * root).T) / _deviations(posterior, gaussian)[:, None]
+    ends = np.cumsum([len(patterns) for *_, patterns in flat])
+    found = [
+        _Form(label, *_evidence(H[rows], scores[rows], by_chance[:, rows]), moves[:, rows], patterns)
+        for (_, label, patterns), end in zip(flat, ends, strict=True)
+        for rows in [slice(end - len(patterns), end)]
+    ]
+    names = [name for name, *_ in flat]
+    return _judged({name: [one for one, of in zip(found, names, strict=True) if of == name] for name in forms})
+
+
+def _deviations(posterior: Posterior, gaussian: Laplace) -> FloatArray:
+    """Standard deviations (d,) of the parameters by Laplace's Gaussian."""
+    d = len(posterior.inputs.names)
+    slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
+    return np.asarray(np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T)))
+
+
+class _Form(NamedTuple):
+    """One form: ln B of the data (), and by chance (n,), strengths (k,), covariance (k, k), moves (d, k), patterns."""
+
+    label: str
+    log_evidence: float
+    by_chance: FloatArray
+    strengths: FloatArray
+    covariance: FloatArray
+    moves: FloatArray
+    patterns: FloatArray
+
+
+def _without(A: FloatArray, G: FloatArray) -> FloatArray:
+    """Return H (k, q) with HHᵀ = G S⁻¹Gᵀ, of derivatives A (m, d) and G (k, m)."""
+    U, sizes, _ = np.linalg.svd(A, full_matrices=False)
+    H = G - ((G @ U) * (1 - 1 / np.sqrt(1 + sizes**2))) @ U.T
+    return np.asarray(H if len(H) >= H.shape[1] else np.linalg.qr(H.T)[1].T)
+
+
+def _evidence(
+    H: FloatArray, scores: FloatArray, by_chance: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Return ln B of scores (k,), and of those by chance (n, k), and strengths with their covariance."""
+    sizes, axes = np.linalg.eigh(H @ H.T)
+    over = 1 / (1 + np.maximum(sizes, 0))
+
+    def log_evidence(s: FloatArray) -> FloatArray:
+        return np.asarray(((s @ axes) ** 2 @ over + np.log(over).sum()) / 2)
+
+    covariance = (axes * over) @ axes.T
+    return float(log_evidence(scores)), log_evidence(by_chance), covariance @ scores, covariance
+
+
+def _judged(found: Mapping[str, list[_Form]]) -> list[Answer]:
+    """Return the answers to questions, by their names, from all their forms."""
+    logs = {name: np.array([one.log_evidence for one in forms]) for name, forms in found.items()}
+    total = {name: float(logsumexp(each) - np.log(len(each))) for name, each in logs.items()}
+    chance = {
+        name: logsumexp([one.by_chance for one in forms], axis=0) - np.log(len(forms)) for name, forms in found.items()
+    }
+    # How many of the draws are at least as large, of each draw too; the smallest of these shares over the questions.
+    ordered = {name: np.sort(values) for name, values in chance.items()}
+    n = DRAWS + 1
+
+    def share(name: str, values: FloatArray) -> FloatArray:
+        return np.asarray(1 + DRAWS - np.searchsorted(ordered[name], values)) / n
+
+    least = np.min([share(name, values) for name, values in chance.items()], axis=0)
+    answered = []
+    for name, forms in found.items():
+        weights = np.exp(logs[name] - logsumexp(logs[name]))
+        each = np.array([one.moves @ one.strengths for one in forms])
+        move = weights @ each
+        inside = np.array([np.einsum("dk,kl,dl->d", one.moves, one.covariance, one.moves) for one in forms])
+        left = np.sqrt(weights @ (inside + (each - move) ** 2))
+        alone = share(name, np.array([total[name]]))[0]
+        probability = float((1 + (least <= alone).sum()) / n)
+        best, searched = forms[int(weights.argmax())], total[name] - float(logs[name].max())
+        known = (best.label, probability, total[name], move, left, best.strengths, best.patterns, searched)
+        answered.append(Answer(name, *known))
+    return answered
+
+
+def findings_in(one: xr.Dataset) -> list[Finding]:
+    """Return what the results of a data set say of questions: what data call for, and what they leave open."""
+    answers = [str(name) for name in one["parameter"].values]
+    moves, left = (one[f"question_{name}"].transpose("question", "parameter").to_numpy() for name in ("move", "left"))
+    names, forms = one["question"].values.tolist(), str(one["question_forms"].item()).split("; ")
+    probability, gain = one["question_probability"].to_numpy(), one["question_log_evidence"].to_numpy()
+    called = [k for k in np.argsort(-gain) if probability[k] <= CALLED]
+    found, told = [], list[tuple[float, str]]()
+    if called:
+        k, others = called[0], called[1:]
+        i = int(np.nanargmax(np.abs(moves[k])))
+        also = "".join(f", or for {names[other]} ({gain[other]:+.2g})" for other in others)
+        values = {"question": names[k], "form": forms[k], "gain": gain[k], "also": also, "answer": answers[i]}
+        values |= {"size": abs(moves[k, i]), "way": "larger" if moves[k, i] > 0 else "smaller"}
+        found.append(Finding("called-for", "warning", values | {"probability": probability[called].min()}))
+    for k, name in enumerate(names):
+        i = int(np.nanargmax(left[k]))
+        if k not in called and left[k, i] >= OPEN:
+            told.append((left[k, i], f"{name}, {answers[i]} by {number(left[k, i], 2)} deviations"))
+    listed = "; ".join(text for _, text in sorted(told, reverse=True)[:SHOWN])
+    return [*found, *([Finding("left-open", "note", {"listed": listed})] if listed else [])]
