@@ -26,6 +26,7 @@ EDGE, RATIO, STIFFNESS = np.log(2), 0.25, np.log(2)
 STEP, TINY = 1e-4, 1e-6  # of these, by which they are changed for derivatives; of a field that is none
 SIZES = (1.0, 0.6)  # of another lump, over that of the one that there is
 SPACING = 0.6  # of its radius, between the places where it may be
+MOST, WIDER = 600, 1.1  # places of one size, and by what they are farther apart where there would be more
 DEPTHS = (0.1, 0.2)  # of a layer, over the smallest extent of the body
 LENGTH, MODES = 0.5, 16  # of a field: its correlation length over the smallest extent, and its modes
 DIRECTIONS = 48  # of fibres
@@ -131,9 +132,10 @@ def _lumps(
     usual = [_radius(one) for one in inclusions] or [_extent(body) / 4]
     width = min([one.width for one in inclusions], default=usual[0] / 2)
     for radius in sorted({max(size * max(usual), cell) for size in SIZES}, reverse=True):
-        lattice = np.floor(places / (SPACING * radius) + 0.5).astype(int)
-        _, chosen = np.unique(lattice, axis=0, return_index=True)
-        centres = places[np.sort(chosen)]
+        spacing, centres = SPACING * radius, places
+        while len(centres) > MOST or centres is places:
+            _, chosen = np.unique(np.floor(places / spacing + 0.5), axis=0, return_index=True)
+            spacing, centres = WIDER * spacing, places[np.sort(chosen)]
         same = np.zeros(len(centres), dtype=bool)
         for one in inclusions:
             same |= np.linalg.norm(centres - (one.x, one.y, one.z), axis=1) < _radius(one)

@@ -113,17 +113,19 @@ class Questions:
 def asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
     """Ask all questions, and solve for the posterior with each enlargement that data call for.
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the mode.
+    Answers are NaN if the model has none at the mode.
     """
-    found = answers(posterior, gaussian, at, questions, seed)
+    try:
+        found = answers(posterior, gaussian, at, questions, seed)
+    except SolveError:
+        none = np.full(len(posterior.inputs.names), np.nan)
+        unknown = "no answer", np.nan, np.nan, none, none, np.zeros(0), np.zeros((0, 0)), np.nan
+        return [Answer(name, *unknown) for name in questions.forms(at.parameters[0])]
     return [_solved(posterior, gaussian, questions, one) if one.probability <= CALLED else one for one in found]
 
 
 def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answer: Answer) -> Answer:
-    """Return an answer with evidence and moves by Laplace's Gaussian of the posterior with the enlargement.
+    """Return an answer with evidence and moves by Laplace's Gaussian with the enlargement, as Gauss–Newton has it.
 
     To first order if the model has no answer there.
     """
@@ -146,7 +148,7 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
     try:
         start = linearise(inputs, evaluate, inputs.from_normals(x)[0][0]).prediction
         larger = replace(posterior, inputs=inputs, evaluate=evaluate, noise=noise, start=start)
-        found = laplace(larger, starts=1, first=np.append(x[0], gaussian.mode[d:]))
+        found = laplace(larger, starts=1, exact=False, first=np.append(x[0], gaussian.mode[d:]))
     except SolveError:
         return answer
     move = larger.physical(found.mode[None])[0, old] - posterior.physical(gaussian.mode[None])[0, :d]
@@ -268,7 +270,7 @@ def findings_in(one: xr.Dataset) -> list[Finding]:
         values |= {"size": abs(moves[k, i]), "way": "larger" if moves[k, i] > 0 else "smaller"}
         found.append(Finding("called-for", "warning", values | {"probability": probability[called].min()}))
     for k, name in enumerate(names):
-        i = int(np.nanargmax(left[k]))
+        i = int(np.nan_to_num(left[k]).argmax())
         if k not in called and left[k, i] >= OPEN:
             told.append((left[k, i], f"{name}, {answers[i]} by {number(left[k, i], 2)} deviations"))
     listed = "; ".join(text for _, text in sorted(told, reverse=True)[:SHOWN])

@@ -10,6 +10,7 @@ from benchmarks import assumptions as bench
 from forward.enlargements import asked_of, enlarged, enlargements
 from forward.fem.layout import vertex_matrices
 from forward.hyperelastic import Hyperelastic
+from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from forward.terms.fibres import QUARTICS, Fibres, quartics
 from inverse.criticism.questions import CALLED, Questions, answers, asked
@@ -42,19 +43,20 @@ def having(names, patterns):
 QUESTIONS = Questions(linear((*INPUTS.names, *map(str, range(N))), np.hstack([A, V])), lambda point: FORMS, having)
 
 
-def found_of(values, ask=answers, noise=None):
+def found_of(values, ask=answers, noise=None, dof=None):
     model = linear(INPUTS.names, A)
-    posterior = Posterior(INPUTS, SerialEvaluate(model), values, Noise(np.full(M, SIGMA), factor=noise))
+    posterior = Posterior(INPUTS, SerialEvaluate(model), values, Noise(np.full(M, SIGMA), dof, noise))
     gaussian = laplace(posterior, starts=1)
     at = posterior.at(gaussian.mode[None], derivatives=True)
     return ask(posterior, gaussian, at, QUESTIONS, 0), gaussian
 
 
-def drawn(seed, strengths=()):
+def drawn(seed, strengths=(), dof=None):
     rng = np.random.default_rng(seed)
     behind = np.zeros(N)
     behind[: len(strengths)] = strengths
-    return A @ INPUTS.drawn(rng, 1)[0] + V @ behind + SIGMA * rng.standard_normal(M)
+    errors = rng.standard_normal(M) if dof is None else rng.standard_t(dof, M)
+    return A @ INPUTS.drawn(rng, 1)[0] + V @ behind + SIGMA * errors
 
 
 def log_evidence(values, B):
@@ -94,12 +96,24 @@ def test_what_data_leave_open_widens_the_answers():
     np.testing.assert_allclose(two.left, np.sqrt(more / np.diag(gaussian.covariance)), rtol=1e-5)
 
 
-@pytest.mark.unit
-def test_a_right_model_is_accused_once_in_twenty():
+@pytest.mark.parametrize("dof", [None, 4.0])
+def test_a_right_model_is_accused_once_in_twenty(dof):
     """Over all questions, whichever: the share of 400 data sets is binomial."""
-    least = np.array([min(one.probability for one in found_of(drawn(seed))[0]) for seed in range(400)])
+    found = (found_of(drawn(seed, (), dof), dof=dof)[0] for seed in range(400))
+    least = np.array([min(one.probability for one in each) for each in found])
     for level in (0.05, 0.2, 0.5):
         assert abs((least <= level).mean() - level) < 4 * np.sqrt(level * (1 - level) / 400)
+
+
+@pytest.mark.unit
+def test_a_model_without_an_answer_says_nothing_and_stops_nothing(monkeypatch):
+    def lost(*args):
+        raise SolveError("no answer")
+
+    monkeypatch.setattr(Questions, "changes", lost)
+    found, _ = found_of(drawn(0), asked)
+    assert [one.name for one in found] == ["two", "one"]
+    assert all(np.isnan(one.probability) and np.isnan(one.left).all() for one in found)
 
 
 @pytest.mark.unit
