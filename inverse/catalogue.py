@@ -187,6 +187,10 @@ TABLE: dict[str, str | Words] = {
         short="the data call for {question}",
     ),
     "left-open": Words("what the data do not tell of may move answers: {listed}", short=""),
+    "unexplained": Words(
+        "what the model does not explain is taken to be a process among the errors, of {size} that vary over {length}",
+        short="",
+    ),
     "motions": Words(
         "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
         short="",

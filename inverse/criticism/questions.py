@@ -26,7 +26,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
-from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.laplace import deviations, laplace, unexplained
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Normal
 from uq.surrogates.linearisation import linearise
@@ -153,7 +153,7 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
         return answer
     move = larger.physical(found.mode[None])[0, old] - posterior.physical(gaussian.mode[None])[0, :d]
     gain = found.log_evidence - gaussian.log_evidence + answer.searched
-    return answer._replace(log_evidence=gain, move=move / _deviations(posterior, gaussian))
+    return answer._replace(log_evidence=gain, move=move / deviations(posterior, gaussian))
 
 
 def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
@@ -171,9 +171,11 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
     residual = posterior.residuals(at.outputs, at.x)[0]
     root = np.sqrt(noise.information(residual))
     G, A = noise.whitened(changes[:, posterior.which] / scale), posterior.sensitivities(at)[0] * root[:, None]
-    scores, H = -G @ noise.score(residual), _without(A, G * root)
+    scores, H = -G @ noise.score(residual), unexplained(A, G * root)
+    if len(H) < H.shape[1]:
+        H = np.linalg.qr(H.T)[1].T
     by_chance = np.random.default_rng(seed).standard_normal((DRAWS, H.shape[1])) @ H.T
-    moves = parameters_moved(posterior, gaussian, A, (G * root).T) / _deviations(posterior, gaussian)[:, None]
+    moves = parameters_moved(posterior, gaussian, A, (G * root).T) / deviations(posterior, gaussian)[:, None]
     ends = np.cumsum([len(patterns) for *_, patterns in flat])
     found = [
         _Form(label, *_evidence(H[rows], scores[rows], by_chance[:, rows]), moves[:, rows], patterns)
@@ -182,13 +184,6 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
     ]
     names = [name for name, *_ in flat]
     return _judged({name: [one for one, of in zip(found, names, strict=True) if of == name] for name in forms})
-
-
-def _deviations(posterior: Posterior, gaussian: Laplace) -> FloatArray:
-    """Standard deviations (d,) of the parameters by Laplace's Gaussian."""
-    d = len(posterior.inputs.names)
-    slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
-    return np.asarray(np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T)))
 
 
 class _Form(NamedTuple):
@@ -201,13 +196,6 @@ class _Form(NamedTuple):
     covariance: FloatArray
     moves: FloatArray
     patterns: FloatArray
-
-
-def _without(A: FloatArray, G: FloatArray) -> FloatArray:
-    """Return H (k, q) with HHᵀ = G S⁻¹Gᵀ, of derivatives A (m, d) and G (k, m)."""
-    U, sizes, _ = np.linalg.svd(A, full_matrices=False)
-    H = G - ((G @ U) * (1 - 1 / np.sqrt(1 + sizes**2))) @ U.T
-    return np.asarray(H if len(H) >= H.shape[1] else np.linalg.qr(H.T)[1].T)
 
 
 def _evidence(

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,17 @@ HALF_LOG = float(np.log(2 * np.pi) / 2)
 
 
 class NormalErrors(Settings):
-    """Normal errors, of which the scale is the standard deviation."""
+    """Normal errors, of which the scale is the standard deviation.
+
+    Parameters
+    ----------
+    process
+        Whether displacements have errors too that vary smoothly along the body: what the model does not explain, of
+        which size and length are inferred (`inverse.low_dimensional.residual_process`).
+    """
 
     kind: Literal["normal"] = "normal"
+    process: bool = False
 
     @property
     def dof(self) -> float | None:
@@ -56,6 +64,7 @@ class StudentErrors(Settings):
     """
 
     kind: Literal["student-t"] = "student-t"
+    process: ClassVar[bool] = False
     degrees: Annotated[float, Field(ge=1, le=1000)] = 4.0
 
     @property
@@ -118,8 +127,8 @@ class Noise:
         (k, m): what data share, a row for a standard deviation of each; None if there is nothing.
     model
         What the model misses; None where that is not known, or nothing.
-    uncertain
-        (k, m): what predictions share because of what is taken for granted, as `shared`.
+    uncertain, process
+        (k, m): what predictions share because of what is taken for granted, and what no model explains, as `shared`.
     """
 
     sigma: FloatArray
@@ -128,6 +137,7 @@ class Noise:
     shared: FloatArray | None = None
     model: ModelError | None = None
     uncertain: FloatArray | None = None
+    process: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if not (self.sigma > 0).all():
@@ -135,20 +145,24 @@ class Noise:
 
     def of(self, rows: NDArray[np.intp]) -> Noise:
         """Return that of some of the data, by number."""
-        shared, uncertain = (None if of is None else of[:, rows] for of in (self.shared, self.uncertain))
-        model = self.model
+        model, found = self.model, {name: of[:, rows] for name, of in self._shared.items()}
         if model is not None:
             error, slopes, root, apart = model.error[rows], model.slopes[rows], model.root[:, rows], model.apart[rows]
             model = replace(model, error=error, slopes=slopes, root=root, apart=apart)
-        return replace(self, sigma=self.sigma[rows], shared=shared, model=model, uncertain=uncertain)
+        return replace(self, sigma=self.sigma[rows], model=model, **found)
 
     def seen(self, measured: FloatArray) -> Noise:
         """Return the same where those data that were not measured, zeros among ones (m,), share nothing."""
-        shared, uncertain = (None if of is None else of * measured for of in (self.shared, self.uncertain))
-        model = self.model
+        model, found = self.model, {name: of * measured for name, of in self._shared.items()}
         if model is not None:
             model = replace(model, root=model.root * measured, apart=model.apart * measured)
-        return replace(self, shared=shared, model=model, uncertain=uncertain)
+        return replace(self, model=model, **found)
+
+    @property
+    def _shared(self) -> dict[str, Any]:
+        """Rows (k, m) of what data share, but for what the model misses, by their names here."""
+        known = {"shared": self.shared, "uncertain": self.uncertain, "process": self.process}
+        return {name: of for name, of in known.items() if of is not None}
 
     @cached_property
     def scale(self) -> FloatArray:
@@ -166,8 +180,7 @@ class Noise:
     @cached_property
     def _rows(self) -> FloatArray:
         """Uᵀ (k, m), of all that is shared."""
-        none = np.zeros((0, len(self.sigma)))
-        roots = [none if of is None else of for of in (self.shared, self.uncertain)]
+        roots = [np.zeros((0, len(self.sigma))), *self._shared.values()]
         return np.concatenate(roots if self.model is None else [*roots, self.model.root / self.model.scale])
 
     @cached_property

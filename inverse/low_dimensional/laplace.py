@@ -223,3 +223,16 @@ def _differences(posterior: Posterior, mode: FloatArray, curvature: FloatArray) 
     values, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
     # In these coordinates Gauss–Newton gives 1.
     return np.asarray(inverse.T @ (vectors * np.maximum(values, 1e-2) @ vectors.T) @ inverse)
+
+
+def deviations(posterior: Posterior, gaussian: Laplace) -> FloatArray:
+    """Return standard deviations (d,) of the parameters by Laplace's Gaussian."""
+    d = len(posterior.inputs.names)
+    slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
+    return np.asarray(np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T)))
+
+
+def unexplained(A: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return rows (k, m) times S^(−½), S = I + AAᵀ with the derivatives A (m, d) of normal residuals."""
+    U, sizes, _ = np.linalg.svd(A, full_matrices=False)
+    return np.asarray(rows - ((rows @ U) * (1 - 1 / np.sqrt(1 + sizes**2))) @ U.T)

@@ -18,6 +18,7 @@ from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.residual_process import Process, with_process
 from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate, Start
@@ -54,6 +55,8 @@ class Inferred:
     mesh, before
         What finer meshes have said, and the error of the mesh at the mean of the prior, in deviations of the noise;
         None where they were not asked.
+    process
+        What no parameters explain, where that was asked for.
     """
 
     posterior: Posterior
@@ -61,6 +64,7 @@ class Inferred:
     assessment: Assessment
     mesh: MeshFound | None
     before: float | None
+    process: Process | None = None
 
 
 def infer(
@@ -72,6 +76,7 @@ def infer(
     seed: int,
     look: Looked | None = None,
     shared: Shared | None = None,
+    unexplained: Measurements | None = None,
     chains: Kind | None = None,
     when: When = "always",
     model: ForwardModel | None = None,
@@ -94,6 +99,8 @@ def infer(
         How the error of the mesh is looked at; None where there is no mesh.
     shared
         What errors the data share, at parameters (d,); None if they are independent.
+    unexplained
+        The data, if what the model does not explain of them is a process among their errors.
     say
         Shows the user a line before the search.
     steps
@@ -116,11 +123,14 @@ def infer(
         posterior = _sharing(posterior, shared(posterior.physical(gaussian.mode[None])[0, :d]))
         gaussian = laplace(posterior, starts=1, first=gaussian.mode)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
+    process = None
     if look is not None:
         treatment = look.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
+    if unexplained is not None:
+        posterior, gaussian, process = with_process(posterior, gaussian, unexplained)
     one = assess(posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
-    return Inferred(posterior, searched, one, mesh, before)
+    return Inferred(posterior, searched, one, mesh, before, process)
 
 
 def _sharing(posterior: Posterior, shared: Mapping[str, Any]) -> Posterior:

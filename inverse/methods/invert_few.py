@@ -47,6 +47,7 @@ from inverse.methods.record import (
     of_mesh,
     of_motions,
     of_prior,
+    of_process,
     of_verdict,
 )
 from uq.evaluation.evaluate import Recorder
@@ -129,6 +130,7 @@ def invert_few(
         seed=method.seed,
         look=looked,
         shared=problem.shared,
+        unexplained=data if problem.errors.process else None,
         chains=method.chains,
         when=method.chains_when,
         model=model,
@@ -147,6 +149,7 @@ def invert_few(
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
     log_evidence, error = one.log_evidence
+    more = 0.0 if inferred.process is None else inferred.process.log_evidence
     points, *drawn = _drawn(posterior, one, at, method)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
@@ -154,6 +157,7 @@ def invert_few(
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
         **of_motions(spectrum, posterior.noise, root),
+        **({} if inferred.process is None else of_process(inferred.process)),
         **_moments(posterior, one, known, points, look),
         **_alone(posterior, gaussian, spectrum, data),
         **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
@@ -164,9 +168,9 @@ def invert_few(
         "source": np.array(SOURCES.index(known.source)),
         **diagnosed(chains, used=known.source == "chains"),
         "mode": best,
-        "log_evidence": np.array(log_evidence),
+        "log_evidence": np.array(log_evidence + more),
         "log_evidence_error": np.array(error),
-        "laplace_log_evidence": np.array(gaussian.log_evidence),
+        "laplace_log_evidence": np.array(gaussian.log_evidence + more),
         "effective": np.array(found.ess),
         "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),

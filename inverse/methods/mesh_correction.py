@@ -20,7 +20,7 @@ from forward.phases import phase
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
 from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
-from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.laplace import Laplace, deviations, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.request import Request
 
@@ -197,14 +197,14 @@ def corrected_few(
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
         root = np.sqrt(noise.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
-        deviations = np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T))
+        widths = deviations(posterior, gaussian)
         rest = found.error if mesh is None else found.error - mesh.at(point[None])[0]
-        shift = parameters_moved(posterior, gaussian, A, root * noise.whitened(rest / scale)) / deviations
+        shift = parameters_moved(posterior, gaussian, A, root * noise.whitened(rest / scale)) / widths
         factor = 1.0 if noise.factor is None else posterior.physical(x)[0, -1]
         largest, left = np.abs(shift).max(), np.zeros(d)
         if mesh is not None:
             gain = slopes @ np.linalg.solve(gaussian.hessian[:d, :d], (root[:, None] * A).T)
-            left = _left(noise.whitened(gain) / scale, mesh) / deviations
+            left = _left(noise.whitened(gain) / scale, mesh) / widths
             # The size of the noise that the covariance was made for must be that of this mode too.
             largest = max(largest, abs(np.log(factor / mesh.scale)))
         added = _evidence(posterior, at, found.error)
@@ -218,10 +218,8 @@ def corrected_few(
     (there, best), known = _rounds((posterior, gaussian), looked, again, treatment)
     if known.corrected:
         best = laplace(there, starts=1, first=best.mode)
-        slopes = there.inputs.from_normals(best.mode[None, :d])[1][0]
-        deviations = np.sqrt(np.diag(slopes @ best.covariance[:d, :d] @ slopes.T))
         moved_by = there.physical(best.mode[None])[0] - there.physical(gaussian.mode[None])[0]
-        known = replace(known, shift=moved_by[:d] / deviations)
+        known = replace(known, shift=moved_by[:d] / deviations(there, best))
     return there, best, known
 
 

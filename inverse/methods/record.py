@@ -25,6 +25,7 @@ from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
+from inverse.low_dimensional.residual_process import Process
 from inverse.methods.invert import Invert
 from uq.estimators.estimate import BAND, part
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
@@ -50,7 +51,7 @@ _NUMBERS = """
     prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products
-    prediction_solves prediction_why question_forms
+    prediction_solves prediction_why question_forms process_size process_length
 """
 WORDS = ("why", "mesh_why", "prediction_why", "question_forms")
 _ARRAYS = {
@@ -231,6 +232,11 @@ def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
 def of_motions(spectrum: Spectrum, noise: Noise, root: FloatArray) -> Record:
     """What the data say about rigid motions that are uncertain; none if none is."""
     return {} if noise.shared is None else {"motion_eigenvalue": determined(spectrum, noise, root)}
+
+
+def of_process(process: Process) -> Record:
+    """Size and length (m) of what the model does not explain."""
+    return {"process_size": np.array(process.size), "process_length": np.array(process.length)}
 
 
 def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:

@@ -173,6 +173,9 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
         yield from self._of_uncertain()
+        if self.data.errors.process and (self.specimen is None or self.field or self.method.reduced is not None):
+            message = "varies along a body of few parameters, expected false with outputs, nodal fields, reduced models"
+            yield ("data", "errors", "process"), message, True
         itself = self.method.expansion is None and self.method.reduced is None and not self.field
         if self.method.question and not (itself and isinstance(self.spec, Solid)):
             message = "is asked of one body that is solved itself for few parameters, with no expansion, reduced model "

@@ -277,6 +277,9 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         if data.registered is not None:
             found.append(Finding("registered", "note", {"how": data.registered.described}))
         found += data.findings
+    if "process_size" in one:
+        size, length = (told(float(one[f"process_{name}"]), "m") for name in ("size", "length"))
+        found.append(Finding("unexplained", "note", {"size": size, "length": length}))
     if "motion_eigenvalue" in one:
         motions = one["motion_eigenvalue"].to_numpy()
         found.append(said_of_motion(motions[np.isfinite(motions)]))

@@ -656,6 +656,22 @@ def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
     assert any("mesh check  about 4 solves of 1,029 displ" in line for line in plan(load(folder / "few.toml")))
 
 
+def test_what_the_model_does_not_explain_is_inferred(folder, monkeypatch):
+    """On a mesh that is too coarse, whose error is not corrected: with a process intervals hold the truth."""
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    changes = ("data.files=['data/made-1.csv']", "method.mesh_check=false")
+    found = []
+    for number, more in enumerate(((), ("data.errors={kind='normal',process=true}",))):
+        here(folder / "few.toml", folder / f"unexplained-{number}", *changes, *more)
+        found.append(json.loads((folder / f"unexplained-{number}" / "summary.json").read_text()))
+    for name, true in (("material.mu", 1e4), ("inclusions.lump.contrast", 4.0)):
+        ends = [(one["posterior"][name]["lower"], one["posterior"][name]["upper"]) for one in found]
+        assert not ends[0][0] < true < ends[0][1]
+        assert ends[1][0] < true < ends[1][1]
+    (said,) = (one["text"] for one in found[1]["findings"] if one["code"] == "unexplained")
+    assert "taken to be a process among the errors" in said
+
+
 def test_what_is_strange_is_said_with_the_inversion(folder, monkeypatch):
     """Data that do not belong by their line, on the mesh that made the data; and the end of a range."""
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
@@ -746,6 +762,8 @@ def test_a_field_and_its_report(folder):
         (FEW, "draws = 50", 'noise = { kind = "normal", mean = 1, std = 1 }', "method.noise: reaches -.*is positive"),
         (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
         (FEW, "lower = 1,", "lower = -1,", "lower"),
+        (FIELD, "[data]", "[data]\nerrors = { kind = 'normal', process = true }",
+         "data.errors.process: varies along a body"),
         (FIELD, "draws = 20", "question = true", "method.question: is asked of one body that is solved itself"),
         (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',
          "a field of nodal values is inverted alone"),

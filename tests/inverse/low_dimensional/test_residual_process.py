@@ -1,0 +1,96 @@
+"""What a model does not explain: closed forms of the evidence, intervals that hold, data at no place."""
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.special import logsumexp
+
+from forward.model import SolveError
+from forward.pointwise import FunctionModel
+from inverse.data.measurements import Measurements
+from inverse.data.noise import Noise
+from inverse.low_dimensional import residual_process
+from inverse.low_dimensional.laplace import deviations, laplace
+from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.residual_process import LENGTHS, SIZES, process, with_process
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Normal
+from uq.inputs.random_parameters import Inputs
+
+X = np.random.default_rng(0).uniform(size=(30, 3))
+SIGMA = 0.1
+DATA = Measurements.of_points(
+    X, np.zeros_like(X), np.full_like(X, SIGMA), np.repeat([0, 1], 15), ["p"] * 30, ("one", "two")
+)
+M = len(DATA)
+SMOOTH = [(np.cos(2 * X[:, 0]), (1.0, 0.3, 0.0)), (X[:, 1], (0.0, 1.0, 0.5))]
+A = np.array([np.outer(values, along).ravel() for values, along in SMOOTH]).T
+NAMES = tuple(map(str, range(M)))
+INPUTS = Inputs({"a": Normal(mean=0.0, std=1.0), "b": Normal(mean=0.0, std=1.0)})
+MODEL = FunctionModel(lambda p: A @ p, INPUTS.names, NAMES, lambda p: A)
+
+
+def kernel(length):
+    apart = np.sqrt(3) * cdist(X, X) / length
+    blocks = (1 + apart) * np.exp(-apart) * (np.arange(30)[:, None] // 15 == np.arange(30) // 15)
+    return np.kron(blocks, np.eye(3))
+
+
+def posterior(values, sigma=SIGMA):
+    return Posterior(INPUTS, SerialEvaluate(MODEL), values, Noise(np.full(M, sigma)))
+
+
+@pytest.mark.unit
+def test_size_length_and_evidence_in_closed_form():
+    y = A @ [0.5, -1.0] + 0.3 * np.sin(5 * np.repeat(X[:, 2], 3)) + SIGMA * np.random.default_rng(1).standard_normal(M)
+    one = posterior(y)
+    found = process(one, one.at(laplace(one, starts=1).mode[None], derivatives=True), DATA)
+    extent = np.ptp(X, axis=0).max()
+    plain = A @ A.T + SIGMA**2 * np.eye(M)
+
+    def evidence(covariance):
+        return -(y @ np.linalg.solve(covariance, y) + np.linalg.slogdet(covariance)[1]) / 2
+
+    logs = np.array([[evidence(plain + (SIGMA * s) ** 2 * kernel(x * extent)) for s in SIZES] for x in LENGTHS])
+    weights = np.exp(logs - logsumexp(logs))
+    squares = (weights * (SIGMA * SIZES) ** 2).sum(axis=1)
+    mean = sum(square * kernel(x * extent) for square, x in zip(squares, LENGTHS, strict=True))
+    np.testing.assert_allclose(found.rows.T @ found.rows, mean, atol=2e-3 * SIGMA**2)
+    assert found.size == pytest.approx(np.exp((weights * np.log(SIGMA * SIZES)).sum()), rel=1e-6)
+    assert found.length == pytest.approx(np.exp(weights.sum(axis=1) @ np.log(LENGTHS * extent)), rel=1e-6)
+    more = logsumexp(logs) - np.log(logs.size) - evidence(plain + mean)
+    assert found.log_evidence == pytest.approx(more, abs=1e-6)
+    noise = with_process(one, laplace(one, starts=1), DATA)[0].noise
+    assert noise.process.shape[1] == M
+    assert noise.of(np.arange(5)).process.shape[1] == 5
+
+
+@pytest.mark.parametrize(("size", "length"), [(0.0, 1.0), (0.1, 0.5), (0.5, 0.4)])
+def test_intervals_hold_where_the_model_is_wrong(size, length):
+    """95 % of the intervals hold, of 60 data sets and two parameters; without the process they do not."""
+    root = np.linalg.cholesky(kernel(length) + 1e-10 * np.eye(M))
+    held = {False: 0, True: 0}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        truth = rng.standard_normal(2)
+        one = posterior(A @ truth + size * (root @ rng.standard_normal(M)) + SIGMA * rng.standard_normal(M))
+        best = laplace(one, starts=1)
+        for with_it in held:
+            if with_it:
+                one, best, _ = with_process(one, best, DATA)
+            gap = np.abs(one.physical(best.mode[None])[0] - truth)
+            held[with_it] += (gap <= 1.96 * deviations(one, best)).sum()
+    assert held[True] > 120 * 0.95 - 3.5 * np.sqrt(120 * 0.95 * 0.05)
+    assert (held[False] < 90) == (size > 0)
+
+
+@pytest.mark.unit
+def test_too_many_data_and_data_at_no_place(monkeypatch):
+    one = posterior(np.zeros(M))
+    best = laplace(one, starts=1)
+    nowhere = np.where(np.arange(M)[:, None] < 3, np.nan, DATA.places)
+    data = Measurements(**{**vars(DATA), "places": nowhere})
+    assert not process(one, one.at(best.mode[None], derivatives=True), data).rows[:, :3].any()
+    monkeypatch.setattr(residual_process, "MOST", 10)
+    with pytest.raises(SolveError, match=r"data\.errors\.process: 90 data, expected at most 10"):
+        with_process(one, best, DATA)
