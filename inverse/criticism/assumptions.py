@@ -283,8 +283,8 @@ class Assumptions:
             found |= {one.name: one.size * slopes[:, :m, i] for i, one in enumerate(self.numbers)}
             scaled = outputs[:, :m] if predicted else scaled
             if moved is not None:
-                by_places = np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1)
-                found |= {name: size * by for (name, size), by in zip(by_shift.items(), by_places, strict=True)}
+                by_axes = dict(zip(AXES, np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1), strict=True))
+                found |= {name: size * by_axes[name[-1]] for name, size in by_shift.items()}
         of = np.array(quantities(self.data, self.units))
         scales = [one for one in self.beside if one.name not in by_shift]
         found |= {one.name: -one.size * scaled * (of == one.name.split(".", 2)[-1]) for one in scales}
@@ -315,19 +315,24 @@ class Assumptions:
                 found[some] = np.nan
         return found
 
+    def errors(self, points: FloatArray, start: Any, measured: NDArray[np.bool_] | bool = True) -> FloatArray:
+        """Return what data share since some of it is uncertain (n, g, m), where `changes` are predicted.
+
+        Those that are not measured (m,) share what is uncertain of the model only.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer.
+        """
+        changes = self.changes(points, start, predicted=True)
+        changes[:, len(self.numbers) :] *= measured
+        return np.asarray(self.weights @ changes)
+
     @property
     def shared(self) -> Shared | None:
-        """What data share since some of it is uncertain; None if nothing is.
-
-        It raises `SolveError` where the model has no answer.
-        """
-        if not len(self.weights):
-            return None
-
-        def errors(point: FloatArray) -> Mapping[str, FloatArray]:
-            return {"uncertain": self.weights @ self.changes(point[None], None, predicted=True)[0]}
-
-        return errors
+        """The same at parameters (d,), by its name in `Noise`; None if nothing is uncertain."""
+        return (lambda point: {"uncertain": self.errors(point[None], None)[0]}) if len(self.weights) else None
 
 
 class Moves(NamedTuple):
