@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 PART = 0.01  # of a number, or of the size of the body for a place, or an angle (rad), by which it may be otherwise
 SHOWN, SEEN = 3, 0.1  # of how many is told, and of which size (deviations) on
 BENT = 0.2  # deviations by which second order may move an answer
+OFF = 3.0  # deviations from which on what the data say of it contradicts what is stated
 BESIDE = 0.05  # of a posterior deviation, by which points are beside the mode
 STEP = 1e-4  # of the extent of a body, by which points are moved for derivatives
 STEP_OF = re.compile(r"\.\d+$")  # which step of a path an output is of
@@ -407,9 +408,17 @@ def findings_in(of: xr.Dataset) -> list[Finding]:
         of[f"assumption_{name}"].transpose(dim, "parameter").to_numpy()
         for name, dim in (("shift", "assumption"), ("bend", "uncertain"))
     )
+    names = [str(name) for name in of["uncertain"].values]
+    far = of["uncertain_mean"].to_numpy() if "uncertain_mean" in of else np.zeros(len(names))
+    return [*findings(kept_in(of), answers, shifts), *bent(names, answers, bends), *off(names, far)]
+
+
+def off(names: Sequence[str], means: FloatArray) -> list[Finding]:
+    """Warn of what the data say is farther off (g,), in its deviations, than what is stated makes likely."""
     return [
-        *findings(kept_in(of), answers, shifts),
-        *bent([str(name) for name in of["uncertain"].values], answers, bends),
+        Finding("uncertain-off", "warning", {"name": name, "size": abs(z), "way": "larger" if z > 0 else "smaller"})
+        for name, z in zip(names, means, strict=True)
+        if abs(z) > OFF
     ]
 
 

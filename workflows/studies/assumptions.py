@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.sparse import block_diag, eye
 
+from forward.affine import Sparse
 from forward.bodies.geometry import AXES
+from forward.combine import Mapped
 from forward.model import FloatArray, ForwardModel, ModelError, SolveError
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
@@ -181,6 +184,21 @@ class TakenForGranted:
     def build(self, comm: Any) -> Any:
         """Make the model with all of these numbers among its parameters; collective."""
         return self.spec.build(comm, (*self.unknown, *(one.name for one in self.numbers)))
+
+    @property
+    def loadings(self) -> FloatArray:
+        """How much larger (k, g) each number is if what is uncertain is larger by its deviation."""
+        weights = np.array(list(self.groups.values())).reshape(len(self.groups), len(self.all))
+        return np.asarray(weights[:, : len(self.numbers)].T * np.array([[one.size] for one in self.numbers]))
+
+    def by_deviations(self, comm: Any) -> ForwardModel:
+        """Make the model with what is uncertain among its parameters, each in its standard deviations; collective."""
+        if not self.groups:
+            found: ForwardModel = self.build(comm)
+            return found
+        d = len(self.unknown)
+        by = Sparse(block_diag((eye(d), self.loadings), format="csr"), np.append(np.zeros(d), self.values))
+        return Mapped(self.build(comm), by, (*self.unknown, *self.groups))
 
     @property
     def asked(self) -> bool:
