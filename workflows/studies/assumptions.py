@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.sparse import block_diag, eye
 
-from forward.affine import Sparse
 from forward.bodies.geometry import AXES
-from forward.combine import Mapped
 from forward.model import FloatArray, ForwardModel, ModelError, SolveError
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
@@ -196,6 +193,11 @@ class TakenForGranted:
         if not self.groups:
             found: ForwardModel = self.build(comm)
             return found
+        from scipy.sparse import block_diag, eye
+
+        from forward.affine import Sparse
+        from forward.combine import Mapped
+
         d = len(self.unknown)
         by = Sparse(block_diag((eye(d), self.loadings), format="csr"), np.append(np.zeros(d), self.values))
         return Mapped(self.build(comm), by, (*self.unknown, *self.groups))
@@ -232,7 +234,7 @@ class TakenForGranted:
         return Assumptions(*known, ask, self._moved(data), self.groups)
 
     def _moved(self, data: Measurements) -> Moved | None:
-        shifts = any(one.name.startswith("data.shift.") for one in self.beside)
+        shifts = self.spec.placed and any(one.name.startswith("data.shift.") for one in self.beside)
         if not shifts or not np.isfinite(data.places).all(axis=1).any():
             return None
         body = self.spec.bodies[0].body
