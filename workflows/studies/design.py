@@ -218,7 +218,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         """Find what cannot be asked together."""
         wrong = list(self._of_model() if self.candidates is None else self._of_candidates())
         yield from wrong
-        if not wrong:
+        if self.uncertain and not wrong:
             yield from of_none([self.takes(name, None) for name in self.of_candidates])
 
     def _of_model(self) -> Iterator[Mistake]:

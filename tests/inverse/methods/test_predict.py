@@ -240,7 +240,8 @@ def jointly():
 
 def test_what_is_uncertain_widens_predictions_by_what_the_data_have_left_of_it(folder):
     """Of a linear model as if it were one more unknown; nothing else than its deviation is known of what is new."""
-    assert ran(folder / "wider.toml", folder / "wider") == 0
+    assert ran(folder / "wider.toml", folder / "wider", report=True) == 0
+    assert "What is uncertain is counted." in (folder / "wider" / "report.html").read_text()
     one = results(folder / "wider").isel(data_set=0)
     mean, covariance, prior = jointly()
     goal = np.array([1.0, -1.0, 2.0, 3.0])
