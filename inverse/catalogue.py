@@ -191,6 +191,11 @@ TABLE: dict[str, str | Words] = {
         "what the model does not explain is taken to be a process among the errors, of {size} that vary over {length}",
         short="",
     ),
+    "uncertain-off": Words(
+        "the data say that {name} is {way} than stated by {size:.2g} of its deviations: it is known less well, or "
+        "something else is wrong",
+        short="{name} is not as stated",
+    ),
     "motions": Words(
         "of {count} rigid motions that are uncertain, the data determine {seen} better than was known before{lost}",
         short="",

@@ -50,6 +50,11 @@ TABLE: dict[str, str | Words] = {
     "an equilibrium that is not observed.",
     "solves-inadmissible": "{lost:,} of {solves:,} solves were of parameters for which there is no model, as for the "
     "first of them ({reason}): their likelihood is zero, and they count as answered.",
+    "uncertain-in-source": Words(
+        "draws of {source} are of its parameters; what was uncertain beside them, {names}, is as stated here: "
+        "parameters.from.names takes it too, as uncertain.PATH, as it errs together with them",
+        short="",
+    ),
     "constants-changed": "Constants are not those with which {source} was calibrated: {changed}.",
     "reduced-estimates-missing": "At {missing} of {samples} unseen samples the larger model that estimates errors is "
     "not stable, though the body is: there are no estimates, and with a tolerance the full model is asked.",

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 PART = 0.01  # of a number, or of the size of the body for a place, or an angle (rad), by which it may be otherwise
 SHOWN, SEEN = 3, 0.1  # of how many is told, and of which size (deviations) on
 BENT = 0.2  # deviations by which second order may move an answer
+OFF = 3.0  # deviations from which on what the data say of it contradicts what is stated
 BESIDE = 0.05  # of a posterior deviation, by which points are beside the mode
 STEP = 1e-4  # of the extent of a body, by which points are moved for derivatives
 STEP_OF = re.compile(r"\.\d+$")  # which step of a path an output is of
@@ -283,8 +284,8 @@ class Assumptions:
             found |= {one.name: one.size * slopes[:, :m, i] for i, one in enumerate(self.numbers)}
             scaled = outputs[:, :m] if predicted else scaled
             if moved is not None:
-                by_places = np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1)
-                found |= {name: size * by for (name, size), by in zip(by_shift.items(), by_places, strict=True)}
+                by_axes = dict(zip(AXES, np.swapaxes(moved.slopes(outputs[:, m:]), 0, 1), strict=True))
+                found |= {name: size * by_axes[name[-1]] for name, size in by_shift.items()}
         of = np.array(quantities(self.data, self.units))
         scales = [one for one in self.beside if one.name not in by_shift]
         found |= {one.name: -one.size * scaled * (of == one.name.split(".", 2)[-1]) for one in scales}
@@ -315,19 +316,24 @@ class Assumptions:
                 found[some] = np.nan
         return found
 
+    def errors(self, points: FloatArray, start: Any, measured: NDArray[np.bool_] | bool = True) -> FloatArray:
+        """Return what data share since some of it is uncertain (n, g, m), where `changes` are predicted.
+
+        Those that are not measured (m,) share what is uncertain of the model only.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer.
+        """
+        changes = self.changes(points, start, predicted=True)
+        changes[:, len(self.numbers) :] *= measured
+        return np.asarray(self.weights @ changes)
+
     @property
     def shared(self) -> Shared | None:
-        """What data share since some of it is uncertain; None if nothing is.
-
-        It raises `SolveError` where the model has no answer.
-        """
-        if not len(self.weights):
-            return None
-
-        def errors(point: FloatArray) -> Mapping[str, FloatArray]:
-            return {"uncertain": self.weights @ self.changes(point[None], None, predicted=True)[0]}
-
-        return errors
+        """The same at parameters (d,), by its name in `Noise`; None if nothing is uncertain."""
+        return (lambda point: {"uncertain": self.errors(point[None], None)[0]}) if len(self.weights) else None
 
 
 class Moves(NamedTuple):
@@ -402,9 +408,17 @@ def findings_in(of: xr.Dataset) -> list[Finding]:
         of[f"assumption_{name}"].transpose(dim, "parameter").to_numpy()
         for name, dim in (("shift", "assumption"), ("bend", "uncertain"))
     )
+    names = [str(name) for name in of["uncertain"].values]
+    far = of["uncertain_mean"].to_numpy() if "uncertain_mean" in of else np.zeros(len(names))
+    return [*findings(kept_in(of), answers, shifts), *bent(names, answers, bends), *off(names, far)]
+
+
+def off(names: Sequence[str], means: FloatArray) -> list[Finding]:
+    """Warn of what the data say is farther off (g,), in its deviations, than what is stated makes likely."""
     return [
-        *findings(kept_in(of), answers, shifts),
-        *bent([str(name) for name in of["uncertain"].values], answers, bends),
+        Finding("uncertain-off", "warning", {"name": name, "size": abs(z), "way": "larger" if z > 0 else "smaller"})
+        for name, z in zip(names, means, strict=True)
+        if abs(z) > OFF
     ]
 
 

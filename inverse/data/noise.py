@@ -211,6 +211,15 @@ class Noise:
         """Return W⁻¹r (…, m)."""
         return np.asarray(rows + ((rows @ self._basis[1].T) * (self._less / (1 - self._less))) @ self._basis[1])
 
+    @cached_property
+    def pull(self) -> FloatArray:
+        """H (g, m): given independent residuals r (m,), what is uncertain is N(−Hr, I − HHᵀ), in its deviations.
+
+        Of heavy tails, which hide it in the scales, H is zero: nothing is learnt.
+        """
+        rows = np.zeros((0, len(self.sigma))) if self.uncertain is None else self.uncertain / self.scale
+        return self.whitened(rows) if self.dof is None else np.zeros_like(rows)
+
     # --- independent residuals, over the scale ------------------------------------------------------------------------
 
     def minus_log(self, r: FloatArray) -> FloatArray:

@@ -10,6 +10,11 @@ for D-optimal designs; the variance of goals G z that they take away is tr G(I �
 Chaloner, I. Verdinelli, Statist. Sci. 10 (1995) 273–304). Both are averaged over draws. The first is submodular: what
 an observation adds never grows as others are added.
 
+Some of the unknowns, with columns N of A, may be of no interest: what is uncertain beside, or errors of the covariance
+I + NNᵀ that the observations share. What these tell of the others is ½ ln det(I + AAᵀ) − ½ ln det(I + NNᵀ), by the
+chain rule of information. It is not submodular: an observation that such unknowns alone move adds nothing at first, and
+something once others depend on them.
+
 Candidates are arrays (c, k, r) for each draw: k rows for each of c candidates, of which some may be zero.
 """
 
@@ -17,7 +22,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +34,7 @@ IntArray = NDArray[np.int64]
 class Criterion(ABC):
     """What a growing set of observations is worth."""
 
-    submodular: ClassVar[bool] = False  # whether what an observation adds never grows as others are added
+    submodular = False  # whether what an observation adds never grows as others are added
 
     @abstractmethod
     def gains(self, which: IntArray) -> FloatArray:
@@ -69,15 +73,17 @@ def told(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.slogdet(np.eye(k) + rows @ np.swapaxes(rows, -1, -2))[1] / 2)
 
 
-def told_along(rows: FloatArray) -> FloatArray:
+def told_along(rows: FloatArray, beside: int = 0) -> FloatArray:
     """Return what the first, the first two, … of observations (n, k, r) tell together (n,): by one Cholesky factor.
 
+    The last unknowns, as many as are `beside`, do not count.
     Where the same is told again and again, rounding is 1e-16 of the largest eigenvalue of RRᵀ, in nat.
     """
     n, k, r = rows.shape
     flat = rows.reshape(n * k, r)
     diagonal = np.diag(np.linalg.cholesky(np.eye(n * k) + flat @ flat.T))
-    return np.asarray(np.log(diagonal).cumsum()[k - 1 :: k])
+    found = np.log(diagonal).cumsum()[k - 1 :: k]
+    return np.asarray(found - told_along(rows[..., r - beside :]) if beside else found)
 
 
 def conditioned(root: FloatArray, rows: FloatArray) -> FloatArray:
@@ -107,18 +113,38 @@ class _Conditioned(Criterion):
 
 
 class Information(_Conditioned):
-    """D-optimality: the mean over draws of what observations tell (nat), of candidates (c, k, r) of each draw."""
+    """D-optimality: the mean over draws of what observations tell (nat), of candidates (c, k, r) of each draw.
 
-    submodular: ClassVar[bool] = True
+    Parameters
+    ----------
+    candidates
+        Of each draw (c, k, r).
+    beside
+        How many unknowns, the last ones, do not count.
+    """
+
+    submodular = True
+
+    def __init__(self, candidates: Sequence[FloatArray], beside: int = 0) -> None:
+        super().__init__(candidates)
+        self._beside = Information([one[..., one.shape[-1] - beside :] for one in candidates]) if beside else None
+        self.submodular = self.submodular and not beside
 
     def of_draws(self, which: IntArray) -> FloatArray:
         """Return what each of some candidates (w,) would add at each draw (draws, w)."""
         pairs = zip(self._candidates, self.roots, strict=True)
-        return np.array([told(rows[which] @ root) for rows, root in pairs])
+        found = np.array([told(rows[which] @ root) for rows, root in pairs])
+        return found if self._beside is None else found - self._beside.of_draws(which)
 
     def gains(self, which: IntArray) -> FloatArray:
         """Return what each of some candidates (w,) would add (w,)."""
         return np.asarray(self.of_draws(which).mean(axis=0))
+
+    def take(self, one: int) -> None:
+        """Add a candidate to the set."""
+        super().take(one)
+        if self._beside is not None:
+            self._beside.take(one)
 
 
 class Variance(_Conditioned):

@@ -25,14 +25,18 @@ TOGETHER = 256  # candidates that are looked at at once
 NEGLIGIBLE = 1e-3  # of the standard deviation of the errors: what the unknowns of a model change less
 
 
-def predicted(outputs: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+def predicted(
+    outputs: FloatArray, sigma: FloatArray, errors: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return mean μ (m,) and root A (m, r) of the covariance of outputs (draws, m), over standard deviations (m,).
 
+    What is uncertain beside the draws adds errors (draws, g, m) that the outputs share, a row for a standard deviation.
     Directions in which no output varies by more than `NEGLIGIBLE` are left out.
     """
     scaled = outputs / sigma
     mean = scaled.mean(axis=0)
-    left, sizes, _ = np.linalg.svd((scaled - mean).T / np.sqrt(len(outputs)), full_matrices=False)
+    rows = scaled - mean if errors is None else np.vstack([scaled - mean, *(errors / sigma)])
+    left, sizes, _ = np.linalg.svd(rows.T / np.sqrt(len(outputs)), full_matrices=False)
     kept = sizes > NEGLIGIBLE
     return mean, left[:, kept] * sizes[kept]
 

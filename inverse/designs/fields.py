@@ -40,6 +40,7 @@ def of_field(
     mass: FloatArray,
     sigma: FloatArray,
     goals: NDArray[np.bool_],
+    errors: FloatArray,
     rank: int,
     seed: int,
 ) -> xr.Dataset:
@@ -53,15 +54,17 @@ def of_field(
         Volume (N,) of each vertex.
     sigma, goals
         Standard deviations (m,) of the errors of the outputs, and which of these (m,) are not measured but predicted.
+    errors
+        What is uncertain beside the field (g, m), a row for a standard deviation of each: the last directions.
     rank, seed
         Largest number of directions, and seed of the search for them.
 
     Returns
     -------
     xarray.Dataset
-        `output` (m,), `sigma`, `row` (m, r), zero for goals; `field_goal` (r, r), what the directions add to the mean
-        variance of the field, over that of the prior; `goal_row` (q, r) of goals over their prior standard deviation;
-        and `beyond` (`PROBES`, m), what is left out of the rows along random directions.
+        `output` (m,), `sigma`, `row` (m, r + g), zero for goals; `field_goal` (r + g, r + g), what the directions add
+        to the mean variance of the field, over that of the prior; `goal_row` (q, r + g) of goals over their prior
+        standard deviation; and `beyond` (`PROBES`, m), what is left out of the rows along random directions.
     """
     import xarray as xr
 
@@ -72,16 +75,19 @@ def of_field(
     directions = prior.root(spectrum.vectors)
     units = np.eye(len(sigma))[goals]
     slopes = prior.root_transposed(solution.adjoint(units)) if len(units) else np.zeros((0, posterior.size))
+    slopes = np.hstack([slopes, errors[:, goals].T])
     sizes = np.linalg.norm(slopes, axis=1, keepdims=True)
-    rows = np.divide(slopes, sizes, out=np.zeros_like(slopes), where=sizes > 0) @ spectrum.vectors.T
+    slopes = np.divide(slopes, sizes, out=np.zeros_like(slopes), where=sizes > 0)
+    rows = np.hstack([slopes[:, : posterior.size] @ spectrum.vectors.T, slopes[:, posterior.size :]])
+    of_field = (directions * mass) @ directions.T / (mass @ prior.variance)
     probes = np.random.default_rng([seed, 3]).standard_normal((PROBES, posterior.size))
     probes -= probes @ spectrum.vectors.T @ spectrum.vectors
     return xr.Dataset(
         {
             "output": ("value", np.array(solution.outputs)),
             "sigma": ("value", sigma),
-            "row": (("value", "direction"), spectrum.images.T),
-            "field_goal": (("direction", "other"), (directions * mass) @ directions.T / (mass @ prior.variance)),
+            "row": (("value", "direction"), np.hstack([spectrum.images.T, (errors * ~goals / sigma).T])),
+            "field_goal": (("direction", "other"), np.pad(of_field, (0, len(errors)))),
             "goal_row": (("goal", "direction"), rows),
             "beyond": (("probe", "value"), point.jvp(probes)),
         }

@@ -232,3 +232,69 @@ class LowRankPosterior:
         values = self.spectrum.values
         spread = float((np.log1p(values) - values / (1 + values)).sum())
         return (spread + float(self.whitened @ self.whitened)) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What is uncertain beside a field m of N values, in its deviations, given m: N(mean + slopes (m − m̂), CCᵀ).
+
+    With a field of the covariance Γ, both have the covariance [[Γ, ΓSᵀ], [SΓ, SΓSᵀ + CCᵀ]], S the slopes.
+
+    Attributes
+    ----------
+    mean
+        (g,).
+    slopes
+        (g, N).
+    root
+        C (g, r).
+    """
+
+    mean: FloatArray
+    slopes: FloatArray
+    root: FloatArray
+
+    @classmethod
+    def before(cls, size: int, count: int) -> Beside:
+        """What it is before the data: independent of the field."""
+        return cls(np.zeros(count), np.zeros((count, size)), np.eye(count))
+
+    @classmethod
+    def of(cls, mode: Point) -> Beside:
+        """What it is at a mode, by `inverse.data.noise.Noise.pull`."""
+        posterior = mode.posterior
+        pull = posterior.seen.pull
+        over = posterior.weights * posterior.seen.whitened(pull)
+        slopes = -mode.solution.adjoint(over) if len(pull) else np.zeros((0, posterior.size))
+        return cls(-pull @ mode.gaps, slopes, symmetric_root(np.eye(len(pull)) - pull @ pull.T))
+
+    def covariance(self, of_field: Map) -> Map:
+        """Return what multiplies the covariance of both with (k, N + g), by what does so with Γ."""
+
+        def product(rows: FloatArray) -> FloatArray:
+            g, z = np.split(rows, [self.slopes.shape[1]], axis=1)
+            seen = of_field(g + z @ self.slopes)
+            return np.hstack([seen, seen @ self.slopes.T + z @ self.root @ self.root.T])
+
+        return product
+
+    def deviations(self, of_field: FloatArray, normals: FloatArray) -> FloatArray:
+        """Return draws (k, N + g) of both less their means, by those (k, N) of the field and normal numbers (k, r)."""
+        return np.hstack([of_field, of_field @ self.slopes.T + normals @ self.root.T])
+
+    def weighted(self, mean: FloatArray, values: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return points of both (n, N + g) with weights, by those of the field: sums of squares are those of all.
+
+        They are 2r + 1 for each, as of an unscented transform (S. Julier, J. Uhlmann, Proc. IEEE 92 (2004) 401–422).
+        """
+        r = self.root.shape[1]
+        normals = np.sqrt(r + 1) * np.vstack([np.zeros((1, r)), np.eye(r), -np.eye(r)])
+        shares = np.append(1.0, np.full(2 * r, 0.5)) / (r + 1)
+        rows = self.deviations(np.repeat(values - mean, 2 * r + 1, axis=0), np.tile(normals, (len(values), 1)))
+        return rows + np.append(mean, self.mean), np.outer(weights, shares).ravel()
+
+
+def symmetric_root(covariance: FloatArray) -> FloatArray:
+    """Return the symmetric root of a covariance (g, g), of which rounding may leave negative variances."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T)

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from forward.findings import Finding
 from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
+from inverse.criticism.assumptions import Assumptions
 from inverse.data.measurements import Measurements
 from inverse.designs.candidates import Candidates, Each, kinds, matching
 from inverse.designs.compared import compared, with_values
@@ -116,11 +117,17 @@ class Design(Settings):
         return f"{', '.join(limits)}; one is a {self.each}"
 
     def run(
-        self, inputs: Inputs, evaluate: Evaluate, values: Measurements, of_mesh: Evaluate | None = None
+        self,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        values: Measurements,
+        of_mesh: Evaluate | None = None,
+        assumed: Assumptions | None = None,
     ) -> xr.Dataset:
         """Linearise the model, which must have derivatives, at draws of the unknowns, and choose among its outputs.
 
-        The same model estimates the error of its mesh; None if it has none.
+        The same model estimates the error of its mesh; None if it has none. What is uncertain of what is taken for
+        granted is unknown too, but nothing is asked of it.
 
         Raises
         ------
@@ -138,13 +145,17 @@ class Design(Settings):
         assert found.tangents is not None
         mesh = self._mesh_errors(inputs, of_mesh) if self.mesh_error and of_mesh is not None else None
         sigma = self._with_mesh(self.sigma(values, found.outputs[ok]), mesh)
-        whitened = found.tangents[ok] @ slopes[ok]  # (draws, m, d)
+        errors = np.zeros((ok.sum(), 0, len(values))) if assumed is None else assumed.errors(points[ok], None, ~goals)
+        beside, slopes = errors.shape[1], slopes[ok]
+        whitened = np.concatenate([found.tangents[ok] @ slopes, errors.swapaxes(1, 2)], axis=2)  # (draws, m, d + g)
+        slopes = np.pad(slopes, ((0, 0), (0, 0), (0, beside)))
         rows = [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened]
-        result = self.chosen(rows, scaled(whitened[:, goals] if goals.any() else slopes[ok]), candidates, costs)
-        spread, after = np.linalg.norm(slopes[ok], axis=2), Information(rows)  # prior standard deviations (draws, d)
+        asked = scaled(whitened[:, goals] if goals.any() else slopes)
+        result = self.chosen(rows, asked, candidates, costs, beside)
+        spread, after = np.linalg.norm(slopes, axis=2), Information(rows)  # prior standard deviations (draws, d)
         for one in result["chosen"].to_numpy().tolist():
             after.take(one)
-        left = [np.linalg.norm(slope @ root, axis=1) for slope, root in zip(slopes[ok], after.roots, strict=True)]
+        left = [np.linalg.norm(slope @ root, axis=1) for slope, root in zip(slopes, after.roots, strict=True)]
         result = result.assign(
             prior_std=("parameter", spread.mean(axis=0)),
             posterior_std=("parameter", np.mean(left, axis=0)),
@@ -162,8 +173,10 @@ class Design(Settings):
         """Count errors of the mesh (m,) as noise too, if that is asked for."""
         return sigma if mesh is None or self.mesh_error != "noise" else np.hypot(sigma, np.nan_to_num(mesh))
 
-    def of_fields(self, draws: Sequence[xr.Dataset], values: Measurements) -> xr.Dataset:
+    def of_fields(self, draws: Sequence[xr.Dataset], values: Measurements, beside: int) -> xr.Dataset:
         """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
+
+        The last directions, as many as are `beside`, are none of the field.
 
         Raises
         ------
@@ -178,7 +191,7 @@ class Design(Settings):
         if self.criterion == "predictions":
             goals = [row.T @ row / len(row) for row in (one["goal_row"].to_numpy() for one in draws)]
         told = [grouped(one, candidates.which, len(candidates.names)) for one in rows]
-        result = self.chosen(told, goals, candidates, costs)
+        result = self.chosen(told, goals, candidates, costs, beside)
         taken = Variance(told, [one["field_goal"].to_numpy() for one in draws])
         share = list(taken.along(result["chosen"].to_numpy().tolist()))
         chosen = np.isin(candidates.which, result["chosen"].to_numpy())
@@ -270,10 +283,12 @@ class Design(Settings):
         weights: Mapping[str, float],
         models: Mapping[str, Evaluate],
         values: Measurements,
+        assumed: Mapping[str, Assumptions],
     ) -> xr.Dataset:
         """Choose the observations, of values that are the outputs of all models, that tell these apart.
 
-        By the name of each model are given its unknowns, and its probability before, up to a common factor.
+        By the name of each model are given its unknowns, its probability before, up to a common factor, and what it
+        takes for granted, of those of which something is uncertain.
 
         Raises
         ------
@@ -281,18 +296,22 @@ class Design(Settings):
             As `run`.
         """
         candidates, _, costs = self.candidates(values)
-        outputs, lost = {}, []
+        outputs, errors, lost = {}, dict[str, FloatArray](), []
         for name, one in inputs.items():
             uniforms = sobol_points(self.seed, 0, 0, self.draws, len(one.names))
-            found = models[name](Request(one.points(uniforms)))
+            points = one.points(uniforms)
+            found = models[name](Request(points))
             if found.ok.sum() < LEAST:
                 reason = f": {found.failures[0].reason}" if found.failures else ""
                 message = f"{name} has an answer at {found.ok.sum()} of {self.draws} draws, expected {LEAST}{reason}"
                 raise SolveError(message)
             lost += [f"{len(found.failures)} of {name}"] if found.failures else []
             outputs[name] = found.outputs[found.ok]
+            if name in assumed:
+                errors[name] = assumed[name].errors(points[found.ok], None)
         sigma = self.sigma(values, np.concatenate(list(outputs.values())))
-        means, roots = zip(*(predicted(one, sigma) for one in outputs.values()), strict=True)
+        each = (predicted(one, sigma, errors.get(name)) for name, one in outputs.items())
+        means, roots = zip(*each, strict=True)
         parts = (means, roots, [weights[name] for name in inputs], candidates.which, len(candidates.names))
         choice, result = self._compared(lambda: Discrimination(*parts), candidates, costs)
         after = Discrimination(*parts)
@@ -314,31 +333,38 @@ class Design(Settings):
         return with_values(result, values, sigma, candidates)
 
     def chosen(
-        self, rows: Sequence[FloatArray], goals: Sequence[FloatArray], candidates: Candidates, costs: FloatArray
+        self,
+        rows: Sequence[FloatArray],
+        goals: Sequence[FloatArray],
+        candidates: Candidates,
+        costs: FloatArray,
+        beside: int,
     ) -> xr.Dataset:
         """Choose among candidates (c,) with costs (c,), and compare with random choices.
 
         Of each draw are given rows (c, k, r) over the standard deviations of the errors, and GᵀG (r, r) of goals with
-        prior variances that add up to one.
+        prior variances that add up to one; the last unknowns, as many as are `beside`, do not count.
         """
 
         def told(order: IntArray) -> FloatArray:
-            return np.array([told_along(one[order]) for one in rows])
+            return np.array([told_along(one[order], beside) for one in rows])
 
+        make = partial(Information, beside=beside)
         if self.criterion == "information":
-            make = partial(Information, rows)
-            choice, found = self._compared(make, candidates, costs, lambda order: told(order).mean(axis=0))
+            choice, found = self._compared(
+                partial(make, rows), candidates, costs, lambda order: told(order).mean(axis=0)
+            )
         else:
             choice, found = self._compared(partial(Variance, rows, goals), candidates, costs)
         known = told(np.array(choice.order))
-        alone = Information(rows).gains(np.arange(len(costs)))
+        alone = make(rows).gains(np.arange(len(costs)))
         found = found.assign(
             gain=("choice", np.diff(np.concatenate([[0.0], known.mean(axis=0)]))),
             information=("choice", known.mean(axis=0)),
             information_of_draw=(("draw_number", "choice"), known),
             candidate_information=("candidate", alone),
         )
-        add(found, *self._doubts(rows, choice, found))
+        add(found, *self._doubts([partial(make, [one]) for one in rows], choice, found))
         return found
 
     def _compared(
@@ -353,10 +379,10 @@ class Design(Settings):
         short = worth_along or (lambda order: np.array(list(make().along(order.tolist()))))
         return choice, compared(choice, candidates, costs, short, self.random, self.seed)
 
-    def _doubts(self, rows: Sequence[FloatArray], choice: Choice, found: xr.Dataset) -> list[Finding]:
-        """Say where draws disagree, and where observations add little."""
+    def _doubts(self, alone: Sequence[Callable[[], Criterion]], choice: Choice, found: xr.Dataset) -> list[Finding]:
+        """Say where draws, each with its own criterion, disagree, and where observations add little."""
         doubts = []
-        lost = self.draws - len(rows)
+        lost = self.draws - len(alone)
         if lost:
             doubts.append(Finding("design-no-answer", "warning", {"lost": lost, "draws": self.draws}))
         gain, n = found["gain"].to_numpy(), len(choice.order)
@@ -364,10 +390,9 @@ class Design(Settings):
         if len(little) and n > 1:
             values = {"first": little[0] + 1, "n": n, "least": LITTLE * gain.sum() / n}
             doubts.append(Finding("design-repeats", "note", values))
-        if self.criterion == "information" and len(rows) > 1:
+        if self.criterion == "information" and len(alone) > 1:
             shared = found["information_of_draw"].to_numpy()[:, -1]
             costs = found["candidate_cost"].to_numpy()
-            alone = (partial(Information, [one]) for one in rows)
             own = [choose(make, costs, number=self.number, budget=self.budget).worth for make in alone]
             shares = shared / np.maximum(own, shared)
             worst = int(shares.argmin())

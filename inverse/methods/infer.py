@@ -25,6 +25,9 @@ from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
 
+# What data share is found anew at most so often, until the mode moves less, in deviations: the next move is a tenth.
+ROUNDS, SETTLED = 4, 0.5
+
 Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what predicts states near there; None if nothing
 
 
@@ -119,9 +122,15 @@ def infer(
             posterior = replace(posterior, start=start(posterior.inputs.mean))
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
-    if shared is not None:  # which depends on the displacements
-        posterior = _sharing(posterior, shared(posterior.physical(gaussian.mode[None])[0, :d]))
-        gaussian = laplace(posterior, starts=1, first=gaussian.mode)
+    for _ in range(ROUNDS):
+        if shared is None:
+            break
+        point, best = gaussian.mode, posterior.physical(gaussian.mode[None])[0]
+        posterior = _sharing(posterior, shared(best[:d]), *best[d:])
+        gaussian = laplace(posterior, starts=1, first=point)
+        move = gaussian.mode - point
+        if move @ gaussian.hessian @ move < SETTLED**2:
+            break
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     process = None
     if look is not None:
@@ -133,8 +142,10 @@ def infer(
     return Inferred(posterior, searched, one, mesh, before, process)
 
 
-def _sharing(posterior: Posterior, shared: Mapping[str, Any]) -> Posterior:
-    return replace(posterior, noise=replace(posterior.noise, **shared))
+def _sharing(posterior: Posterior, shared: Mapping[str, Any], size: float = 1.0) -> Posterior:
+    """Return a posterior of errors that data share, which the size of the others says nothing of."""
+    noise = {name: rows / size for name, rows in shared.items()}
+    return replace(posterior, noise=replace(posterior.noise, **noise))
 
 
 def by_tangents(inputs: Inputs, evaluate: Evaluate) -> Starts:

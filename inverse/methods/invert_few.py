@@ -163,6 +163,7 @@ def invert_few(
         **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
         **({} if problem.questions is None else _asked(posterior, gaussian, at, problem.questions, method.seed)),
         **_draws(posterior, *drawn),
+        **_of_uncertain(posterior, points, gaussian.mode),
         "point": points.values,
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
@@ -272,3 +273,22 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
     scale = (np.ones(len(draws)) if noise.factor is None else draws[:, -1])[:, None] * noise.scale
     gaps = noise.whitened((outputs - posterior.data) / scale)
     return {"draw": draws, "draw_log_likelihood": -noise.minus_log(gaps) - np.log(scale)}
+
+
+def _of_uncertain(posterior: Posterior, points: Points, mode: FloatArray) -> Record:
+    """Moments of what is uncertain beside the parameters, in its deviations, at each point and over all.
+
+    With the most probable size of the errors, for which it was made.
+    """
+    pull, seen = posterior.noise.pull, points.weights[:, None] > 0
+    if not len(pull):
+        return {}
+    there = -posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None]) @ pull.T
+    mean, covariance = points.weights @ there, np.eye(len(pull)) - pull @ pull.T
+    squares = np.diag(covariance) + points.weights @ (there - mean) ** 2
+    return {
+        "uncertain_point": there,
+        "uncertain_covariance": covariance,
+        "uncertain_mean": mean,
+        "uncertain_std": np.sqrt(np.maximum(squares, 0)),
+    }

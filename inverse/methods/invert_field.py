@@ -22,7 +22,7 @@ from inverse.criticism.predictive import examine
 from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
-from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.low_rank import Beside, LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise_size import SolvedField, infer_noise
 from inverse.methods.invert import Invert
@@ -78,11 +78,12 @@ def invert_field(
     posterior: FieldPosterior,
     problem: Problem,
     vertices: Vertices,
-    predict: Callable[[LowRankPosterior, Weighted | None], Record] | None = None,
+    predict: Callable[[LowRankPosterior, Weighted | None, Beside], Record] | None = None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
 
-    A posterior, and the values with weights that correct it if it cannot be trusted, `predict` what else is asked for.
+    A posterior, the values with weights that correct it if it cannot be trusted, and what is uncertain beside `predict`
+    what else is asked for.
 
     Raises
     ------
@@ -157,8 +158,12 @@ def invert_field(
     }
     if problem.assumed is not None:
         record |= _of_assumed(solved, problem.assumed, g, np.asarray(stiffness["stiffness_std"]), mean["std"])
+    beside = Beside.of(mode.point)
+    if len(beside.mean):
+        squares = np.einsum("gn,gn->g", beside.slopes, found.covariance(beside.slopes)) + (beside.root**2).sum(axis=1)
+        record |= {"uncertain_mean": beside.mean, "uncertain_std": np.sqrt(squares)}
     if predict is not None:
-        record |= predict(found, corrected)
+        record |= predict(found, corrected, beside)
     return as_dataset(record)
 
 

@@ -21,11 +21,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from inverse.fields.low_rank import Beside
 from inverse.methods.record import ENDS, Record
 from uq.estimators.estimate import BAND, part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import linearise
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 
 Z = 1.959963984540054  # standard normal quantile of the upper end
 SPARE = 20.0  # solves that calibrating the error of the mesh may cost
+POINTS = 4096  # that stand for a distribution
 STREAM = 7  # of the normal numbers of pairs
 
 
@@ -95,6 +98,21 @@ def record(before: Band, after: Band, mesh_error: FloatArray, share: FloatArray 
 
 
 # --- few parameters --------------------------------------------------------------------------------------------------
+
+
+def with_beside(
+    points: FloatArray, weights: FloatArray, means: FloatArray, root: FloatArray, seed: int = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (N, c + g), with weights (N,), of parameters and what is uncertain beside them.
+
+    Given each of n points (n, c) that is normal, with means (n, g) and a root (g, r) of the covariance.
+    """
+    from scipy.special import ndtri
+
+    copies, c = max(POINTS // len(points), 1), points.shape[1]
+    normals = ndtri(sobol_points(seed, 0, 0, copies * len(points), c + root.shape[1])[:, c:])
+    both = np.hstack([np.repeat(points, copies, axis=0), np.repeat(means, copies, axis=0) + normals @ root.T])
+    return both, np.repeat(weights / copies, copies)
 
 
 def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
@@ -221,10 +239,19 @@ def deviations(prior: Prior, size: int, pairs: int, seed: int, found: LowRankPos
     return prior.root(whitened if found is None else found.spectrum.root(whitened)) if pairs else whitened
 
 
-def before_field(model: ForwardModel, prior: Prior, size: int, pairs: int, seed: int) -> Band:
-    """Return what the prior N(0, LLᵀ) of a field says on the outputs of a model."""
-    drawn = deviations(prior, size, pairs, seed)
-    return _of_field(model, np.zeros(size), lambda g: prior.root(prior.root_transposed(g)), drawn)[0]
+def _normals(pairs: int, beside: Beside, seed: int) -> FloatArray:
+    return np.random.default_rng([seed, STREAM, 1]).standard_normal((pairs, beside.root.shape[1]))
+
+
+def before_field(model: ForwardModel, prior: Prior, size: int, pairs: int, seed: int, count: int = 0) -> Band:
+    """Return what the prior N(0, LLᵀ) of a field says on the outputs of a model.
+
+    The model's last parameters, so many, are what is uncertain beside, in its deviations.
+    """
+    beside = Beside.before(size, count)
+    drawn = beside.deviations(deviations(prior, size, pairs, seed), _normals(pairs, beside, seed))
+    covariance = beside.covariance(lambda g: prior.root(prior.root_transposed(g)))
+    return _of_field(model, np.zeros(size + count), covariance, drawn)[0]
 
 
 def after_field(
@@ -234,19 +261,25 @@ def after_field(
     pairs: int,
     seed: int,
     weighted: tuple[FloatArray, FloatArray] | None = None,
+    beside: Beside | None = None,
     *,
     of_mesh: bool,
 ) -> Record:
     """Return what the posterior of a field says on the outputs of a model, beside what was known before the data.
 
-    All parameters of the model are values of the field. Pairs of draws show what gradients leave out. Values (n, N)
-    with weights (n,) correct the normal distribution; None where it is right. The error of the mesh is estimated if
-    asked for.
+    Parameters of the model are values of the field and, at last, what is uncertain beside, if something is. Pairs of
+    draws show what gradients leave out. Values (n, N) with weights (n,) correct the normal distribution; None where it
+    is right. The error of the mesh is estimated if asked for.
     """
-    drawn = deviations(found.prior, len(found.mean), pairs, seed, found)
-    after, gradients, mesh = _of_field(model, found.mean, found.covariance, drawn, weighted, of_mesh=of_mesh)
-    whole = (found.prior.root_transposed(gradients) ** 2).sum(axis=1)
-    left = np.einsum("kn,kn->k", gradients, found.covariance(gradients))
+    size = len(found.mean)
+    beside = beside or Beside.before(size, 0)
+    drawn = beside.deviations(deviations(found.prior, size, pairs, seed, found), _normals(pairs, beside, seed))
+    mean, covariance = np.append(found.mean, beside.mean), beside.covariance(found.covariance)
+    both = None if weighted is None else beside.weighted(found.mean, *weighted)
+    after, gradients, mesh = _of_field(model, mean, covariance, drawn, both, of_mesh=of_mesh)
+    of_field, of_rest = np.split(gradients, [size], axis=1)
+    whole = (found.prior.root_transposed(of_field) ** 2).sum(axis=1) + (of_rest**2).sum(axis=1)
+    left = np.einsum("kn,kn->k", gradients, covariance(gradients))
     share = np.divide(whole - left, whole, out=np.full(len(whole), np.nan), where=whole > 0)
     return record(before, after, mesh, share)
 

@@ -14,6 +14,7 @@ from forward.registry import OfKind
 from forward.settings import Settings
 from uq.evaluation.request import BLOCKS
 
+BESIDE = "uncertain."  # before names, in draws, of numbers that were uncertain beside the parameters
 KEPT = "draws.npz"  # beside study.toml: the draws as they were read
 AVERAGED = "averaged"  # all candidates of a comparison, by their probabilities
 STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best

@@ -15,7 +15,7 @@ from forward.findings import Finding
 from forward.settings import Settings, nearest
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AVERAGED, KEPT, STACKED, Correlation
+from workflows.config.blocks import AVERAGED, BESIDE, KEPT, STACKED, Correlation
 from workflows.config.priors import findings_of_impossible, inputs_of, mistakes_of_priors, ranges
 from workflows.config.tables import at
 
@@ -115,7 +115,7 @@ class Source(Settings):
     names
         Names in the source by the paths of numbers of the model, where they differ. Without it every name of the source
         is looked for among the paths: as it is, or as the end of a path, if only one ends so. With it, only
-        these are taken.
+        these are taken, and what was uncertain beside the parameters can be, as ``"uncertain.PATH"``.
     digest
         Hash of the file, filled in when it is read: an interrupted study is not continued with other draws.
     """
@@ -212,7 +212,7 @@ class Source(Settings):
             if name not in drawn:
                 yield (*place, "names"), f"'{name}' is not in {self.file}; {nearest(name, list(drawn))}", name
         for name in drawn if not self.names else ():
-            if name not in found.values():
+            if name not in found.values() and not name.startswith(BESIDE):
                 ends = [path for path in scalars if path.endswith(f".{name}")]
                 near = f"expected one of: {', '.join(ends)}" if ends else nearest(name, tuple(scalars))
                 message = (
@@ -236,6 +236,10 @@ class Source(Settings):
         yield from findings_of_source(inputs)
         if inputs.draws is not None:
             yield from findings_of_impossible(model, inputs.draws, inputs.names)
+        beside = [name.removeprefix(BESIDE) for name in self.drawn.names if name.startswith(BESIDE)]
+        there = [name for name in beside if name in model.scalars and name not in inputs.names]
+        if there:
+            yield Finding("uncertain-in-source", "note", {"source": self.file, "names": ", ".join(there)})
         block, mine = self.material, getattr(model, "material", None)
         if block and mine is not None:
             here = {name: v for name, v in mine.model_dump().items() if name in block and name not in self.drawn.names}

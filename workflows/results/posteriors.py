@@ -17,10 +17,12 @@ import numpy as np
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.tables_of_draws import of_table
+from inverse.fields.low_rank import symmetric_root
 from inverse.low_dimensional.posterior import NOISE
+from inverse.methods.predict import with_beside
 from uq.evaluation.hdf5 import variables
 from uq.inputs.draws import Draws
-from workflows.config.blocks import AVERAGED, KEPT, STACKED
+from workflows.config.blocks import AVERAGED, BESIDE, KEPT, STACKED
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,13 +137,14 @@ class Left:
         block = chosen.get("material", {})
         return dict(block) if isinstance(block, dict) else {}
 
-    def draws(self, group: str | None, model: str | None) -> Draws:
-        """Return the draws of a posterior."""
+    def draws(self, group: str | None, model: str | None, *, beside: bool = True) -> Draws:
+        """Return the draws of a posterior, with what was uncertain beside the parameters or without it."""
         if self.kind not in READERS:
             known = f"expected one of: {', '.join(READERS)}"
             raise ValueError(f"{self.path}: is a study of kind '{self.kind}', which has no posterior, {known}")
         try:
-            return replace(READERS[self.kind](self.path, self.found, group, model), digest=self.digest)
+            found = self.found if beside else _alone(self.found)
+            return replace(READERS[self.kind](self.path, found, group, model), digest=self.digest)
         except KeyError as error:
             raise ValueError(
                 f"{self.path}: its results.nc has no {error}, expected one that this version has made: run it again"
@@ -153,7 +156,7 @@ class Left:
             raise ValueError(f"{self.path}: is a study of kind '{self.kind}', expected 'select' or 'invert'")
         names = _texts(self.found, "group" if self.kind == "select" else "data_set")
         done = np.atleast_1d(self.found["ok"]).astype(bool) if self.kind == "invert" else [True] * len(names)
-        return {name: self.draws(name, model) for name, one in zip(names, done, strict=True) if one}
+        return {name: self.draws(name, model, beside=False) for name, one in zip(names, done, strict=True) if one}
 
 
 def _texts(found: Arrays, name: str) -> list[str]:
@@ -167,6 +170,11 @@ def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> i
         words = [*known, BEST, AVERAGED, STACKED] if what == "model" else list(known)
         raise ValueError(f"{what} = '{given}' is not in {path}; {nearest(given, words)}")
     return 0 if given is None else known.index(given)
+
+
+def _alone(found: Arrays) -> Arrays:
+    """Return results without what was uncertain beside the parameters."""
+    return {name: one for name, one in found.items() if name != "uncertain_point"}
 
 
 def _drawn(names: Sequence[str], values: FloatArray, weights: FloatArray, worth: float = np.inf) -> Draws:
@@ -204,7 +212,14 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None) -
         raise ValueError(f"{path}: has no draws of that data set, which could not be inverted")
     chains = int(np.nan_to_num(np.atleast_1d(found["chains"])[k])) if "chains" in found else 0
     worth = float(np.atleast_1d(found["chain_effective" if chains else "effective"])[k])
-    return _drawn(_texts(found, "parameter"), values[whole], weights[whole], worth if worth > 0 else np.inf)
+    drawn = _drawn(_texts(found, "parameter"), values[whole], weights[whole], worth if worth > 0 else np.inf)
+    if "uncertain_point" not in found or "number" not in found:
+        return drawn
+    by, names = np.asarray(found["uncertain_weight"]), [f"{BESIDE}{name}" for name in _texts(found, "number")]
+    means = found["uncertain_value"] + found["uncertain_point"][k][whole] @ by.T
+    root = by @ symmetric_root(found["uncertain_covariance"][k])
+    both = with_beside(drawn.values, drawn.weights, means, root)
+    return Draws((*drawn.names, *names), *both, drawn.effective)
 
 
 def _of_population(path: Path, found: Arrays, group: str | None, model: str | None) -> Draws:
@@ -224,7 +239,8 @@ READERS = {"select": _selected, "invert": _inverted, "population": _of_populatio
 
 def draws_in(found: xr.Dataset, kind: str) -> Draws:
     """Return the draws in the results of a study of one group of data or data set; errors as of `read`."""
-    return READERS[kind](Path("results"), {str(name): one.values for name, one in found.variables.items()}, None, None)
+    values = _alone({str(name): one.values for name, one in found.variables.items()})
+    return READERS[kind](Path("results"), values, None, None)
 
 
 class NamedCandidate(NamedTuple):

@@ -97,7 +97,7 @@ def means(name: str, path: str) -> bool:
 class TakenForGranted:
     """What is taken for granted of a model with some unknown numbers, and of the data sets of a study.
 
-    What is stated to be uncertain may be otherwise by its standard deviation.
+    What is stated to be uncertain may be otherwise by its standard deviation; `alone`, nothing else may be.
     """
 
     label: ClassVar[str] = ASSUMED
@@ -106,6 +106,7 @@ class TakenForGranted:
     unknown: tuple[str, ...]
     found: Sequence[Measurements | None]
     stated: Mapping[str, Uncertain] = field(default_factory=dict)
+    alone: bool = False
 
     @cached_property
     def _scalars(self) -> Mapping[str, Scalar]:
@@ -120,12 +121,15 @@ class TakenForGranted:
     def numbers(self) -> list[Assumption]:
         """Numbers of the model, but for those that are zero, and not stated to be uncertain."""
         found = of_numbers(self._scalars, self.unknown, self._extent)
-        return [one for one in map(self._as_stated, found) if one.size]
+        return [one for one in map(self._as_stated, filter(self._counts, found)) if one.size]
 
     @cached_property
     def beside(self) -> list[Assumption]:
         """Of the data."""
-        return [self._as_stated(one) for one in of_data(self.found, self._units, self._extent)]
+        return [self._as_stated(one) for one in of_data(self.found, self._units, self._extent) if self._counts(one)]
+
+    def _counts(self, one: Assumption) -> bool:
+        return not self.alone or any(means(name, one.name) for name in self.stated)
 
     def _as_stated(self, one: Assumption) -> Assumption:
         for name, how in self.stated.items():
@@ -179,16 +183,41 @@ class TakenForGranted:
         return self.spec.build(comm, (*self.unknown, *(one.name for one in self.numbers)))
 
     @property
+    def loadings(self) -> FloatArray:
+        """How much larger (k, g) each number is if what is uncertain is larger by its deviation."""
+        weights = np.array(list(self.groups.values())).reshape(len(self.groups), len(self.all))
+        return np.asarray(weights[:, : len(self.numbers)].T * np.array([[one.size] for one in self.numbers]))
+
+    def by_deviations(self, comm: Any) -> ForwardModel:
+        """Make the model with what is uncertain among its parameters, each in its standard deviations; collective."""
+        if not self.groups:
+            found: ForwardModel = self.build(comm)
+            return found
+        from scipy.sparse import block_diag, eye
+
+        from forward.affine import Sparse
+        from forward.combine import Mapped
+
+        d = len(self.unknown)
+        by = Sparse(block_diag((eye(d), self.loadings), format="csr"), np.append(np.zeros(d), self.values))
+        return Mapped(self.build(comm), by, (*self.unknown, *self.groups))
+
+    @property
     def asked(self) -> bool:
         """Whether the model has to be asked of the data sets."""
         moved = any(one is not None and self._moved(one) is not None for one in self.found)
         return bool(self.numbers or self.groups) or moved
 
-    def model(self, comm: Any) -> ForwardModel:
-        """Make what is asked of the first data set; collective."""
+    @property
+    def data(self) -> Measurements:
+        """The first data set."""
         data = self.found[0]
         assert data is not None
-        found = self.observed(self.build(comm), data)
+        return data
+
+    def model(self, comm: Any) -> ForwardModel:
+        """Make what is asked of the first data set; collective."""
+        found = self.observed(self.build(comm), self.data)
         assert found is not None
         return found
 
@@ -205,7 +234,8 @@ class TakenForGranted:
         return Assumptions(*known, ask, self._moved(data), self.groups)
 
     def _moved(self, data: Measurements) -> Moved | None:
-        if not self.spec.placed or not np.isfinite(data.places).all(axis=1).any():
+        shifts = self.spec.placed and any(one.name.startswith("data.shift.") for one in self.beside)
+        if not shifts or not np.isfinite(data.places).all(axis=1).any():
             return None
         body = self.spec.bodies[0].body
         return Moved(data, self._extent, onto(body) if data.on_surface else body.nearest, data.on_surface)
@@ -250,3 +280,9 @@ class TakenForGranted:
         if "std" in found and found["std"].dims == ("output",):
             add(found, *of_outputs(self.numbers, outputs, changes, found["std"].to_numpy()))
         return found
+
+
+def of_none(each: Sequence[TakenForGranted]) -> Iterator[Mistake]:
+    """Find what is stated to be uncertain of models of which none takes that for granted."""
+    first, *others = [{one[0]: one for one in taken.mistakes()} for taken in each]
+    yield from (one for place, one in first.items() if all(place in other for other in others))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -17,6 +18,7 @@ from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from forward.specimen import Observed
+from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.data.measurements import Measurements
 from inverse.designs.fields import of_field
 from inverse.methods.design import Design
@@ -28,6 +30,7 @@ from workflows.config.priors import findings_of_materials, ranges
 from workflows.config.tables import at
 from workflows.data.designs import files
 from workflows.run.from_python import FromPython
+from workflows.studies.assumptions import ASSUMED, TakenForGranted, Uncertain, of_none
 from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
@@ -67,6 +70,8 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         Correlations between them.
     candidates
         Models by name, as of a comparison, that the observations should tell apart.
+    uncertain
+        Standard deviations of what is taken for granted, as of inversions: what only that moves tells less.
     method
         What is chosen and how.
     """
@@ -77,6 +82,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     model: Annotated[SerializeAsAny[ModelSpec] | dict[str, Any], AS_DECIDED, PartOrKind(ANY_MODEL)]
     candidates: Annotated[dict[str, CandidateModel], Field(min_length=2)] | None = None
+    uncertain: dict[str, Uncertain] = Field(default={})
     method: Design
 
     @model_validator(mode="before")
@@ -98,8 +104,25 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     @property
     def planned(self) -> int:
-        """Number of solves: one for each draw, of each candidate."""
-        return self.method.draws * len(self.of_candidates)
+        """Number of solves: for each draw, of each candidate, one, and of few parameters another for the uncertain."""
+        return self.method.draws * len(self.of_candidates) * (2 if self.uncertain and not self.field else 1)
+
+    @property
+    def field(self) -> bool:
+        """Whether values of a field at the vertices are what is unknown, of one model."""
+        return self.candidates is None and super().field
+
+    def takes(self, name: str, values: Measurements | None) -> TakenForGranted:
+        """Return what a candidate takes for granted of values that may be measured."""
+        spec: Any = self.of_candidates[name]
+        if values is not None:
+            some = replace(values, some=True, names=values.labels)
+            values = values.in_model(spec.observable) if spec.placed else some
+        return TakenForGranted(spec, self.unknown_of(name), [values], self.uncertain, alone=values is not None)
+
+    def unknown_of(self, name: str) -> tuple[str, ...]:
+        """Paths of the unknown numbers of a candidate or of the one model, and of coefficients."""
+        return self.of_candidates[name].coefficients if self.field else self.parameters_of(name)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -119,6 +142,9 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
             told, draw = self._unknown(draw)
         else:
             told = [f"candidate   {name}: {spec.description}" for name, spec in self.of_candidates.items()]
+        draw *= self.planned / (method.draws * len(costs))
+        if self.uncertain:
+            told.append(f"uncertain   {', '.join(self.uncertain)}: errors that the observations share")
         return [
             f"method      {method.kind}, criterion {method.criterion}",
             *told,
@@ -140,17 +166,16 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, or those of all candidates, which are all observed at the places of the first; collective."""
-        method, nodal = self.method, self.candidates is None and self.field
-        specs = self.of_candidates
+        method, specs = self.method, self.of_candidates
         first, *others = specs
-        model: Any = specs[first].build(
-            ensemble.group, specs[first].coefficients if nodal else self.parameters_of(first)
-        )
-        if self.candidates is None:
-            derivable(model, self.spec.kind)
+        model: Any = specs[first].build(ensemble.group, self.unknown_of(first))
+        if self.candidates is None or self.uncertain:
+            derivable(model, specs[first].kind)
         values = values_of(specs[first], model)
-        if nodal:
-            return _of_field(method, self.spec, ensemble, checkpoint, model, values)
+        taken = {one: self.takes(one, values) for one in specs if self.uncertain}
+        taken = {one: found for one, found in taken.items() if found.groups}
+        if self.field:
+            return _of_field(method, self.spec, ensemble, checkpoint, model, values, taken.get(first))
         recorders: dict[str, Recorder] = {}
 
         def made(name: str) -> ForwardModel:
@@ -165,12 +190,16 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         def task(evaluate: Evaluate) -> xr.Dataset:
             for one in specs:
                 recorders[one] = Recorder(evaluate if one == first else evaluate.on(one))
+            assumed = {name: one.of(one.data, by_evaluation(evaluate.on(held[name]))) for name, one in taken.items()}
             if self.candidates is None:
-                return method.run(self.inputs, recorders[first], values, evaluate if has_mesh(self.spec) else None)
+                of_mesh = evaluate if has_mesh(self.spec) else None
+                return method.run(self.inputs, recorders[first], values, of_mesh, assumed.get(first))
             weights = {one: candidate.weight for one, candidate in self.candidates.items()}
-            return method.run_models(self.priors, weights, recorders, values)
+            return method.run_models(self.priors, weights, recorders, values, assumed)
 
-        makers = {one: partial(made, one) for one in others}
+        held = {name: f"{name}/{ASSUMED}" for name in taken}
+        makers: dict[str, Callable[[], ForwardModel]] = {one: partial(made, one) for one in others}
+        makers |= {held[name]: partial(one.model, ensemble.group) for name, one in taken.items()}
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
@@ -187,7 +216,10 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     def mistakes(self) -> Iterator[Mistake]:
         """Find what cannot be asked together."""
-        yield from self._of_model() if self.candidates is None else self._of_candidates()
+        wrong = list(self._of_model() if self.candidates is None else self._of_candidates())
+        yield from wrong
+        if self.uncertain and not wrong:
+            yield from of_none([self.takes(name, None) for name in self.of_candidates])
 
     def _of_model(self) -> Iterator[Mistake]:
         model: Any = self.model
@@ -304,7 +336,13 @@ def values_of(spec: Any, model: Any) -> Measurements:
 
 
 def _of_field(
-    method: Design, spec: Any, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Measurements
+    method: Design,
+    spec: Any,
+    ensemble: Ensemble,
+    checkpoint: Checkpoint,
+    model: ForwardModel,
+    values: Measurements,
+    taken: TakenForGranted | None,
 ) -> TasksJob:
     """Each draw of the field is a task of one group."""
     from forward.combine import Recorded
@@ -313,7 +351,9 @@ def _of_field(
     prior = spec.fields[0].prior(spec.body)
     names = [f"draw {number}" for number in range(method.draws)]
     solving: list[Kept] = []  # of the draw at hand
-    goals = method.candidates(values)[1]
+    goals, assumed = method.candidates(values)[1], None
+    if taken is not None:
+        assumed = taken.of(taken.data, by_model(taken.model(ensemble.group)))
 
     def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
         solving.append(Kept(checkpoint, ensemble.group, names[number]))
@@ -327,14 +367,18 @@ def _of_field(
         ensemble.count(1, 0)
         sigma = method.sigma(values, solution.outputs[None])
         mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
-        found = of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
+        errors = np.zeros((0, len(values)))
+        if assumed is not None:
+            errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
+        parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
+        found = of_field(kept, solution, whitened, *parts)
         return found if mesh is None else found.assign(mesh_error=("value", mesh))
 
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         found = [one.dataset for one in outcomes if one.dataset is not None]
         if not found:
             raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
-        return method.of_fields(found, values)
+        return method.of_fields(found, values, 0 if assumed is None else len(assumed.weights))
 
     return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -18,6 +19,7 @@ from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, ranges
 from workflows.run.from_python import FromPython
+from workflows.studies.assumptions import of_none
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import Sampled, StudyKind
@@ -111,8 +113,8 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         return job(self, ensemble, directory, checkpoint)
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknown parameters, of those that act in what is predicted."""
-        return self.acting if label == PREDICTED else self.inputs.names
+        """Names of the unknown parameters, of those that act in what is predicted with what is uncertain there."""
+        return (*self.acting, *self.predicts.groups) if label == PREDICTED else self.inputs.names
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
@@ -172,7 +174,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             if name not in self.model.scalars:
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
-        yield from self._of_uncertain()
         if self.data.errors.process and (self.specimen is None or self.field or self.method.reduced is not None):
             message = "varies along a body of few parameters, expected false with outputs, nodal fields, reduced models"
             yield ("data", "errors", "process"), message, True
@@ -180,18 +181,23 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         if self.method.question and not (itself and isinstance(self.spec, Solid)):
             message = "is asked of one body that is solved itself for few parameters, with no expansion, reduced model "
             yield ("method", "question"), f"{message}or field of nodal values; expected false", True
+        wrong = list[Mistake]()
         if self.predict is not None:
             from workflows.studies.predicted import mistakes
 
-            yield from mistakes(self)
+            wrong = list(mistakes(self))
+            yield from wrong
+        if not wrong:
+            yield from self._of_uncertain()
 
     def _of_uncertain(self) -> Iterator[Mistake]:
-        """Find what cannot be uncertain."""
+        """Find what cannot be uncertain, neither in what was measured nor in what is predicted."""
         if self.uncertain and (self.method.expansion is not None or self.method.reduced is not None):
             message = "what is uncertain beside the parameters needs solves of the model itself, expected neither "
             yield ("uncertain",), f"{message}method.expansion nor method.reduced", list(self.uncertain)
         elif self.uncertain and self.taken is not None:
-            yield from self.taken.mistakes()
+            predicted = [] if self.predict is None else [replace(self.taken, spec=self.predicted)]
+            yield from of_none([self.taken, *predicted])
 
     def _of_specimen(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of displacements."""

@@ -125,6 +125,11 @@ class InversionBlocks(OneModel):
         known = {*self.predicted.scalars, *self.predicted.coefficients}
         return tuple(name for name in self.unknown if name in known)
 
+    @cached_property
+    def predicts(self) -> TakenForGranted:
+        """What is uncertain in what is predicted: numbers of its model."""
+        return TakenForGranted(self.predicted, self.acting, (), self.uncertain, alone=True)
+
     @property
     def predicted_by(self) -> int:
         """Number of solves for what is predicted, beside the first, for the posterior as for the prior."""

@@ -68,7 +68,7 @@ def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint:
     made = _outputs(study, ensemble, keep) if specimen is None else _specimen(study, specimen, ensemble, keep)
     derivable(made.model, study.model.kind)
     if study.predict is not None:
-        made = replace(made, predicted=study.predicted.build(ensemble.group, study.acting))
+        made = replace(made, predicted=study.predicts.by_deviations(ensemble.group))
     return (
         _one(study, made, ensemble, checkpoint)
         if study.together

@@ -92,6 +92,12 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         assumed = study.taken.shown
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
         held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
+        by = study.taken.loadings
+        acting = np.flatnonzero(by.any(axis=1))
+        if "uncertain_point" in held and len(acting):
+            held["uncertain_weight"] = (("number", "uncertain"), by[acting])
+            held["uncertain_value"] = ("number", study.taken.values[acting])
+            coordinates["number"] = [study.taken.numbers[k].name for k in acting]
     if study.asked:
         coordinates["question"] = list(study.asked)
     if study.predict is not None:

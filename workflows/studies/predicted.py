@@ -13,6 +13,7 @@ from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
 from forward.specimen import in_words, shared_paths
+from inverse.fields.low_rank import Beside, symmetric_root
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
@@ -31,9 +32,8 @@ if TYPE_CHECKING:
     from uq.evaluation.request import Evaluate
     from workflows.studies.inversion_blocks import InversionBlocks, Predict
 
-# From the name of a data set, the posterior of its field, and what corrects that.
-FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
-POINTS = 4096  # that stand for the prior
+# From the name of a data set, the posterior of its field, what corrects that, and what is uncertain beside.
+FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None", Beside], "Record"]
 LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 
 
@@ -131,25 +131,44 @@ def of_few(
     before
         What the prior says.
     """
-    names = study.acting
+    names, labels = study.acting, tuple(study.predicts.groups)
     weights = found["point_weight"].to_numpy()
     used = weights > 0
     columns = [study.names.index(name) for name in names]
     points = found["point"].to_numpy()[used][:, columns]
     kept = weights[used] / weights[used].sum()
-    draws = Draws(names, points, kept, float(1 / (kept**2).sum()))
+    effective = float(1 / (kept**2).sum())
+    if labels:
+        means, covariance = np.zeros((used.sum(), 0)), np.zeros((0, 0))
+        if "uncertain_point" in found:
+            means, covariance = found["uncertain_point"].to_numpy()[used], found["uncertain_covariance"].to_numpy()
+        known, others = _acting_of(study)
+        root = np.hstack([known @ symmetric_root(covariance), others])
+        points, kept = predict.with_beside(points, kept, means @ known.T, root, study.method.seed)
+    draws = Draws((*names, *labels), points, kept, effective)
     after = predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
     looked = study.method.treatment is not None and has_mesh(study.predicted)
     mesh = predict.mesh_error_at(draws, of_mesh) if looked and not np.isnan(after.mean).all() else np.nan
     return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
 
 
+def _acting_of(study: InversionBlocks) -> tuple[FloatArray, FloatArray]:
+    """Return which of what is uncertain acts in what is predicted, ones among zeros (g′, g), and units of others."""
+    known, labels = [] if study.taken is None else list(study.taken.groups), list(study.predicts.groups)
+    acting = np.array([[float(one == other) for other in known] for one in labels]).reshape(len(labels), len(known))
+    return acting, np.eye(len(labels))[:, ~acting.any(axis=1)]
+
+
 def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
     """Return what the prior says, which is solved for once for all data sets."""
-    names, every = study.acting, study.inputs.names
-    points = study.inputs.points(sobol_points(study.method.seed, 0, 0, POINTS, len(every)))
-    values = points[study.inputs.allowed(points)][:, [every.index(name) for name in names]]
-    draws = Draws(names, values, np.full(len(values), 1 / len(values)), float(len(values)))
+    from scipy.special import ndtri
+
+    names, every, labels = study.acting, study.inputs.names, tuple(study.predicts.groups)
+    uniforms = sobol_points(study.method.seed, 0, 0, predict.POINTS, len(every) + len(labels))
+    points = study.inputs.points(uniforms[:, : len(every)])
+    values = np.hstack([points[:, [every.index(name) for name in names]], ndtri(uniforms[:, len(every) :])])
+    values = values[study.inputs.allowed(points)]
+    draws = Draws((*names, *labels), values, np.full(len(values), 1 / len(values)), float(len(values)))
     return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
 
 
@@ -165,14 +184,18 @@ def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> Fi
     """
     prior, looked = study.model.fields[0].prior(study.model.body), study.method.treatment is not None
     pairs, seed, size = study.predicted_by // 2, study.method.seed, len(study.acting)
+    known, others = _acting_of(study)
 
     @cache
     def before() -> Band:
-        return predict.before_field(model(f"prior, {PREDICTED}"), prior, size, pairs, seed)
+        return predict.before_field(model(f"prior, {PREDICTED}"), prior, size, pairs, seed, len(known))
 
-    def record(name: str, found: LowRankPosterior, weighted: tuple[FloatArray, FloatArray] | None) -> Record:
+    def record(
+        name: str, found: LowRankPosterior, weighted: tuple[FloatArray, FloatArray] | None, every: Beside
+    ) -> Record:
         there = model(f"{name}/{PREDICTED}")
-        return predict.after_field(there, found, before(), pairs, seed, weighted, of_mesh=looked)
+        beside = Beside(known @ every.mean, known @ every.slopes, np.hstack([known @ every.root, others]))
+        return predict.after_field(there, found, before(), pairs, seed, weighted, beside, of_mesh=looked)
 
     return record
 

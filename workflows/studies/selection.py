@@ -20,6 +20,7 @@ from workflows.config.priors import findings_of_materials, mistakes_of_factor
 from workflows.data.material_tests import DataFile, expanded
 from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
+from workflows.studies.assumptions import of_none
 from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
 from workflows.studies.study import StudyKind, bytes_of
@@ -210,13 +211,8 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             if spec is not None:
                 yield from self.mistakes_of_ranks(spec)
         yield from self._of_method()
-        yield from self._of_uncertain()
-
-    def _of_uncertain(self) -> Iterator[Mistake]:
-        """Find what is stated to be uncertain of which no candidate takes anything for granted."""
         if self.uncertain:
-            each = [{one[0]: one for one in self.takes(name, []).mistakes()} for name in self.candidates]
-            yield from (one for place, one in each[0].items() if all(place in other for other in each))
+            yield from of_none([self.takes(name, []) for name in self.candidates])
 
     def _of_tests(self) -> Iterator[Mistake]:
         """Find several tests of one name in a group, words about meshes, and candidates that are no materials."""

@@ -50,10 +50,8 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
     def task(evaluate: Evaluate) -> xr.Dataset:
         def assumed(name: str, group: str) -> Assumptions:
             one = taken[name, group]
-            (data,) = one.found
-            assert data is not None
             asked = by_evaluation(evaluate.on(f"{name}/{group}/{ASSUMED}")) if one.asked else None
-            return one.of(data, asked)
+            return one.of(one.data, asked)
 
         shared = {(n, g): motion.errors_by(evaluate.on(f"{n}/{g}/{MOVED}")) for (n, g), motion in motions.items()}
         for pair, one in taken.items():

@@ -24,12 +24,15 @@ from inverse.criticism.assumptions import (
     merged,
     moved_by,
     of_data,
+    off,
     quantities,
 )
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.invert_few import invert_few
+from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
@@ -231,6 +234,39 @@ def test_what_is_too_uncertain_for_first_order_is_said():
     assert one.text == (
         "s is too uncertain for its first order: second order moves b by 0.31 deviations; make it a parameter, with a "
         "normal prior."
+    )
+
+
+@pytest.mark.unit
+def test_what_is_uncertain_is_as_stated_whatever_the_size_of_the_errors():
+    """Errors that are a fifth of what is stated, by a factor that is inferred: a stated deviation is no fifth of it."""
+    rng, m = np.random.default_rng(1), 200
+    rows, by_s = rng.standard_normal((m, 2)), rng.standard_normal(m)
+    names = tuple(map(str, range(m)))
+    values = rows @ [1.2, -0.5] + 0.7 * by_s + 0.02 * rng.standard_normal(m)
+    data = Measurements.of(values, np.full(m, 0.1), [0] * m, range(m), names)
+    model = FunctionModel(lambda p: rows @ p, ("a", "b"), names, lambda p: rows)
+    method = bench.METHOD.model_copy(update={"noise": LogUniform(lower=0.01, upper=10.0)})
+    problem = Problem(data, method, shared=lambda point: {"uncertain": 0.5 * by_s[None]})
+    found = invert_few(INPUTS, SerialEvaluate(model), problem).dataset
+    covariance = np.linalg.inv(0.02**2 * np.eye(m) + 0.25 * np.outer(by_s, by_s))
+    right = np.linalg.inv(np.diag(INPUTS.std**-2.0) + rows.T @ covariance @ rows)
+    np.testing.assert_allclose(found["std"][:2], np.sqrt(np.diag(right)), rtol=0.15)
+    assert float(found["uncertain_mean"][0]) == pytest.approx(1.4, abs=0.05)
+    mean = right @ (rows.T @ covariance @ values + INPUTS.mean / INPUTS.std**2)
+    left = 1 / (4 + by_s @ by_s / 0.02**2)  # of s, were a and b known
+    of_both = left * by_s @ rows / 0.02**2
+    assert float(found["uncertain_std"][0]) == pytest.approx(2 * np.sqrt(left + of_both @ right @ of_both), rel=0.15)
+    np.testing.assert_allclose(found["mean"][:2], mean, atol=0.3 * np.sqrt(np.diag(right)).max())
+
+
+@pytest.mark.unit
+def test_what_the_data_contradict_is_said():
+    (one,) = off(["load", "scale"], np.array([2.9, -3.14]))
+    assert one.severity == "warning"
+    assert one.text == (
+        "The data say that scale is smaller than stated by 3.1 of its deviations: it is known less well, or something "
+        "else is wrong."
     )
 
 

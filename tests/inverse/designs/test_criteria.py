@@ -5,6 +5,7 @@ import pytest
 from scipy.special import logsumexp
 
 from inverse.designs.criteria import Information, Variance, conditioned, grouped, told, told_along
+from inverse.designs.greedy import choose
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
@@ -118,3 +119,34 @@ def test_parameters_are_whitened_by_their_prior():
     log_normal = Inputs({"e": LogNormal(mean=2.0, std=1.0)})
     points, slopes = log_normal.whitened(u[:, :1])
     np.testing.assert_allclose(slopes[:, 0, 0], points[:, 0] * np.sqrt(np.log(1.25)), rtol=1e-12)
+
+
+@pytest.mark.unit
+def test_unknowns_of_no_interest_are_errors_that_observations_share():
+    """What they leave to the others is the determinant of these alone, whatever the order."""
+    rows, order = problem(draws=2, r=6), [3, 0, 5, 1]
+
+    def others(A, n):
+        seen = A[order[:n]].reshape(-1, 6)
+        C = np.linalg.inv(np.eye(6) + seen.T @ seen)[:4, :4]
+        return -np.linalg.slogdet(C)[1] / 2
+
+    expected = [np.mean([others(A, n) for A in rows]) for n in (1, 2, 3, 4)]
+    criterion = Information(rows, 2)
+    np.testing.assert_allclose(list(criterion.along(order)), expected, rtol=1e-9)
+    np.testing.assert_allclose(np.mean([told_along(A[order], 2) for A in rows], axis=0), expected, rtol=1e-8)
+    whole = rows[0][order].reshape(-1, 6)  # of errors with the covariance I + NNᵀ
+    root = np.linalg.cholesky(np.eye(len(whole)) + whole[:, 4:] @ whole[:, 4:].T)
+    assert told(np.linalg.solve(root, whole[:, :4])) == pytest.approx(others(rows[0], 4), rel=1e-9)
+
+
+@pytest.mark.unit
+def test_what_only_they_move_tells_something_once_others_depend_on_them():
+    rows = np.array([[[1.0, 5.0]], [[0.0, 9.0]], [[0.1, 0.0]]])
+    criterion = Information([rows], 1)
+    before = criterion.gains(np.arange(3))
+    assert before[1] == pytest.approx(0, abs=1e-12)
+    criterion.take(0)
+    assert criterion.gains(np.array([1]))[0] > 0.25
+    chosen = choose(lambda: Information([rows], 1), np.ones(3), number=2, budget=None)
+    assert chosen.order == (0, 1)

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from forward.pointwise import FunctionModel
 from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
-from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.low_rank import Beside, LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.predict import after_field, before_field
 from tests.launch import TISSUQ, assert_same_bits, environment, in_process, run, run_script, tissuq_on_two_ranks
@@ -78,6 +78,46 @@ def test_what_gradients_leave_out_is_seen_in_pairs():
     assert abs(seen.std[0] - np.sqrt(variance + 2 * variance**2)) < 4 * seen.std_error[0]
 
 
+def test_what_is_uncertain_beside_a_field_is_what_the_data_have_left_of_it():
+    """Jointly with the field, against dense matrices; one of three acts in what was measured alone, one in neither."""
+    names = tuple(f"m{i}" for i in range(SIZE + 3))
+    U, by_goal = RNG.standard_normal((3, DATA)), RNG.standard_normal((GOALS, 3))
+    U[1:] *= [[2.0], [0.0]]
+    goal = np.hstack([GOAL, by_goal])
+    model = FunctionModel(lambda m: goal @ m + 1, names, tuple(map(str, range(GOALS))), lambda m: goal)
+    values = SEEN @ ROOT @ RNG.standard_normal(SIZE) + RNG.standard_normal(3) @ U + SIGMA * RNG.standard_normal(DATA)
+    noise = Noise(np.full(DATA, SIGMA), uncertain=U)
+    mode = find_mode(FieldPosterior(linear(SEEN), values + 1, noise, PRIOR), tolerance=1e-12).point
+    found = LowRankPosterior.at(mode, cutoff=1e-12)
+    before = before_field(model, PRIOR, SIZE, 4, 0, 3)
+    whole = np.hstack([SEEN, U.T])
+    prior = np.block([[ROOT @ ROOT.T, np.zeros((SIZE, 3))], [np.zeros((3, SIZE)), np.eye(3)]])
+    gain = prior @ whole.T @ np.linalg.inv(whole @ prior @ whole.T + SIGMA**2 * np.eye(DATA))
+    covariance = prior - gain @ whole @ prior
+    wide, narrow = (np.sqrt(np.diag(goal @ C @ goal.T)) for C in (prior, covariance))
+    beside = Beside.of(mode)
+    said = after_field(model, found, before, 4, 0, None, beside, of_mesh=False)
+    np.testing.assert_allclose(said["prediction_mean"], goal @ gain @ values + 1, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(said["prediction_std"], narrow, rtol=1e-7)
+    np.testing.assert_allclose(before.std, wide, rtol=1e-8)
+    np.testing.assert_allclose(said["prediction_share"], 1 - (narrow / wide) ** 2, rtol=1e-7)
+    # A field that is known by weighted points of that covariance, which none of its directions leaves.
+    root = ROOT @ np.linalg.cholesky(
+        np.eye(SIZE)
+        - np.linalg.multi_dot(
+            [
+                (SEEN @ ROOT).T,
+                np.linalg.inv(SEEN @ ROOT @ (SEEN @ ROOT).T + U.T @ U + SIGMA**2 * np.eye(DATA)),
+                SEEN @ ROOT,
+            ]
+        )
+    )
+    points = np.vstack([found.mean + np.sqrt(SIZE) * root.T, found.mean - np.sqrt(SIZE) * root.T])
+    weighted = points, np.full(2 * SIZE, 0.5 / SIZE)
+    said = after_field(model, found, before, 0, 0, weighted, beside, of_mesh=False)
+    np.testing.assert_allclose(said["prediction_std"], narrow, rtol=1e-7)
+
+
 # --- few parameters, by closed forms ---------------------------------------------------------------------------------
 
 A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
@@ -102,6 +142,25 @@ def other(p):
 
 def others(p):
     return np.array([[1.0, -1.0]])
+
+
+B = np.array([1.0, -2.0, 1.5])
+
+
+def wider(p):
+    return A @ p[:2] + B * p[2]
+
+
+def wider_slopes(p):
+    return np.column_stack([A, B])
+
+
+def wider_other(p):
+    return np.array([p[0] - p[1] + 2 * p[2] + 3 * p[3]])
+
+
+def wider_others(p):
+    return np.array([[1.0, -1.0, 2.0, 3.0]])
 """
 STUDY = """
 [model]
@@ -133,9 +192,20 @@ OTHER = 'model = { function = "predicted_lines.other", jacobian = "predicted_lin
 VALUES, ERRORS = np.array([0.4, 3.1, 2.9]), np.array([0.05, 0.31, 0.29])
 
 
+WIDER = """{ function = "predicted_lines.wider_other", jacobian = "predicted_lines.wider_others", outputs = ["q"],
+parameters = { a = 1.0, b = -1.0, s = 2.0, t = 0.0 } }""".replace("\n", " ")
+UNCERTAIN = "[uncertain]\ns = 0.4\nt = 0.1\n"
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("predict")
+    of_wider = (
+        STUDY.replace("linear", "wider")
+        .replace("slopes", "wider_slopes")
+        .replace("b = -1.0 }", "b = -1.0, s = 2.0 }", 1)
+    )
+    (place / "wider.toml").write_text(of_wider.replace("PREDICT", f"model = {WIDER}") + UNCERTAIN)
     (place / "predicted_lines.py").write_text(LINES)
     for name, block in (("same", ""), ("other", OTHER)):
         (place / f"{name}.toml").write_text(STUDY.replace("PREDICT", block))
@@ -155,6 +225,33 @@ def exactly():
     B = A[[0, 2, 2]]
     covariance = np.linalg.inv(np.diag(STD**-2.0) + (B / ERRORS[:, None] ** 2).T @ B)
     return covariance @ (B.T @ (VALUES / ERRORS**2) + MEAN / STD**2), covariance
+
+
+def jointly():
+    """Mean and covariance of a, b, s and t after the data of the wider model; t acts in the predicted one alone."""
+    scope = {}
+    exec(LINES, scope)
+    rows = np.column_stack([scope["wider_slopes"](None), np.zeros(3)])[[0, 2, 2]]
+    prior = np.diag(np.append(STD, [0.4, 0.1]) ** 2)
+    gain = prior @ rows.T @ np.linalg.inv(rows @ prior @ rows.T + np.diag(ERRORS**2))
+    at = np.append(MEAN, [2.0, 0.0])
+    return at + gain @ (VALUES - rows @ at), prior - gain @ rows @ prior, prior
+
+
+def test_what_is_uncertain_widens_predictions_by_what_the_data_have_left_of_it(folder):
+    """Of a linear model as if it were one more unknown; nothing else than its deviation is known of what is new."""
+    assert ran(folder / "wider.toml", folder / "wider", report=True) == 0
+    assert "What is uncertain is counted." in (folder / "wider" / "report.html").read_text()
+    one = results(folder / "wider").isel(data_set=0)
+    mean, covariance, prior = jointly()
+    goal = np.array([1.0, -1.0, 2.0, 3.0])
+    std, wide = (float(np.sqrt(goal @ C @ goal)) for C in (covariance, prior))
+    assert float(one["prediction_mean"][0]) == pytest.approx(goal @ mean, abs=0.05 * std)
+    assert float(one["prediction_std"][0]) == pytest.approx(std, rel=0.05)
+    assert float(one["prediction_prior_std"][0]) == pytest.approx(wide, rel=0.01)
+    assert one["uncertain"].values.tolist() == ["s"]
+    assert float(one["uncertain_mean"][0]) == pytest.approx((mean[2] - 2) / 0.4, abs=0.05)
+    assert float(one["uncertain_std"][0]) == pytest.approx(np.sqrt(covariance[2, 2]) / 0.4, rel=0.05)
 
 
 def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(folder, capsys, looked_at):
@@ -334,6 +431,36 @@ def test_other_loads_and_places_of_a_specimen(specimens):
     assert np.isfinite(found["prediction_mesh_error"]).all()
     said = json.loads((specimens / "few" / "summary.json").read_text())["findings"]
     assert any("the mesh is estimated to move" in one["text"] for one in said)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("unknown", [NUMBER, FIELD])
+def test_a_load_that_is_uncertain_in_what_was_measured_and_predicted(specimens, tmp_path, unknown):
+    """Few parameters: as if it were one more unknown. Of a field load and stiffness err together."""
+    (tmp_path / "points.csv").write_text(POINTS)
+    stated = '[uncertain]\n"loads.traction.size" = { std = 15 }\n'
+    (tmp_path / "stated.toml").write_text(CUBE.replace("MORE", unknown) + stated)
+    changes = ("method.mesh_error=false", "method.samples=128")
+    assert ran(tmp_path / "stated.toml", tmp_path / "stated", *changes) in (0, 3)
+    found = results(tmp_path / "stated").isel(data_set=0)
+    assert found["uncertain"].values.tolist() == ["loads.traction.size"]
+    if unknown == FIELD:
+        assert ran(specimens / "field.toml", tmp_path / "plain", *changes) in (0, 3)
+        plain = results(tmp_path / "plain").isel(data_set=0)
+        # The energy is that of a load times a displacement, which was measured: 5 %, and by the load alone 10 %.
+        by_load = 0.05 * found["uncertain_std"][0] * found["prediction_mean"][-1]
+        right = np.hypot(plain["prediction_std"][-1], by_load)
+        assert float(found["prediction_std"][-1]) == pytest.approx(float(right), rel=0.05)
+        assert (found["prediction_prior_std"] > plain["prediction_prior_std"]).all()
+        return
+    sampled = NUMBER + '"loads.traction.size" = { kind = "normal", mean = 300, std = 15 }\n'
+    (tmp_path / "sampled.toml").write_text(CUBE.replace("MORE", sampled))
+    assert ran(tmp_path / "sampled.toml", tmp_path / "sampled", *changes) in (0, 3)
+    right = results(tmp_path / "sampled").isel(data_set=0)
+    for name in ("std", "mean"):
+        np.testing.assert_allclose(found[name][:1], right[name][:1], rtol=0.1)
+        np.testing.assert_allclose(found[f"prediction_{name}"][1:], right[f"prediction_{name}"][1:], rtol=0.1)
+    np.testing.assert_allclose(found["uncertain_std"][0] * 15, right["std"][1], rtol=0.1)
 
 
 @pytest.mark.fem

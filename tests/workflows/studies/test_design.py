@@ -170,6 +170,45 @@ def test_variances_of_parameters_and_predictions(folder):
     assert float(goal["worth"][0]) == pytest.approx(taken(best), rel=1e-9)
 
 
+UNCERTAIN = "\n".join(NORMAL.splitlines()[:2]) + "\n[uncertain]\n"
+
+
+def test_what_is_uncertain_is_an_unknown_of_which_nothing_is_asked(folder):
+    """As if c had a prior, and only a and b counted; goals depend on it too."""
+    found = load(line(folder, parameters=UNCERTAIN + "c = 3")).run()
+    chosen = found["chosen"].to_numpy()
+    left = [exact(chosen[: n + 1])[1][:2, :2] for n in range(4)]
+    told = [np.log(4 / np.linalg.det(C)) / 2 for C in left]
+    np.testing.assert_allclose(found["information"], told, rtol=1e-9)
+    np.testing.assert_allclose(found["posterior_std"], np.sqrt(np.diag(left[-1])), rtol=1e-9)
+    alone = [np.log(4 / np.linalg.det(exact([i])[1][:2, :2])) / 2 for i in range(12)]
+    np.testing.assert_allclose(found["candidate_information"], alone, rtol=1e-8)
+    assert chosen[0] == np.argmax(alone)
+    assert not [one for one in findings(found) if one.severity == "error"]
+    by_parameters = load(line(folder, 'number = 2\ncriterion = "parameters"', UNCERTAIN + "c = 3")).run()
+    variances = np.diag(exact(by_parameters["chosen"].to_numpy())[1])[:2]
+    assert float(by_parameters["worth"][-1]) == pytest.approx(1 - (variances / [1, 4]).mean(), rel=1e-9)
+    goals = 'number = 2\ncriterion = "predictions"\ngoals = ["y0"]'
+    whole, some = (load(line(folder, goals, block)).run() for block in (NORMAL, UNCERTAIN + "c = 3"))
+    np.testing.assert_allclose(some["worth"], whole["worth"], rtol=1e-9)
+    np.testing.assert_array_equal(some["chosen"], whole["chosen"])
+
+
+def test_scales_that_are_uncertain_together_say_nothing_of_goals(folder):
+    """Against dense matrices: a scale is an error of what is measured, and of nothing that is predicted."""
+    block = UNCERTAIN + 'c = { std = 3, group = "one" }\n"data.scale" = { relative = 0.4, group = "one" }'
+    method = 'number = 2\ndraws = 1\ncriterion = "predictions"\ngoals = ["y11"]'
+    found = load(line(folder, method, block)).run()
+    scope = {}
+    exec(MODULE, scope)
+    G = scope["G"]
+    together = 3 * G[:, 2] - 0.4 * (G @ [1, 1, 0])
+    A, goal = np.column_stack([G[:, :2] * [1, 2], together]) / 0.5, np.append(G[11, :2] * [1, 2], 3 * G[11, 2])
+    rows = A[found["chosen"].to_numpy()]
+    worth = [1 - goal @ np.linalg.inv(np.eye(3) + rows[:n].T @ rows[:n]) @ goal / (goal @ goal) for n in (1, 2)]
+    np.testing.assert_allclose(found["worth"], worth, rtol=1e-9)
+
+
 @pytest.mark.fem
 def test_chosen_points_are_what_other_studies_take(folder):
     path = cube(folder, "number = 6\ncosts = { 'pull.grip' = 1.5 }\nnoises = { '*.grip' = { relative = 0.02 } }")
@@ -334,6 +373,13 @@ def straight(p):
 def bent(p):
     return (p[0] * X + p[1] * X**2).tolist()
 """
+SLOPES = """
+def by_a(p):
+    return X[:, None].tolist()
+
+def by_both(p):
+    return np.column_stack([X, X**2]).tolist()
+"""
 TWO = """
 [model]
 kind = "python"
@@ -386,6 +432,29 @@ def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch, looked_a
         assert float(found["log_bayes_factor"][k, other]) == pytest.approx(factors.mean(), abs=error)
     told = 0.25 * float(found["log_bayes_factor"][0, 1]) + 0.75 * float(found["log_bayes_factor"][1, 0])
     assert float(found["worth"][-1]) == pytest.approx(told, rel=1e-9)
+
+
+def test_models_are_told_apart_less_where_something_is_uncertain(tmp_path, monkeypatch):
+    """Its errors are among what each model predicts; candidates without such a number have none."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "curves", raising=False)
+    (tmp_path / "curves.py").write_text(CURVES + SLOPES)
+    outputs = ", ".join(f'{{ name = "y{i}" }}' for i in range(10))
+    text = TWO.format(outputs=outputs).replace('curves.straight"', 'curves.straight", jacobian = "curves.by_a"')
+    text = text.replace('curves.bent"', 'curves.bent", jacobian = "curves.by_both"')
+    text = text.replace('parameters.b = { kind = "normal", mean = 0.3, std = 0.1 }\n', "").replace("b = 0.1", "b = 0.3")
+    (tmp_path / "two.toml").write_text(text + "[uncertain]\nb = 0.1\n")
+    study = load(tmp_path / "two.toml")
+    assert parse(document(study)) == study
+    found = study.run()
+    X = np.linspace(0.2, 2, 10)[found["chosen"].to_numpy()]
+    roots = [0.5 * X[:, None], np.column_stack([0.5 * X, 0.1 * X**2])]
+    means, covariances = (X, X + 0.3 * X**2), [root @ root.T + 0.0025 * np.eye(3) for root in roots]
+    for k, other in ((0, 1), (1, 0)):
+        inverse, gap = np.linalg.inv(covariances[other]), means[k] - means[other]
+        logs = [np.linalg.slogdet(covariances[i])[1] for i in (other, k)]
+        told = (np.trace(inverse @ covariances[k]) - 3 + gap @ inverse @ gap + logs[0] - logs[1]) / 2
+        assert float(found["log_bayes_factor"][k, other]) == pytest.approx(told, rel=0.02)  # moments of 256 draws
 
 
 @pytest.mark.fem
@@ -499,6 +568,48 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
     left = root @ np.linalg.inv(after(chosen)) @ root.T
     share = 1 - (mass * np.diag(left)).sum() / (mass * np.diag(root @ root.T)).sum()
     assert float(found["field_variance_told"][-1]) == pytest.approx(share, rel=5e-3)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("criterion", ["information", "predictions"])
+def test_of_fields_what_is_uncertain_is_told_as_dense_matrices_say(tmp_path, criterion):
+    """Loads and points that err, which few points of one face cannot tell from a stiffness."""
+    goals = '\ngoals = ["pull.top"]' if criterion == "predictions" else ""
+    stated = '[uncertain]\n"loads.traction.size" = { relative = 0.2 }\n"data.scale" = 0.1\n"data.shift.z" = 0.05\n'
+    (tmp_path / "field.toml").write_text(FIELD + f'number = 3\ndraws = 1\ncriterion = "{criterion}"{goals}\n' + stated)
+    study = load(tmp_path / "field.toml")
+    found = study.run()
+    slopes, _, _, sigma = dense(study, found)
+    spec, which, goal = study.spec, found["value_candidate"].to_numpy(), found["value"].values == "pull.top"
+    sizes = [f"cases.{name}.loads.traction.size" for name in ("shear", "pull")]
+    model = spec.build(MPI.COMM_SELF, (*spec.coefficients, *sizes))
+    solution = model.solve(np.append(np.zeros(len(spec.coefficients)), [100.0, 100.0]))
+    outputs, N = np.asarray(solution.outputs), len(spec.coefficients)
+    by_load = 20 * solution.tangent(np.eye(2, N + 2, N)).sum(axis=0)
+    step, places = 1e-5, found["value_place"].to_numpy()
+    inside = np.where(places[:, 2] > 0.5, -1.0, 1.0)[:, None] * [0, 0, step]
+    axes, cases = [int(one) for one in model.axes], model.cases.tolist()
+    moved = model.observing(np.nan_to_num(places + inside), axes, cases)
+    there = np.asarray(moved.solve(np.append(np.zeros(N), [100.0, 100.0])).outputs)
+    by_place = 0.05 * np.where(np.isfinite(places[:, 2]), (there - outputs) / np.nan_to_num(inside[:, 2], nan=1.0), 0.0)
+    scale = np.where(np.isfinite(places[:, 2]), 0.1 * outputs, 0.0)
+    errors = np.column_stack([by_load, np.where(goal, 0, scale), np.where(goal, 0, by_place)])
+    whole, n = np.hstack([slopes, errors]), slopes.shape[1]
+
+    def left(chosen, columns):
+        rows = whole[np.isin(which, chosen)][:, columns] / sigma[np.isin(which, chosen), None]
+        return np.eye(rows.shape[1]) + rows.T @ rows
+
+    def worth(chosen):
+        if criterion == "information":
+            logs = [np.linalg.slogdet(left(chosen, some))[1] for some in (slice(None), slice(n, None))]
+            return (logs[0] - logs[1]) / 2
+        row = whole[goal][0]
+        return 1 - row @ np.linalg.inv(left(chosen, slice(None))) @ row / (row @ row)
+
+    chosen = found["chosen"].to_numpy()
+    for k in range(3):
+        assert float(found["worth"][k]) == pytest.approx(worth(chosen[: k + 1]), rel=5e-3)
 
 
 @pytest.mark.fem

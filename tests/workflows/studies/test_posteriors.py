@@ -483,6 +483,46 @@ def test_draws_of_an_inversion_keep_their_dependence(tmp_path, monkeypatch):
         assert said in mistake(tmp_path / "other.toml")
 
 
+def test_draws_know_how_what_was_uncertain_errs_with_them(tmp_path, monkeypatch):
+    """By name: else they are of the parameters alone, which is said. A linear chain, as if all were unknown."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    (tmp_path / "drawn_model.py").write_text(
+        "def value(p):\n    return [p[0] + 2 * p[1] + p[2], p[0] / 2 - p[1] + p[3]]\n"
+        "def slopes(p):\n    return [[1.0, 2.0, 1.0, 0.0], [0.5, -1.0, 0.0, 1.0]]\n"
+        "def other(p):\n    return [p[0] + p[1] + p[2] + p[3]]\n"
+    )
+    more = INVERT.replace("b = -1.0 }", "b = -1.0, s = 1.0, t = 2.0 }")
+    stated = '[uncertain]\ns = { std = 0.5, group = "both" }\nt = { relative = 0.1, group = "both" }\n'
+    (tmp_path / "invert.toml").write_text(more + stated)
+    assert run(load(tmp_path / "invert.toml"), "invert", tmp_path / "posterior", quiet=True, report=False) in (0, 3)
+    predict = more.replace(".value", ".other").replace('jacobian = "drawn_model.slopes"', "").split("[parameters]")[0]
+    predict = predict.replace('outputs = [{ name = "u", unit = "m" }, "v"]', 'outputs = ["w"]')
+    method = '[method]\nkind = "quasi-monte-carlo"\ncontrol = "none"\nsamples = 512\n'
+    block = '[parameters]\nfrom = { file = "posterior", names = { a = "a", b = "b", s = "uncertain.s" } }\n'
+    (tmp_path / "predict.toml").write_text(predict + block + method)
+    study = load(tmp_path / "predict.toml")
+    assert study.draws.names == ("a", "b", "s")
+    assert study.draws.effective <= 800
+    found = study.run()
+    rows, prior = np.array([[1, 2, 0.5], [0.5, -1, 0.2]]), np.diag([0.25, 4.0, 1.0])
+    gain = prior @ rows.T @ np.linalg.inv(rows @ prior @ rows.T + 0.09 * np.eye(2))
+    covariance, goal = prior - gain @ rows @ prior, np.array([1, 1, 0.5])
+    mean = np.array([1, -1, 0]) + gain @ (np.array([0.4, 0.3]) - rows @ [1, -1, 0] - [1, 2])
+    std = np.sqrt(goal @ covariance @ goal)
+    assert abs(float(found["std"][0]) - std) < 4 * float(found["std_error"][0]) < 0.4 * std
+    assert abs(float(found["mean"][0]) - (goal @ mean + 3)) < 4 * float(found["mean_error"][0])
+    plain = load_with(tmp_path, predict + '[parameters]\nfrom = "posterior"\n' + method)
+    assert plain.draws.names == ("a", "b")
+    (said,) = (one for one in plain.findings if one.code == "uncertain-in-source")
+    assert "what was uncertain beside them, s, t, is as stated here" in said.text
+
+
+def load_with(folder, text):
+    (folder / "changed.toml").write_text(text)
+    return load(folder / "changed.toml")
+
+
 # --- populations ------------------------------------------------------------------------------------------------------
 
 

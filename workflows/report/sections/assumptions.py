@@ -67,6 +67,11 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
     yield from _folded(("if …", *(title for title, _ in columns)), rows)
     if not known.all():
         yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")
+    if "uncertain_mean" in one:
+        yield Text("What is uncertain is counted. The data say of it, in its deviations (0 ± 1: nothing):")
+        parts = (one[f"uncertain{part}"].values.tolist() for part in ("", "_mean", "_std"))
+        each = zip(*parts, strict=True)
+        yield Table(("uncertain", "larger by"), [(str(n), f"{number(z, 2)} ± {number(std, 2)}") for n, z, std in each])
 
 
 @section("question_probability", heading="Questions to the shape")
