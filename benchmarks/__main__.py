@@ -56,6 +56,7 @@ NAMES = (
     "meshes",
     "pgd",
     "multifidelity",
+    "linear",
     "controls",
     "gains",
     "blocks",

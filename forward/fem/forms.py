@@ -51,6 +51,8 @@ class Forms:
         Measure of the undeformed body.
     u, test, F, J
         Displacement, virtual displacement, deformation gradient and its determinant.
+    spatial
+        F and J of the body that loads act on and Cauchy stresses are of: where strains are small, the undeformed one.
     stored_energy, dilation
         Densities of the stored energy and of the change of volume.
     unknown
@@ -103,6 +105,9 @@ class Forms:
         )
         self.F = self._invariants.F
         self.J = ufl.det(self.F)
+        self._finite = spec.strains == "finite"
+        undeformed = spaces.constant(self.mesh, np.eye(3))
+        self.spatial = (self.F, self.J) if self._finite else (undeformed, ufl.det(undeformed))
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         # Where there is friction: the state at the end of the increment before, and what has moved since.
@@ -188,20 +193,38 @@ class Forms:
         """
         dilation, p = self._invariants.deformation.dilation, self._pressure
         energy, j = self.energy, self._invariants.measures.get("j", dilation)
+        stored = energy if self._finite else ufl.inner(self.stress_of(energy), ufl.grad(self.u)) / 2
         if p is None:
-            return energy, energy, dilation
+            return stored, energy, self._to_first_order(dilation)
         bulk, g = self._invariants.volume(self.stiffness_factor, self._material)
         of_pressure = p**2 / (2 * bulk)
-        return energy + of_pressure, energy + p * g - of_pressure, p / bulk if g is j else p / bulk + (j - g)
+        less = p / bulk if g is j or not self._finite else p / bulk + (j - g)
+        return stored + of_pressure, energy + p * g - of_pressure, less
+
+    def _to_first_order(self, expression: Any) -> Any:
+        """An expression of the state, to first order about rest where strains are small."""
+        if self._finite:
+            return expression
+        expand, zero = ufl.algorithms.expand_derivatives, ufl.zero(self.unknown.ufl_shape)
+        slope = expand(self._invariants.inserted(self._invariants.derivative_of(expression, self.unknown, self._along)))
+        at_rest = ufl.replace(expand(self._invariants.inserted(expression)), {self.unknown: zero})
+        return at_rest + ufl.replace(slope, {self.unknown: zero, self._along: self.unknown})
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
-        return self._invariants.stress(density)
+        return self._to_first_order(self._invariants.stress(density))
+
+    def cauchy_of(self, density: Any) -> Any:
+        """σ = P Fᵀ/J (Pa) of such a density."""
+        F, J = self.spatial
+        return self.stress_of(density) * F.T / J
 
     def _variation_of(self, density: Any) -> Any:
         """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
         work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
-        return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
+        if self._pressure is None:
+            return work
+        return work + self._to_first_order(ufl.diff(density, self._pressure)) * self._test_pressure
 
     def derivative(self, form: Any, direction: Any | None = None) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
@@ -311,8 +334,8 @@ class Forms:
         return Place(
             u=self.u,
             v=self.test,
-            F=self.F,
-            J=self.J,
+            F=self.spatial[0],
+            J=self.spatial[1],
             X=ufl.SpatialCoordinate(self.mesh),
             normal=ufl.FacetNormal(self.mesh),
             dx=self.dx,
@@ -399,7 +422,7 @@ class Forms:
     @cached_property
     def gradients(self) -> assembly.NodalAverages:
         """Deformation gradients (3, 3, n_owned) at the nodes, at the current state."""
-        return assembly.NodalAverages(self.F, (3, 3), self.space, self.comm, often=True)
+        return assembly.NodalAverages(self.spatial[0], (3, 3), self.space, self.comm, often=True)
 
     @cached_property
     def stresses_at_nodes(self) -> assembly.NodalAverages:
@@ -407,7 +430,7 @@ class Forms:
 
         σ = P Fᵀ/J and E = (FᵀF − I)/2, components xx, yy, zz, xy, yz, xz.
         """
-        cauchy = self._invariants.inserted(self.stress_of(self._potential)) * self.F.T / self.J
+        cauchy = self._invariants.inserted(self.cauchy_of(self._potential))
         strain = (self.F.T * self.F - ufl.Identity(3)) / 2
         both = ufl.as_vector([tensor[i, j] for tensor in (cauchy, strain) for i, j in SYMMETRIC])
         return assembly.NodalAverages(both, (2, 6), self.space, self.comm)
