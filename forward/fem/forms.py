@@ -14,7 +14,7 @@ from forward.bodies.inclusions import stiffness_factor
 from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
-from forward.fem.vertex_fields import VertexField
+from forward.fem.vertex_fields import PressuresAtVertices, VertexField
 from forward.loaded import LoadedBody
 from forward.materials.material import energy_of, isochoric
 from forward.model import FloatArray
@@ -52,7 +52,7 @@ class Forms:
     u, test, F, J
         Displacement, virtual displacement, deformation gradient and its determinant.
     spatial
-        F and J of the body that loads act on and Cauchy stresses are of: where strains are small, the undeformed one.
+        As of `Invariants`.
     stored_energy, dilation
         Densities of the stored energy and of the change of volume.
     unknown
@@ -100,14 +100,12 @@ class Forms:
         self.u, self.p = self.unknowns.split(self.unknown)
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
+        small = (self.unknown, self._along) if spec.strains == "small" else None
         self._invariants = Invariants(
-            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres
+            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres, small
         )
-        self.F = self._invariants.F
+        self.F, self.spatial = self._invariants.F, self._invariants.spatial
         self.J = ufl.det(self.F)
-        self._finite = spec.strains == "finite"
-        undeformed = spaces.constant(self.mesh, np.eye(3))
-        self.spatial = (self.F, self.J) if self._finite else (undeformed, ufl.det(undeformed))
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         # Where there is friction: the state at the end of the increment before, and what has moved since.
@@ -192,27 +190,18 @@ class Forms:
         latter keeps its digits however small it is.
         """
         dilation, p = self._invariants.deformation.dilation, self._pressure
+        stored, first = self._invariants.stored, self._invariants.to_first_order
         energy, j = self.energy, self._invariants.measures.get("j", dilation)
-        stored = energy if self._finite else ufl.inner(self.stress_of(energy), ufl.grad(self.u)) / 2
         if p is None:
-            return stored, energy, self._to_first_order(dilation)
+            return stored(energy), energy, first(dilation)
         bulk, g = self._invariants.volume(self.stiffness_factor, self._material)
         of_pressure = p**2 / (2 * bulk)
-        less = p / bulk if g is j or not self._finite else p / bulk + (j - g)
-        return stored + of_pressure, energy + p * g - of_pressure, less
-
-    def _to_first_order(self, expression: Any) -> Any:
-        """An expression of the state, to first order about rest where strains are small."""
-        if self._finite:
-            return expression
-        expand, zero = ufl.algorithms.expand_derivatives, ufl.zero(self.unknown.ufl_shape)
-        slope = expand(self._invariants.inserted(self._invariants.derivative_of(expression, self.unknown, self._along)))
-        at_rest = ufl.replace(expand(self._invariants.inserted(expression)), {self.unknown: zero})
-        return at_rest + ufl.replace(slope, {self.unknown: zero, self._along: self.unknown})
+        less = p / bulk if g is j else p / bulk + first(j - g)
+        return stored(energy) + of_pressure, energy + p * g - of_pressure, less
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
-        return self._to_first_order(self._invariants.stress(density))
+        return self._invariants.stress(density)
 
     def cauchy_of(self, density: Any) -> Any:
         """σ = P Fᵀ/J (Pa) of such a density."""
@@ -222,9 +211,8 @@ class Forms:
     def _variation_of(self, density: Any) -> Any:
         """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
         work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
-        if self._pressure is None:
-            return work
-        return work + self._to_first_order(ufl.diff(density, self._pressure)) * self._test_pressure
+        first = self._invariants.to_first_order
+        return work if self._pressure is None else work + first(ufl.diff(density, self._pressure)) * self._test_pressure
 
     def derivative(self, form: Any, direction: Any | None = None) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
@@ -368,7 +356,8 @@ class Forms:
     def pressures_at_vertices(self, label: str) -> PressuresAtVertices:
         """Pressures under a tool, averaged by hat functions."""
         load, at = self.tool(label)
-        return PressuresAtVertices(self, tools.pressure(OPS, *load.touch(at, at.X + at.u)), load.measure(at))
+        pressure = tools.pressure(OPS, *load.touch(at, at.X + at.u))
+        return PressuresAtVertices(self.mesh, self.by_vertices, pressure, load.measure(at))
 
     def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
         at = self.place(numbers)
@@ -434,29 +423,6 @@ class Forms:
         strain = (self.F.T * self.F - ufl.Identity(3)) / 2
         both = ufl.as_vector([tensor[i, j] for tensor in (cauchy, strain) for i, j in SYMMETRIC])
         return assembly.NodalAverages(both, (2, 6), self.space, self.comm)
-
-
-class PressuresAtVertices:
-    """Contact pressures (n_vertices,) (Pa) at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
-
-    Attributes
-    ----------
-    density, measure
-        Pressure and its boundary, in UFL.
-    areas
-        ∫φ_i dS (n_vertices,) (m²); 0 away from the boundary.
-    """
-
-    def __init__(self, forms: Forms, density: Any, measure: Any) -> None:
-        self.density, self.measure = density, measure
-        hat = ufl.TestFunction(spaces.scalar_space(forms.mesh, 1))
-        self._forces = forms.by_vertices(density * hat * measure)
-        self.areas = forms.by_vertices(hat * measure)()
-
-    def __call__(self) -> FloatArray:
-        """Return them at the state that is set."""
-        on_it = self.areas > 0
-        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=on_it)
 
 
 def _linear(work: Any, numbers: Collection[Any]) -> bool:

@@ -6,8 +6,12 @@ from mpi4py import MPI
 
 from forward.conformance import EXACT, check_derivatives
 from forward.hyperelastic import Hyperelastic
+from forward.material_tests import MaterialTests
 from forward.materials.material import small_strain_moduli
-from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, loaded_body
+from forward.model import ModelError
+from forward.reduced.spec import mistakes
+from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, cantilever, loaded_body
+from workflows.config.study import parse
 
 pytestmark = pytest.mark.fem
 SCALES = (1e-4, 2e-4)
@@ -81,3 +85,28 @@ def test_a_bar_is_stretched_by_its_modulus(formulation):
     found = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0)).outputs
     expected = [0.4 * 1e4 / young, 1e8 / (2 * young) * 0.008, 1e4 / (3 * kappa), 1e4]
     np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
+def test_a_candidate_and_its_errors_against_the_body():
+    model = loaded_body("demiray").model_dump(mode="json", exclude_none=True)
+    priors = {"material.a": {"kind": "log-normal", "mean": 4e4, "std": 1e4}}
+    linear = {"model": {"strains": "small"}, "model_error": {"against": {}}, "parameters": priors}
+    study = parse(
+        {
+            "model": model,
+            "data": {"outputs": {"reaction-x": 100.0}, "sigma": {"reaction-x": 5.0}},
+            "candidates": {"body": {"parameters": priors}, "linear": linear},
+            "method": {"kind": "select", "noise": {}},
+        }
+    )
+    assert [one.strains for one in study.of_candidates.values()] == ["finite", "small"]
+    assert study.truth("linear") == study.of_candidates["body"]
+    assert "another one, whose mesh is taken as it is" in study.unchecked["linear"]
+    assert not study.unchecked["body"]
+
+
+def test_a_reduced_model_stands_for_finite_strains_only():
+    (said,) = [line for line in mistakes(cantilever(strains="small")) if "strains" in line]
+    assert said.endswith("expected strains = 'finite'")
+    with pytest.raises(ModelError, match="a model of kind 'material-tests' has no strains"):
+        MaterialTests.model_construct().linearised()
