@@ -57,6 +57,7 @@ NAMES = (
     "pgd",
     "multifidelity",
     "linear",
+    "learnt_errors",
     "controls",
     "gains",
     "blocks",

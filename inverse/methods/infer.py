@@ -19,6 +19,7 @@ from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
+from inverse.methods.model_error import Truth, over_posterior, over_prior
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
@@ -72,6 +73,7 @@ def infer(
     seed: int,
     look: Looked | None = None,
     shared: Shared | None = None,
+    truth: Truth | None = None,
     chains: Kind | None = None,
     when: When = "always",
     model: ForwardModel | None = None,
@@ -94,6 +96,8 @@ def infer(
         How the error of the mesh is looked at; None where there is no mesh.
     shared
         What errors the data share, at parameters (d,); None if they are independent.
+    truth
+        What the errors of the model are learnt from; None where they are not, and always with finer meshes.
     say
         Shows the user a line before the search.
     steps
@@ -110,11 +114,15 @@ def infer(
     if posterior.start is None:
         with suppress(SolveError):  # or else every solve begins at zero
             posterior = replace(posterior, start=start(posterior.inputs.mean))
+    if truth is not None:
+        posterior = over_prior(posterior, truth, steps)
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
     if shared is not None:  # which depends on the displacements
         posterior = _sharing(posterior, shared(posterior.physical(gaussian.mode[None])[0, :d]))
         gaussian = laplace(posterior, starts=1, first=gaussian.mode)
+    if truth is not None:
+        posterior, gaussian = over_posterior(posterior, gaussian, truth, steps)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     if look is not None:
         treatment = look.treatment or "report"

@@ -25,6 +25,7 @@ from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
+from inverse.methods.model_error import Truth
 from uq.estimators.estimate import BAND, part
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 
@@ -49,7 +50,7 @@ _NUMBERS = """
     prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products
-    prediction_solves prediction_why
+    prediction_solves prediction_why model_error_solves
 """
 _WORDS = {"why", "mesh_why", "prediction_why"}
 _ARRAYS = {
@@ -63,7 +64,8 @@ _ARRAYS = {
     "assumption": "assumption_stiffness",
     "uncertain parameter": "assumption_bend",
     "iteration column": "step",
-    "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution",
+    "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution model_error "
+    "model_error_std",
     "datum axis": "place datum_direction",
     "node": "stiffness_mode stiffness_mean stiffness_std stiffness_mesh_shift",
     "direction parameter": "direction_parameter",
@@ -107,6 +109,8 @@ class Problem:
         What keeps what is found of few parameters.
     assumed
         What is taken for granted; None if it is not looked at.
+    truth
+        What the errors of the model are learnt from; None where they are not.
     """
 
     data: Measurements
@@ -117,6 +121,7 @@ class Problem:
     say: Callable[[str], None] = field(default=lambda line: None)
     steps: Steps = ALL_AGAIN
     assumed: Assumptions | None = None
+    truth: Truth | None = None
 
     @property
     def noise(self) -> Noise:
@@ -240,6 +245,16 @@ def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
         "mesh_settled": np.array(float(found.settled)),
         "mesh_solves": np.array(float(found.solves + (before is not None))),
         "mesh_before": np.array(np.nan if before is None else before),
+    }
+
+
+def of_learnt(noise: Noise, truth: Truth) -> Record:
+    """Mean and standard deviation of the learnt errors of a model, over those of the data."""
+    assert noise.model is not None
+    return {
+        "model_error": noise.model.error / noise.sigma,
+        "model_error_std": noise.model.std / noise.sigma,
+        "model_error_solves": np.array(2.0 * truth.solves),
     }
 
 

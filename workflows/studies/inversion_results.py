@@ -279,6 +279,9 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found.append(said_of_motion(motions[np.isfinite(motions)]))
     if "expansion_error" in one:
         found += criticism.expansion_off(float(one["expansion_error"]), int(one["expansion_solves"]))
+    if "model_error" in one:
+        mean, std = (one[name].to_numpy()[seen] for name in ("model_error", "model_error_std"))
+        found.append(criticism.learnt(mean, std, int(one["model_error_solves"])))
     if "reduced_share" in one:
         shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
         found += criticism.reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
