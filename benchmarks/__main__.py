@@ -57,6 +57,8 @@ NAMES = (
     "meshes",
     "pgd",
     "multifidelity",
+    "linear",
+    "learnt_errors",
     "controls",
     "gains",
     "blocks",

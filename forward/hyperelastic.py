@@ -47,6 +47,10 @@ class Hyperelastic(LoadedBody):
         Balls that are stiffer or softer: their factors multiply the energy density.
     fields
         Random fields that multiply the stiffness or the density.
+    strains
+        "small": the linear model, with the moduli that the material has at rest. Loads act on the undeformed body,
+        tools on the deformed one; stress, energy and change of volume are those of small strains, other outputs are
+        functions of the displacements as ever. Fibres carry only tension and add nothing. No stability is tested.
     solver
         Path, tolerance and limits of the solver; a word stands for its kind, `solver = "newton"`.
     formulation

@@ -179,7 +179,7 @@ class LoadedBody(Refinable):
     def _of_followers(self) -> Iterator[Finding]:
         """What the stability test cannot see under loads that follow the body."""
         followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
-        if followers and not self.solver.accept_unstable:
+        if followers and self.strains == "finite" and not self.solver.accept_unstable:
             yield Finding("followers", "note", {"loads": ", ".join(followers)})
 
     def refined(self, level: int) -> Self:

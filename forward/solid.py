@@ -85,6 +85,7 @@ class Solid(ModelSpec):
     regions: dict[str, dict[str, float]] = Field(default={})
     inclusions: tuple[Inclusion, ...] = ()
     fields: tuple[RandomField, ...] = ()
+    strains: Literal["finite", "small"] = "finite"
     solver: SolverSettings = SolverSettings()
 
     @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
@@ -187,6 +188,11 @@ class Solid(ModelSpec):
     def over(self, ranges: Ranges) -> Self:
         """Return the same body with the formulation that suits all values of parameters within ranges."""
         return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
+
+    def linearised(self) -> Self:
+        """Return the same body with small strains, whose stiffness is that at rest and never unstable."""
+        solver = self.solver.model_copy(update={"accept_unstable": True})
+        return self.model_copy(update={"strains": "small", "solver": solver})
 
     def locking(self, ranges: Ranges) -> Iterator[Finding]:
         """Find where displacements alone are too stiff for values of parameters within ranges."""

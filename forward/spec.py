@@ -257,6 +257,16 @@ class ModelSpec(Settings):
         """
         raise ModelError(f"a model of kind '{self.kind}' has no meshes")
 
+    def linearised(self) -> Self:
+        """Return the same model with small strains.
+
+        Raises
+        ------
+        ModelError
+            If it has no strains.
+        """
+        raise ModelError(f"a model of kind '{self.kind}' has no strains")
+
     @property
     def solver_tolerance(self) -> float | None:
         """What its solver leaves of the equations, relative to their terms; None where there is no such number."""

@@ -25,7 +25,8 @@ from forward.solid import Solid
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
-SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
+# Blocks that are the same in all cases.
+SHARED = ("body", "material", "regions", "inclusions", "fields", "strains", "solver")
 ACTING = ("loads.", "displacements.")  # paths of numbers of what acts in a load case
 
 
@@ -136,7 +137,7 @@ class Specimen(Solid):
 
     Parameters
     ----------
-    body, material, regions, inclusions, fields, solver, formulation
+    body, material, regions, inclusions, fields, strains, solver, formulation
         As in `Hyperelastic`; the same in all cases.
     cases
         Load cases.

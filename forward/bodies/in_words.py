@@ -23,7 +23,8 @@ def in_words(model: LoadedBody, said: Callable[[str], str], where: str) -> Itera
     numbers = [f"{name} = {said(f'material.{name}')}" for name in constants(model.energy)]
     fibres = [f"fibres along {' and '.join(map(listed, model.fibres))}"] if model.fibres else []
     law = str(energy_of(model.energy).__doc__).partition("\n")[0]
-    yield "material", [law, ", ".join(numbers), *fibres]
+    small = ["small strains: its moduli at rest"] if model.strains == "small" else []
+    yield "material", [law, ", ".join(numbers), *fibres, *small]
     if model.regions:
         yield "regions", [_region(region, changed, said) for region, changed in model.regions.items()]
     if model.inclusions:

@@ -63,7 +63,7 @@ class DiscreteBody(Generic[S]):
             if path not in scalars and path not in coefficients:
                 known = [*scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
                 raise ValueError(f"'{path}' is not a number of the model, expected one of: {', '.join(known)}")
-        self.spec = spec
+        self.spec = spec = spec.linearised() if spec.strains == "small" else spec
         self.parameters = parameters
         self.outputs = tuple(output.name for output in spec.outputs)
         self.equations = Discretisation(spec, comm, parameters)

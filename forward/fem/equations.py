@@ -47,7 +47,7 @@ class Discretisation(Sensitivities):
 
     def __init__(self, spec: LoadedBody, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
-        self._jacobians = self.at_points(self.J, often=True)
+        self._jacobians = self.at_points(self.spatial[1], often=True)
         self._external = 0.0
         self._full_targets = np.zeros(len(self.fixed))
         self._sizes: dict[tuple[float, ...], float] = {}

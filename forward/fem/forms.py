@@ -14,7 +14,7 @@ from forward.bodies.inclusions import stiffness_factor
 from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
-from forward.fem.vertex_fields import VertexField
+from forward.fem.vertex_fields import PressuresAtVertices, VertexField
 from forward.loaded import LoadedBody
 from forward.materials.material import energy_of, isochoric
 from forward.model import FloatArray
@@ -51,6 +51,8 @@ class Forms:
         Measure of the undeformed body.
     u, test, F, J
         Displacement, virtual displacement, deformation gradient and its determinant.
+    spatial
+        As of `Invariants`.
     stored_energy, dilation
         Densities of the stored energy and of the change of volume.
     unknown
@@ -98,10 +100,11 @@ class Forms:
         self.u, self.p = self.unknowns.split(self.unknown)
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
+        small = (self.unknown, self._along) if spec.strains == "small" else None
         self._invariants = Invariants(
-            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres
+            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres, small
         )
-        self.F = self._invariants.F
+        self.F, self.spatial = self._invariants.F, self._invariants.spatial
         self.J = ufl.det(self.F)
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
@@ -187,21 +190,29 @@ class Forms:
         latter keeps its digits however small it is.
         """
         dilation, p = self._invariants.deformation.dilation, self._pressure
+        stored, first = self._invariants.stored, self._invariants.to_first_order
         energy, j = self.energy, self._invariants.measures.get("j", dilation)
         if p is None:
-            return energy, energy, dilation
+            return stored(energy), energy, first(dilation)
         bulk, g = self._invariants.volume(self.stiffness_factor, self._material)
         of_pressure = p**2 / (2 * bulk)
-        return energy + of_pressure, energy + p * g - of_pressure, p / bulk if g is j else p / bulk + (j - g)
+        less = p / bulk if g is j else p / bulk + first(j - g)
+        return stored(energy) + of_pressure, energy + p * g - of_pressure, less
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
         return self._invariants.stress(density)
 
+    def cauchy_of(self, density: Any) -> Any:
+        """σ = P Fᵀ/J (Pa) of such a density."""
+        F, J = self.spatial
+        return self.stress_of(density) * F.T / J
+
     def _variation_of(self, density: Any) -> Any:
         """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
         work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
-        return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
+        first = self._invariants.to_first_order
+        return work if self._pressure is None else work + first(ufl.diff(density, self._pressure)) * self._test_pressure
 
     def derivative(self, form: Any, direction: Any | None = None) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
@@ -311,8 +322,8 @@ class Forms:
         return Place(
             u=self.u,
             v=self.test,
-            F=self.F,
-            J=self.J,
+            F=self.spatial[0],
+            J=self.spatial[1],
             X=ufl.SpatialCoordinate(self.mesh),
             normal=ufl.FacetNormal(self.mesh),
             dx=self.dx,
@@ -345,7 +356,8 @@ class Forms:
     def pressures_at_vertices(self, label: str) -> PressuresAtVertices:
         """Pressures under a tool, averaged by hat functions."""
         load, at = self.tool(label)
-        return PressuresAtVertices(self, tools.pressure(OPS, *load.touch(at, at.X + at.u)), load.measure(at))
+        pressure = tools.pressure(OPS, *load.touch(at, at.X + at.u))
+        return PressuresAtVertices(self.mesh, self.by_vertices, pressure, load.measure(at))
 
     def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
         at = self.place(numbers)
@@ -399,7 +411,7 @@ class Forms:
     @cached_property
     def gradients(self) -> assembly.NodalAverages:
         """Deformation gradients (3, 3, n_owned) at the nodes, at the current state."""
-        return assembly.NodalAverages(self.F, (3, 3), self.space, self.comm, often=True)
+        return assembly.NodalAverages(self.spatial[0], (3, 3), self.space, self.comm, often=True)
 
     @cached_property
     def stresses_at_nodes(self) -> assembly.NodalAverages:
@@ -407,33 +419,10 @@ class Forms:
 
         σ = P Fᵀ/J and E = (FᵀF − I)/2, components xx, yy, zz, xy, yz, xz.
         """
-        cauchy = self._invariants.inserted(self.stress_of(self._potential)) * self.F.T / self.J
+        cauchy = self._invariants.inserted(self.cauchy_of(self._potential))
         strain = (self.F.T * self.F - ufl.Identity(3)) / 2
         both = ufl.as_vector([tensor[i, j] for tensor in (cauchy, strain) for i, j in SYMMETRIC])
         return assembly.NodalAverages(both, (2, 6), self.space, self.comm)
-
-
-class PressuresAtVertices:
-    """Contact pressures (n_vertices,) (Pa) at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
-
-    Attributes
-    ----------
-    density, measure
-        Pressure and its boundary, in UFL.
-    areas
-        ∫φ_i dS (n_vertices,) (m²); 0 away from the boundary.
-    """
-
-    def __init__(self, forms: Forms, density: Any, measure: Any) -> None:
-        self.density, self.measure = density, measure
-        hat = ufl.TestFunction(spaces.scalar_space(forms.mesh, 1))
-        self._forces = forms.by_vertices(density * hat * measure)
-        self.areas = forms.by_vertices(hat * measure)()
-
-    def __call__(self) -> FloatArray:
-        """Return them at the state that is set."""
-        on_it = self.areas > 0
-        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=on_it)
 
 
 def _linear(work: Any, numbers: Collection[Any]) -> bool:

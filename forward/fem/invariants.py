@@ -58,11 +58,15 @@ class Invariants:
         Displacements of the direction of derivatives.
     fibres
         Unit vectors along the families of fibres, in UFL.
+    small
+        Where strains are small, the state and a direction of it.
 
     Attributes
     ----------
     F
         Deformation gradient.
+    spatial
+        F and J of the body that loads act on and Cauchy stresses are of: where strains are small, the undeformed one.
     deformation
         Parts of the deformation.
     measures
@@ -70,10 +74,18 @@ class Invariants:
     """
 
     def __init__(
-        self, energy: str, mesh: Any, u: Any, displacement_of: Callable[[Any], Any], fibres: Sequence[Any] = ()
+        self,
+        energy: str,
+        mesh: Any,
+        u: Any,
+        displacement_of: Callable[[Any], Any],
+        fibres: Sequence[Any] = (),
+        small: tuple[Any, Any] | None = None,
     ) -> None:
         gradient, identity = ufl.grad(u), ufl.Identity(3)
-        self.F = identity + gradient
+        self.F, self._small = identity + gradient, small
+        there = self.F if small is None else spaces.constant(mesh, np.eye(3))
+        self.spatial = there, ufl.det(there)
         self.deformation = at = kinematics.deformation(OPS, gradient, identity)
         self._energy, self._undeformed = energy, spaces.constant(mesh, 0.0)
         self._displacement_of = displacement_of
@@ -102,7 +114,20 @@ class Invariants:
         of_fibres = [ufl.diff(density, longer) for longer in self._variables.get("i4", ())]
         fibres = list(zip(self._fibres, of_fibres, strict=True)) if of_fibres else []
         P = kinematics.nominal_stress(OPS, self.F, self.deformation, slopes, fibres)
-        return sum((slopes[name] * self._shape.slopes[name] for name in self._symbols), P)
+        return self.to_first_order(sum((slopes[name] * self._shape.slopes[name] for name in self._symbols), P))
+
+    def stored(self, density: Any) -> Any:
+        """Return a density of the measures, to second order about rest where strains are small: P : ∇u/2."""
+        return density if self._small is None else ufl.inner(self.stress(density), self.F - ufl.Identity(3)) / 2
+
+    def to_first_order(self, expression: Any) -> Any:
+        """Return an expression of the state, to first order about rest where strains are small."""
+        if self._small is None:
+            return expression
+        (state, along), expand = self._small, ufl.algorithms.expand_derivatives
+        zero = {state: ufl.zero(state.ufl_shape)}
+        slope = expand(self.inserted(self.derivative_of(expression, state, along)))
+        return ufl.replace(expand(self.inserted(expression)), zero) + ufl.replace(slope, zero | {along: state})
 
     def volume(self, factor: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
         """Return the bulk modulus κ (Pa) and g(J) of the volumetric part U = κ/2 g², used in the mixed form.

@@ -1,7 +1,11 @@
-"""Random fields on the mesh of a rank group: functions in forms that depend on the parameters, and their transpose."""
+"""Fields at the vertices of the mesh of a rank group: random ones, as functions in forms, and pressures of contact.
+
+Random fields depend on the parameters, and have the transpose of that map.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -126,3 +130,28 @@ class VertexField:
 def _give(function: Any, values: FloatArray) -> None:
     function.x.array[: len(values)] = values
     function.x.scatter_forward()
+
+
+class PressuresAtVertices:
+    """Contact pressures (n_vertices,) (Pa) at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
+
+    Attributes
+    ----------
+    density, measure
+        Pressure and its boundary, in UFL.
+    areas
+        ∫φ_i dS (n_vertices,) (m²); 0 away from the boundary.
+    """
+
+    def __init__(
+        self, mesh: Any, by_vertices: Callable[[Any], Callable[[], FloatArray]], density: Any, measure: Any
+    ) -> None:
+        self.density, self.measure = density, measure
+        hat = ufl.TestFunction(spaces.scalar_space(mesh, 1))
+        self._forces = by_vertices(density * hat * measure)
+        self.areas = by_vertices(hat * measure)()
+
+    def __call__(self) -> FloatArray:
+        """Return them at the state that is set."""
+        on_it = self.areas > 0
+        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=on_it)

@@ -144,7 +144,7 @@ class _MaxVonMises:
 
         self._equations = equations
         # A pressure has no deviator: in the mixed form the isochoric energy is all that is needed.
-        cauchy = equations.stress_of(equations.energy) * equations.F.T / equations.J
+        cauchy = equations.cauchy_of(equations.energy)
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = equations.spec.body.quadrature
         self._values = equations.at_points(stress)

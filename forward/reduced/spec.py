@@ -316,6 +316,8 @@ def mistakes(spec: LoadedBody) -> Iterator[str]:
             f"a reduced model has no friction, which depends on the way that a tool went, expected friction = 0 of "
             f"{', '.join(rubbing)}"
         )
+    if spec.strains == "small":
+        yield "strains are small, and the energy of a reduced model is that of finite ones, expected strains = 'finite'"
     for load in (load for load in spec.loads if not load.written):
         yield f"the load '{load.label}' is no form and cannot be reduced, expected loads that are written as forms"
     known = {"displacement", "mean-displacement", "max-displacement", "reaction", "strain-energy", "volume-change"}

@@ -88,6 +88,12 @@ def far_from_prior(
     return found
 
 
+def learnt(mean: FloatArray, std: FloatArray, solves: int) -> Finding:
+    """Say what the errors of a model are that were learnt, over those of the data (m,)."""
+    size, spread = (float(np.sqrt((one**2).mean())) for one in (mean, std))
+    return Finding("model-error-learnt", "note", {"size": size, "spread": spread, "solves": solves})
+
+
 def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> list[Finding]:
     """Say where a field is what its prior says: deviations (n,) of posterior and prior at places (n, 3)."""
     left = np.divide(std, prior_std, out=np.ones_like(std), where=prior_std > 0)

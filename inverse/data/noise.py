@@ -32,6 +32,8 @@ from forward.settings import Settings
 from uq.inputs.distributions import Distribution
 
 HALF_LOG = float(np.log(2 * np.pi) / 2)
+FEWEST = 4  # errors of a model that tell the variance of the next one
+ROUNDED = 1e-10  # singular values over the largest that are rounding
 
 
 class NormalErrors(Settings):
@@ -103,6 +105,43 @@ class ModelError:
     root: FloatArray
     apart: FloatArray
     scale: float = 1.0
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations (m,) of what is uncertain of it."""
+        return np.asarray(np.sqrt((self.root**2).sum(axis=0) + self.apart**2))
+
+    @classmethod
+    def of_pairs(cls, errors: FloatArray, sigma: FloatArray, point: FloatArray, scale: float = 1.0) -> ModelError:
+        """Return what N errors (N, m) of a model tell of the next one, of data with errors σ (m,).
+
+        With their mean and covariance S, in p dimensions that is Student's distribution with N − p degrees of freedom
+        and the covariance S (1 + 1/N) (N − 1)/(N − p − 2) (A. Gelman et al., Bayesian Data Analysis (2013), section
+        3.6); here it is the normal one, and p counts the directions in which S is seen beside σ², Σ λ/(1 + λ) of the
+        eigenvalues λ of S over σ². What errors that are left out one by one have beyond the span of the others is
+        independent from datum to datum.
+
+        Raises
+        ------
+        ValueError
+            With fewer than four errors.
+        """
+        N = len(errors)
+        if N < FEWEST:
+            raise ValueError(f"{N} errors of a model, expected at least {FEWEST}")
+        mean = errors.mean(axis=0)
+        root = (errors - mean) / np.sqrt(N - 1)
+        seen = np.linalg.svd(root / sigma, compute_uv=False) ** 2
+        p = min(max((seen / (1 + seen)).sum(), 1.0), N - 3.0)
+        root = root * np.sqrt((1 + 1 / N) * (N - 1) / (N - p - 2))
+        beyond = np.zeros_like(errors)
+        for k, others in enumerate(np.delete(errors / sigma, j, axis=0) for j in range(N)):
+            centre = others.mean(axis=0)
+            basis, sizes = np.linalg.svd((others - centre).T, full_matrices=False)[:2]
+            basis, left = basis[:, sizes > ROUNDED * sizes.max(initial=0.0)], errors[k] / sigma - centre
+            beyond[k] = left - basis @ (basis.T @ left)
+        apart = sigma * np.sqrt((beyond**2).mean(axis=0))
+        return cls(point, mean, np.zeros((len(mean), 0)), root, apart, scale)
 
     def at(self, points: FloatArray) -> FloatArray:
         """Return δ (n, m) at parameters (n, d)."""

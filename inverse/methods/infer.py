@@ -20,6 +20,7 @@ from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.residual_process import Process, with_process
 from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
+from inverse.methods.model_error import Truth, over_posterior, over_prior
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
@@ -80,6 +81,7 @@ def infer(
     look: Looked | None = None,
     shared: Shared | None = None,
     unexplained: Measurements | None = None,
+    truth: Truth | None = None,
     chains: Kind | None = None,
     when: When = "always",
     model: ForwardModel | None = None,
@@ -104,6 +106,8 @@ def infer(
         What errors the data share, at parameters (d,); None if they are independent.
     unexplained
         The data, if what the model does not explain of them is a process among their errors.
+    truth
+        What the errors of the model are learnt from; None where they are not, and always with finer meshes.
     say
         Shows the user a line before the search.
     steps
@@ -120,6 +124,8 @@ def infer(
     if posterior.start is None:
         with suppress(SolveError):  # or else every solve begins at zero
             posterior = replace(posterior, start=start(posterior.inputs.mean))
+    if truth is not None:
+        posterior = over_prior(posterior, truth, steps)
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
     for _ in range(ROUNDS):
@@ -131,6 +137,8 @@ def infer(
         move = gaussian.mode - point
         if move @ gaussian.hessian @ move < SETTLED**2:
             break
+    if truth is not None:
+        posterior, gaussian = over_posterior(posterior, gaussian, truth, steps)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     process = None
     if look is not None:

@@ -27,6 +27,7 @@ from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.residual_process import Process
 from inverse.methods.invert import Invert
+from inverse.methods.model_error import Truth
 from uq.estimators.estimate import BAND, part
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 
@@ -51,7 +52,7 @@ _NUMBERS = """
     prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products
-    prediction_solves prediction_why question_forms process_size process_length
+    prediction_solves prediction_why question_forms process_size process_length model_error_solves
 """
 WORDS = ("why", "mesh_why", "prediction_why", "question_forms")
 _ARRAYS = {
@@ -70,7 +71,8 @@ _ARRAYS = {
     "uncertain uncertain_partner": "uncertain_covariance",
     "point uncertain": "uncertain_point",
     "iteration column": "step",
-    "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution",
+    "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution model_error "
+    "model_error_std",
     "datum axis": "place datum_direction",
     "node": "stiffness_mode stiffness_mean stiffness_std stiffness_mesh_shift",
     "direction parameter": "direction_parameter",
@@ -116,6 +118,8 @@ class Problem:
         What is taken for granted; None if it is not looked at.
     questions
         What the body does not have, to be asked about; None if nothing is asked.
+    truth
+        What the errors of the model are learnt from; None where they are not.
     """
 
     data: Measurements
@@ -127,6 +131,7 @@ class Problem:
     steps: Steps = ALL_AGAIN
     assumed: Assumptions | None = None
     questions: Questions | None = None
+    truth: Truth | None = None
 
     @property
     def noise(self) -> Noise:
@@ -255,6 +260,16 @@ def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
         "mesh_settled": np.array(float(found.settled)),
         "mesh_solves": np.array(float(found.solves + (before is not None))),
         "mesh_before": np.array(np.nan if before is None else before),
+    }
+
+
+def of_learnt(noise: Noise, truth: Truth) -> Record:
+    """Mean and standard deviation of the learnt errors of a model, over those of the data."""
+    assert noise.model is not None
+    return {
+        "model_error": noise.model.error / noise.sigma,
+        "model_error_std": noise.model.std / noise.sigma,
+        "model_error_solves": np.array(2.0 * truth.solves),
     }
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -32,6 +32,7 @@ from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
 from inverse.methods.mesh_correction import MeshTreatment
+from inverse.methods.model_error import Truth
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
@@ -170,6 +171,7 @@ class Select(MeshTreatment, Settings):
         model: Callable[[str, str], ForwardModel] | None = None,
         steps: Callable[[str, str], Steps] = lambda name, group: ALL_AGAIN,
         assumed: Callable[[str, str], Assumptions] | None = None,
+        truth: Callable[[str, str], Truth | None] = lambda name, group: None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -195,6 +197,8 @@ class Select(MeshTreatment, Settings):
             What keeps what is found of a candidate for a group; by default an interrupted comparison begins again.
         assumed
             What a candidate and a group take for granted; by default it is not looked at.
+        truth
+            What the errors of a candidate are learnt from; by default they are not.
 
         Returns
         -------
@@ -209,6 +213,7 @@ class Select(MeshTreatment, Settings):
         pairs = [(name, group) for name in candidates for group in data_groups]
         found: dict[tuple[str, str], Inferred] = {}
         starts: dict[tuple[str, str], Starts] = {}
+        truths = {pair: truth(*pair) for pair in pairs}
         for name, group in pairs:
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
             starts[name, group] = by_tangents(one.inputs, one.evaluate)
@@ -222,6 +227,7 @@ class Select(MeshTreatment, Settings):
                     seed=self.seed,
                     look=None if finer is None else Looked(finer(name, group), data, self.treatment),
                     shared=None if shared is None else shared.get((name, group)),
+                    truth=truths[name, group],
                     chains=self.chains,
                     when=self.chains_when,
                     model=None if model is None else model(name, group),
@@ -290,6 +296,7 @@ class Select(MeshTreatment, Settings):
             for (name, group), one in found.items()
         }
         result = comparison(candidates, data_groups, compared, variants, checks, left_out)
+        result = result.assign(_learnt(posteriors, truths, data_groups))
         if any(one.noise.shared is None for one in posteriors.values()):
             return result
         seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
@@ -301,6 +308,31 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
     seen = data.seen()
     which = np.arange(len(seen))  # what is only predicted follows
     return Posterior(candidate.inputs, evaluate, seen.values, noise.of(seen), which)
+
+
+def _learnt(
+    posteriors: Mapping[tuple[str, str], Posterior],
+    truths: Mapping[tuple[str, str], Truth | None],
+    data_groups: Mapping[str, Measurements],
+) -> dict[str, Any]:
+    """Mean and standard deviation of learnt errors, over those of the data; NaN of others, empty without any."""
+    if not any(truths.values()):
+        return {}
+    names = list(dict.fromkeys(name for name, _ in posteriors))
+    sizes, solves = [len(data) for data in data_groups.values()], np.zeros(len(names))
+    found = [np.full((2, len(names), size), np.nan) for size in sizes]
+    for k, name in enumerate(names):
+        for rows, group in zip(found, data_groups, strict=True):
+            noise, truth = posteriors[name, group].noise, truths[name, group]
+            if truth is not None and noise.model is not None:
+                rows[:, k, : len(noise.sigma)] = [noise.model.error / noise.sigma, noise.model.std / noise.sigma]
+                solves[k] += 2 * truth.solves
+    both, dims = np.concatenate(found, axis=2), ("model", "output")
+    return {
+        "model_error": (dims, both[0]),
+        "model_error_std": (dims, both[1]),
+        "model_error_solves": ("model", solves),
+    }
 
 
 def _taken(posterior: Posterior, gaussian: Laplace, assumed: Assumptions) -> tuple[Assumptions, Moves]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from forward.scalars import Mistake
 
 UNBALANCED = 1e-4  # part of the forces that a reduced model may leave: it errs by far more, and need only follow
+ROUGH = 1e-2  # part of the forces that a linear model may leave, for the same reason
+OF_LINEAR = 0.3  # cost of such a solve over that of the body (`python -m benchmarks linear`)
 CORRECTIONS = 8  # of a solve from the tangent to the tolerance, by which few of them are cheaper
 
 
@@ -146,6 +148,31 @@ class FewIterations(CheapModel):
             yield ("kind",), f"a model of kind '{spec.kind}' has no iterations of a solver", self.kind
 
 
+class Linear(CheapModel):
+    """The same body with small strains: its corrections go to a rough tolerance, with one factor for all samples."""
+
+    kind: Literal["linear"] = "linear"
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        return self.name or self.kind
+
+    def of(self, spec: ModelSpec) -> ModelSpec:
+        """Return the linear model.
+
+        Raises
+        ------
+        ModelError
+            If it is no body.
+        """
+        return spec.linearised().solved_to(ROUGH)
+
+    def predicted(self, unknowns: int, own: int) -> float:
+        """Return the measured share of the cost of a solve."""
+        return self.cost or OF_LINEAR
+
+
 class ReducedModel(CheapModel):
     """A reduced model of the body, without tests of stability and in lockstep.
 
@@ -208,6 +235,7 @@ CHEAP = Kinds(
     {
         "mesh": "uq.methods.low_fidelity:Coarser",
         "iterations": "uq.methods.low_fidelity:FewIterations",
+        "linear": "uq.methods.low_fidelity:Linear",
         "reduced": "uq.methods.low_fidelity:ReducedModel",
         "model": "uq.methods.low_fidelity:OtherModel",
     },

@@ -254,6 +254,17 @@ def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Da
     return dataset.assign(trusted=dataset["trusted"] & ~dataset["model"].isin(list(wrong)))
 
 
+def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
+    """Say what the errors of candidates are that were learnt."""
+    from inverse.criticism.doubts import learnt as learnt_errors
+
+    for name in dataset["model"].values if "model_error" in dataset else ():
+        one = dataset.sel(model=name)
+        mean, std = (one[of].dropna("output").to_numpy() for of in ("model_error", "model_error_std"))
+        if mean.size:
+            yield learnt_errors(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
+
+
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
     from inverse.criticism.doubts import certain, decides

@@ -186,7 +186,7 @@ class TakenForGranted:
     def loadings(self) -> FloatArray:
         """How much larger (k, g) each number is if what is uncertain is larger by its deviation."""
         weights = np.array(list(self.groups.values())).reshape(len(self.groups), len(self.all))
-        return np.asarray(weights[:, : len(self.numbers)].T * np.array([[one.size] for one in self.numbers]))
+        return np.asarray(weights[:, : len(self.numbers)].T * np.array([one.size for one in self.numbers])[:, None])
 
     def by_deviations(self, comm: Any) -> ForwardModel:
         """Make the model with what is uncertain among its parameters, each in its standard deviations; collective."""

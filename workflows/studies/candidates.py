@@ -21,7 +21,7 @@ from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_o
 if TYPE_CHECKING:
     from forward.findings import Finding
 
-_SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
+SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
 
 
 class CandidateModel(Settings):
@@ -90,7 +90,7 @@ class OfCandidates(Settings):
 
     def whole(self, name: str) -> ModelSpec:
         """Return the model of a candidate; a ValidationError for mistakes in its block."""
-        return _SPEC.validate_python(changed(self.model, self.candidates[name].changes))
+        return SPEC.validate_python(changed(self.model, self.candidates[name].changes))
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:

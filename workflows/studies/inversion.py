@@ -21,6 +21,7 @@ from workflows.config.priors import findings_of_materials, mistakes_of_factor, r
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
+from workflows.studies.model_errors import mistakes_of_truth
 from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import Sampled, StudyKind
 
@@ -54,6 +55,9 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
     uncertain
         Standard deviations of what is taken for granted, by its name, as the table of it in a report has it: of numbers
         of the model, ``data.scale`` and ``data.shift``. Their errors are among those of the data, to first order.
+    model_error
+        Another model against which the errors of the model are learnt, which are then among those of the data; what is
+        predicted is predicted by it.
     """
 
     stopped: ClassVar[str] = "all data sets inverted"
@@ -71,10 +75,10 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The model, what is predicted, and the model on the finer meshes that it is looked at on."""
-        spec, beside = self.spec, () if self.predict is None else (self.predicted,)
-        looked = has_mesh(spec) and self.method.treatment is not None
+        spec, truth = self.spec, () if self.model_error is None else (self.truth,)
+        beside = truth if self.predict is None else (self.predicted, *truth)
         try:
-            return spec, *beside, *(meshes_of(spec) if looked else ())
+            return spec, *beside, *(meshes_of(spec) if has_mesh(spec) and self.looked else ())
         except ValueError:  # there are none, which is said elsewhere
             return spec, *beside
 
@@ -181,14 +185,21 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         if self.method.question and not (itself and isinstance(self.spec, Solid)):
             message = "is asked of one body that is solved itself for few parameters, with no expansion, reduced model "
             yield ("method", "question"), f"{message}or field of nodal values; expected false", True
-        wrong = list[Mistake]()
-        if self.predict is not None:
+        wrong = [] if self.model_error is None else list(self._of_model_error())
+        if self.predict is not None and not wrong:
             from workflows.studies.predicted import mistakes
 
-            wrong = list(mistakes(self))
-            yield from wrong
-        if not wrong:
-            yield from self._of_uncertain()
+            wrong += mistakes(self)
+        yield from wrong or self._of_uncertain()
+
+    def _of_model_error(self) -> Iterator[Mistake]:
+        """Find what of the other model is wrong, and with what errors of the model are not learnt."""
+        asked = {"a field of nodal values": self.field, "method.expansion": self.method.expansion is not None}
+        asked["method.reduced"] = self.method.reduced is not None
+        for what in (what for what, there in asked.items() if there):
+            yield ("model_error",), f"errors of a model are not learnt with {what}, expected one of both", what
+        for place, message, given in mistakes_of_truth(lambda: self.truth, self.spec, self.unknown):
+            yield ("model_error", *place), message, given
 
     def _of_uncertain(self) -> Iterator[Mistake]:
         """Find what cannot be uncertain, neither in what was measured nor in what is predicted."""

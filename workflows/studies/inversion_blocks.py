@@ -14,6 +14,7 @@ from forward.settings import Settings
 from forward.spec import MEASURED, SPECIMEN, usual_kind
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
+from inverse.methods.model_error import LearntError
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import AS_DECIDED, Parallel, decided
@@ -23,6 +24,7 @@ from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.assumptions import TakenForGranted, Uncertain
+from workflows.studies.model_errors import UNSEEN, truth_of
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
@@ -76,6 +78,7 @@ class InversionBlocks(OneModel):
     method: Invert = Invert()
     predict: Predict | None = None
     uncertain: dict[str, Uncertain] = Field(default={})
+    model_error: LearntError | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     if TYPE_CHECKING:  # of every study
@@ -102,17 +105,33 @@ class InversionBlocks(OneModel):
     @cached_property
     def predicted(self) -> ModelSpec:
         """The model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
-        asked = self.predict
+        asked, model = self.predict, self.model if self.model_error is None else self.truth
         assert asked is not None
-        if self.model.placed:
-            own = self.model.over(ranges(self.parameters))
+        if model.placed:
+            own = model.over(ranges(self.parameters))
             known = {case.name: case for case in own.cases}
             cases = tuple(_acting(case, known) for case in asked.cases) or own.cases
             shared = {name: getattr(own, name) for name in SHARED}
             return Specimen(formulation=own.formulation, cases=cases, observed=asked.observed, **shared)
-        kept = {name: getattr(self.model, name) for name in type(self.model).model_fields}
-        made: ModelSpec = type(self.model).model_validate(kept | asked.model)
+        kept = {name: getattr(model, name) for name in type(model).model_fields}
+        made: ModelSpec = type(model).model_validate(kept | asked.model)
         return made.over(ranges({name: one for name, one in self.parameters.items() if name in made.scalars}))
+
+    @cached_property
+    def truth(self) -> Any:
+        """The model against which the errors of the model are learnt; a ValidationError says no."""
+        assert self.model_error is not None
+        return truth_of(self.model, self.model_error, self.parameters)
+
+    @property
+    def looked(self) -> bool:
+        """Whether the model is looked at on finer meshes, where it has a mesh."""
+        return self.method.treatment is not None and self.model_error is None
+
+    @property
+    def unlooked(self) -> str:
+        """Why it is not."""
+        return UNSEEN if self.model_error is not None else self.method.unchecked
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -208,6 +227,7 @@ class InversionBlocks(OneModel):
         each = method.solves(len(self.names), field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
         more = 0 if self.predict is None else 1 + self.predicted_by
+        each += 0 if self.model_error is None else 2 * self.model_error.solves
         count = sum(measurement is not None for measurement in self.measurements)
         return (each + more) * count + more
 

@@ -21,6 +21,7 @@ from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
+from inverse.methods.model_error import Truth
 from inverse.methods.record import Problem, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
@@ -41,6 +42,7 @@ from workflows.studies.inversion_results import (
     table_of_finished,
 )
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
+from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 
@@ -92,6 +94,8 @@ class _Observed:
         The model with the numbers that are taken for granted; None where it is not asked.
     questions
         Questions to its shape; None where there are none.
+    truth
+        The model against which its errors are learnt; None where they are not.
     """
 
     model: ForwardModel
@@ -99,6 +103,7 @@ class _Observed:
     shared: tuple[SharedMotion, ForwardModel] | None = None
     held: ForwardModel | None = None
     questions: Questions | None = None
+    truth: ForwardModel | None = None
 
 
 @dataclass(frozen=True)
@@ -134,8 +139,8 @@ def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
         there = (None if meshes is None else meshes.of(model), why)
     elif study.spec.hidden:
         there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
-    held, asked = _holding(study, ensemble), _asking(study, ensemble)
-    return _Made(model, lambda number: _Observed(model, there, held=held(number), questions=asked(number)))
+    held, asked, truth = _holding(study, ensemble), _asking(study, ensemble), _truth(study, ensemble)
+    return _Made(model, lambda number: _Observed(model, there, None, held(number), asked(number), truth))
 
 
 def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], ForwardModel | None]:
@@ -157,13 +162,18 @@ def _asking(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Quest
     return lambda number: of(study.measurements[number])
 
 
+def _truth(study: InversionBlocks, ensemble: Ensemble) -> ForwardModel | None:
+    """Make the model against which errors are learnt; collective."""
+    return None if study.model_error is None else study.truth.build(ensemble.group, study.inputs.names)
+
+
 def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
     """Make a specimen; collective."""
     names = study.model.coefficients if study.field else study.inputs.names
     model = spec.build(ensemble.group, names)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
     meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
-    held, asked = _holding(study, ensemble), _asking(study, ensemble)
+    held, asked, truth = _holding(study, ensemble), _asking(study, ensemble), _truth(study, ensemble)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
@@ -177,7 +187,8 @@ def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep)
         there = None if meshes is None else meshes.of(own)
         motion = motion_of(data, study.model.body)
         shared = None if motion is None else (motion, model.observing(*motion.observed))
-        return _Observed(own, (there, why), shared, held(number), asked(number))
+        beside = None if truth is None else observing(truth, data)
+        return _Observed(own, (there, why), shared, held(number), asked(number), beside)
 
     return _Made(model, observed, vertices, look)
 
@@ -186,8 +197,8 @@ def _meshes(
     study: InversionBlocks, model: ForwardModel, start: FloatArray, keep: Keep
 ) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
     """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
-    if study.method.treatment is None:
-        return None, study.method.unchecked
+    if not study.looked:
+        return None, study.unlooked
     try:
         return extrapolated(model, start, keep), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
@@ -227,7 +238,11 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensem
             ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
         assumed = taken.of(data, ask)
         shared = together(shared, assumed.shared)
-    return Problem(data, study.method, study.data.errors, finer, shared, ensemble.say, steps, assumed, seen.questions)
+    truth = None
+    if seen.truth is not None and study.model_error is not None:
+        truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
+    errors, questions = study.data.errors, seen.questions
+    return Problem(data, study.method, errors, finer, shared, ensemble.say, steps, assumed, questions, truth)
 
 
 def _inverted(
@@ -396,7 +411,7 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Ch
     cheap = _reduced(study)(seen.model)
     moved = None if seen.shared is None else seen.shared[1]
     fine = None if seen.there is None else seen.there[0]
-    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: seen.held}
+    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: seen.held, TRUTH: seen.truth}
     others = {name: partial(lambda one: one, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:

@@ -283,6 +283,12 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         if data.registered is not None:
             found.append(Finding("registered", "note", {"how": data.registered.described}))
         found += data.findings
+    return [*found, *_of_errors(one), *_of_mesh(one, study, number)]
+
+
+def _of_errors(one: xr.Dataset) -> list[Finding]:
+    """Say what errors beside those of the data one data set was inverted with."""
+    found: list[Finding] = []
     if "process_size" in one:
         size, length = (told(float(one[f"process_{name}"]), "m") for name in ("size", "length"))
         found.append(Finding("unexplained", "note", {"size": size, "length": length}))
@@ -291,10 +297,13 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
         found.append(said_of_motion(motions[np.isfinite(motions)]))
     if "expansion_error" in one:
         found += criticism.expansion_off(float(one["expansion_error"]), int(one["expansion_solves"]))
+    if "model_error" in one:
+        mean, std = (one[name].to_numpy() for name in ("model_error", "model_error_std"))
+        found.append(criticism.learnt(mean[np.isfinite(mean)], std[np.isfinite(mean)], int(one["model_error_solves"])))
     if "reduced_share" in one:
-        shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
+        shift = dict(zip(one.parameter.values.tolist(), one["reduced_shift"].to_numpy().tolist(), strict=True))
         found += criticism.reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
-    return found + _of_mesh(one, study, number)
+    return found
 
 
 def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Finding]:

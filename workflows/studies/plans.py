@@ -25,6 +25,7 @@ from workflows.studies.predictions import (
 )
 
 if TYPE_CHECKING:
+    from forward.spec import ModelSpec
     from forward.specimen import Specimen
     from inverse.data.measurements import Measurements
     from workflows.studies.inversion_blocks import InversionBlocks
@@ -163,6 +164,7 @@ def of_inversion(study: InversionBlocks) -> list[str]:
     method = study.method
     lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
     lines += only_needed(method.chains, method.chains_when, method.chain_solves(len(study.names), field=study.field))
+    lines += _learnt(study)
     lines += [] if study.taken is None else [f"assumed     {study.taken.described(field=study.field)}"]
     lines += (
         [f"asked       {', '.join(study.asked)}: whether the data call for them, by 1 solve"] if study.asked else []
@@ -189,7 +191,7 @@ def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
         seconds = textbook * 15 * study.method.starts + each * study.method.solves(len(study.names), field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
-    once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
+    once, checked = _mesh_check(study, spec)
     seconds += once + _seconds_of_predictions(study) + _own_seconds(study, max(counts))
     return [
         f"unknown     {unknown}",
@@ -203,6 +205,23 @@ def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
         f"mesh check  {checked}",
         *_predicted(study),
         f"time        about {duration(seconds)} for each on 1 core (rough)",
+    ]
+
+
+def _mesh_check(study: InversionBlocks, spec: ModelSpec) -> tuple[float, str]:
+    """Predict the processor time (s) of looks on finer meshes, and say what is solved, or why nothing is."""
+    if study.looked:
+        return mesh_check(spec)
+    return 0.0, NOT_ASKED if study.model_error is None else study.unlooked
+
+
+def _learnt(study: InversionBlocks) -> list[str]:
+    """Say what the errors of the model are learnt from."""
+    if study.model_error is None:
+        return []
+    pairs = study.model_error.solves
+    return [
+        f"learns      errors of the model by {pairs} solves of another one over the prior, {pairs} over the posterior"
     ]
 
 
@@ -247,7 +266,7 @@ def _moved(count: int, usable: list[Measurements]) -> str:
 def _of_outputs(study: InversionBlocks) -> list[str]:
     from inverse.methods.invert import derivable
 
-    spec, method = study.spec, study.method
+    spec = study.spec
     counts = [len(found) for found in study.measurements if found is not None]
     lines = [
         *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
@@ -263,7 +282,7 @@ def _of_outputs(study: InversionBlocks) -> list[str]:
         derivable(study.spec.build(None, study.inputs.names), spec.kind)
         each = f"up to about {duration(own)} for each, " if own else ""
         return [*lines, f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take"]
-    once, checked = mesh_check(spec) if method.treatment is not None else (0.0, NOT_ASKED)
+    once, checked = _mesh_check(study, spec)
     d = len(study.inputs.names)
     seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
     each = duration(seconds + own + once)

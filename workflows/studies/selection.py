@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from pydantic import ValidationError
 
 from forward.findings import Finding
 from forward.scalars import Mistake
@@ -21,6 +25,7 @@ from workflows.data.material_tests import DataFile, expanded
 from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
+from workflows.studies.model_errors import mistakes_of_truth
 from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
 from workflows.studies.study import StudyKind, bytes_of
@@ -96,12 +101,14 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The models of all candidates, and the finer meshes that they are looked at on."""
-        return *self.of_candidates.values(), *(fine for several in self.finer_meshes for fine in several)
+        truths = (self.truth(name) for name in self.learnt)
+        return *self.of_candidates.values(), *truths, *(fine for several in self.finer_meshes for fine in several)
 
     @property
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
-        return bytes_of(self.of_candidates.values()) + max(
+        truths = [self.truth(name) for name in self.learnt]
+        return bytes_of([*self.of_candidates.values(), *truths]) + max(
             (bytes_of(several) for several in self.finer_meshes), default=0.0
         )
 
@@ -117,7 +124,8 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         """Approximate number of solves: the searches for the modes are not predictable."""
         searches = sum(self.searches(name) for name, _ in self.pairs)
         chains = sum(self.chain_solves(name) for name, _ in self.pairs)
-        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs) + chains
+        pairs = sum(2 * one.solves for one in self.learnt.values())
+        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs) + chains + pairs
 
     def chain_solves(self, name: str) -> int:
         """Most solves of the chains of a candidate in a group of data."""
@@ -213,6 +221,20 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         yield from self._of_method()
         if self.uncertain:
             yield from of_none([self.takes(name, []) for name in self.candidates])
+        yield from self._of_model_errors()
+
+    def _of_model_errors(self) -> Iterator[Mistake]:
+        """Find what is wrong with models against which errors of candidates are learnt."""
+        for name in self.learnt:
+            place = ("candidates", name, "model_error")
+            if self.model is None:
+                yield place, "tests of materials have no model that it changes, expected none", name
+                continue
+            with suppress(ValidationError):  # of the candidate, which is said elsewhere
+                spec = self.of_candidates[name]
+                unknown = self.candidates[name].parameters
+                for where, message, given in mistakes_of_truth(partial(self.truth, name), spec, unknown):
+                    yield (*place, *where), message, given
 
     def _of_tests(self) -> Iterator[Mistake]:
         """Find several tests of one name in a group, words about meshes, and candidates that are no materials."""

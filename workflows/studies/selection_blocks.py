@@ -19,6 +19,7 @@ from forward.spec import SPECIMEN, ModelSpec, usual_kind
 from inverse.criticism.comparison import Candidate
 from inverse.data.measurements import Measurements
 from inverse.methods.invert import derivable
+from inverse.methods.model_error import LearntError
 from inverse.methods.selection import Select
 from workflows.config.blocks import AS_DECIDED, decided
 from workflows.config.priors import ranges
@@ -28,6 +29,7 @@ from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
 from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import CandidateModel, OfCandidates
+from workflows.studies.model_errors import UNSEEN, truth_of
 from workflows.studies.predictions import has_mesh, meshes_of
 
 if TYPE_CHECKING:
@@ -36,11 +38,24 @@ if TYPE_CHECKING:
 Pair = tuple[str, str]  # a candidate, and a group of data
 
 
+class ComparedModel(CandidateModel):
+    """A candidate of a comparison by data; other settings as of any candidate.
+
+    Parameters
+    ----------
+    model_error
+        Another model, given by what it changes of that of the study, against which the errors of the candidate are
+        learnt; they are then among those of the data.
+    """
+
+    model_error: LearntError | None = None
+
+
 class SelectionBlocks(OfCandidates):
     """The blocks of a comparison, as `workflows.studies.selection.Selection` explains them."""
 
     data: Annotated[MeasuredTests | DisplacementFile | OutputFile, AS_DECIDED]
-    candidates: Annotated[dict[str, CandidateModel], Field(min_length=1)]
+    candidates: Annotated[dict[str, ComparedModel], Field(min_length=1)]
     predict: tuple[MaterialTest, ...] = ()
     uncertain: dict[str, Uncertain] = Field(default={})
     method: Select
@@ -110,6 +125,22 @@ class SelectionBlocks(OfCandidates):
         derivable(model, spec.kind)
         return observing(model, self.data_as_in(spec))
 
+    def build_truth(self, name: str, comm: Any = None) -> ForwardModel:
+        """Make the model against which the errors of a candidate are learnt, which has the same outputs; collective."""
+        spec = self.truth(name)
+        return observing(spec.build(comm, tuple(self.candidates[name].parameters)), self.data_as_in(spec))
+
+    def truth(self, name: str) -> ModelSpec:
+        """The model against which the errors of a candidate are learnt; a ValidationError says no."""
+        one = self.candidates[name]
+        assert one.model_error is not None
+        return truth_of(self.model, one.model_error, one.parameters)
+
+    @property
+    def learnt(self) -> dict[str, LearntError]:
+        """How the errors of candidates are learnt, of those where they are."""
+        return {name: one.model_error for name, one in self.candidates.items() if one.model_error is not None}
+
     def shared(self, name: str, group: str) -> SharedMotion | None:
         """Return the errors that the data share, as a candidate sees them; None if they are independent."""
         spec: Any = self.of_candidates[name]
@@ -170,7 +201,8 @@ class SelectionBlocks(OfCandidates):
         """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
         if not any(has_mesh(spec) or spec.hidden for spec in self.of_candidates.values()):
             return {}
-        return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
+        learnt = self.learnt
+        return {name: UNSEEN if name in learnt else self._unchecked(spec) for name, spec in self.of_candidates.items()}
 
     def _unchecked(self, spec: Any) -> str:
         method: Any = self.method

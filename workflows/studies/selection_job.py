@@ -15,6 +15,7 @@ from forward.model import FloatArray, ForwardModel
 from inverse.criticism.assumptions import Assumptions, by_evaluation
 from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
+from inverse.methods.model_error import Truth
 from uq.evaluation.evaluate import Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
@@ -22,6 +23,7 @@ from uq.findings import add
 from workflows.results import comparison
 from workflows.studies.assumptions import ASSUMED
 from workflows.studies.job import MOVED, MethodJob, kept_starts
+from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
@@ -71,6 +73,11 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
                 return Finer(None, why[name])
             return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
+        def truth(name: str, group: str) -> Truth | None:
+            if name not in study.learnt:
+                return None
+            return Truth(evaluate.on(f"{name}/{group}/{TRUTH}"), study.learnt[name].solves, method.seed)
+
         return method.run(
             study.models,
             study.data_groups,
@@ -82,6 +89,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
             lambda *pair: makers[pair](),
             lambda *pair: Steps(kept, recorders["/".join(pair)], "/".join(pair), ensemble.count),
             assumed if method.assumptions or study.uncertain else None,
+            truth,
         )
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
@@ -95,7 +103,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         of_wrong = [name for name, several in wrong.items() if several]
         judged = comparison.trusted_on_meshes(comparison.with_right_derivatives(found, of_wrong))
         add(judged, *comparison.findings(found), *comparison.untrusted(found, judged, of_wrong), *doubts)
-        add(judged, *(one for several in wrong.values() for one in several))
+        add(judged, *(one for several in wrong.values() for one in several), *comparison.learnt(judged))
         return judged
 
     finer_ones = {
@@ -105,16 +113,19 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         for n, g in checked
     }
     moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, makers[n, g], one) for (n, g), one in motions.items()}
+    true_ones = {
+        f"{n}/{g}/{TRUTH}": partial(study.build_truth, n, ensemble.group) for n, g in study.pairs if n in study.learnt
+    }
     held_ones = {f"{n}/{g}/{ASSUMED}": partial(one.model, ensemble.group) for (n, g), one in taken.items() if one.asked}
     return MethodJob(
         makers[study.pairs[0]](),
-        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones | held_ones,
+        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones | held_ones | true_ones,
         task,
         recorders,
         labelled=labelled,
         arviz_groups=partial(comparison.arviz_groups, study.models, method.noise.factor, method.seed),
         costly=study.model is not None or method.chains in {"pcn", "emcee"},  # whose one step may take minutes
-        passing=frozenset({*finer_ones, *held_ones}),
+        passing=frozenset({*finer_ones, *held_ones, *true_ones}),
     )
 
 

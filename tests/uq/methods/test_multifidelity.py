@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+import xarray as xr
 from pydantic import ValidationError
 from scipy import stats
 
@@ -374,6 +375,26 @@ def test_what_does_not_fit_a_study_is_said():
     bare: dict = {"model": BLOCK, "parameters": {"a": {"kind": "uniform", "lower": 0, "upper": 1}}}
     with pytest.raises(StudyError, match=r"of kind 'python' has no meshes(.|\n)*has no iterations"):
         parse(bare | {"method": {"kind": "multifidelity", "samples": 40, "cheap": CHEAP}})
+
+
+@pytest.mark.fem
+def test_the_linear_model_is_a_cheap_one(tmp_path):
+    text = (ROOT / "configs" / "tiny.toml").read_text()
+    method = "[method]\nkind = 'multifidelity'\nsamples = 40\ncontrol = 'none'\ncheap = [{ kind = 'linear' }]\n"
+    (tmp_path / "study.toml").write_text(text[: text.index("[method]")] + method)
+    (spec,) = load(tmp_path / "study.toml").models.values()
+    assert (spec.strains, spec.solver_tolerance, spec.solver.accept_unstable) == ("small", 1e-2, True)
+    done = in_process("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--no-report")
+    assert done.returncode == 0, done.stderr
+    with xr.open_dataset(tmp_path / "out" / "results.nc") as data:
+        assert data["fidelity"].values.tolist() == ["model", "linear"]
+        assert (data["fidelity_correlation"][:, 1] > 0.95).all()
+        assert data["fidelity_cost"][1] < 0.5
+    with pytest.raises(StudyError, match="a model of kind 'python' has no strains"):
+        parse(
+            {"model": BLOCK, "parameters": {"a": {"kind": "uniform", "lower": 0, "upper": 1}}}
+            | {"method": {"kind": "multifidelity", "samples": 40, "cheap": [{"kind": "linear"}]}}
+        )
 
 
 def test_other_models_are_part_of_what_results_depend_on():
