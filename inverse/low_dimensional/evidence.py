@@ -147,7 +147,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     opening = first(wide, student, normal)
     derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
     pilot = [_drawn(posterior, opening, seed, 0, quarter, derivatives=derivatives)]
-    drawn = _weighted(pilot, "importance", "")
+    drawn = _weighted(posterior, pilot, "importance", "")
     share = f"the first {quarter} points are worth {drawn.ess:.0f}"
     # Of the first points all must have an answer: where many have none, the Gaussian is not what the prior allows.
     if np.isfinite(drawn.density.log_posterior).all() and _is_gaussian(gaussian, drawn.density):
@@ -183,7 +183,9 @@ class _Part:
     log_over_prior: Callable[[FloatArray], FloatArray]
 
 
-def _weighted(parts: Sequence[_Part], route: Route, why: str, cloud: Cloud | None = None) -> Evidence:
+def _weighted(
+    posterior: Posterior, parts: Sequence[_Part], route: Route, why: str, cloud: Cloud | None = None
+) -> Evidence:
     """Weight all points by the mixture of the densities they were drawn from, eight replicates in order.
 
     With a cloud, it stands for the posterior with what they differ from it.
@@ -195,22 +197,25 @@ def _weighted(parts: Sequence[_Part], route: Route, why: str, cloud: Cloud | Non
         counts[part.log_over_prior] = counts.get(part.log_over_prior, 0) + len(part.density.x)
     log_over = joint(list(counts), [n / len(density.x) for n in counts.values()], density.x)
     found = weighed(density, density.log_likelihood - log_over, route, why)
-    return found if cloud is None else replace(found, many=_corrected(found, log_over, cloud))
+    return found if cloud is None else replace(found, many=_corrected(posterior, found, log_over, cloud))
 
 
-def _corrected(found: Evidence, log_over: FloatArray, cloud: Cloud) -> tuple[FloatArray, FloatArray] | None:
+def _corrected(
+    posterior: Posterior, found: Evidence, log_over: FloatArray, cloud: Cloud
+) -> tuple[FloatArray, FloatArray] | None:
     """Return points of a cloud and of an estimate with their weights; None where the cloud is no help.
 
-    Or where it is so wrong that what the points differ from it leaves a negative variance.
+    Or where it is so wrong that what the points differ from it leaves a negative variance, of the parameters too.
     """
     x, weights = found.density.x, found.weights
     by_polynomial = cloud.surrogate.at(x).log_likelihood - log_over
     if not np.isfinite(by_polynomial).any():
         return None
     points, many = np.concatenate([cloud.x, x]), np.concatenate([cloud.weights, weights - normalised(by_polynomial)])
-    apart = points - many @ points
-    if np.linalg.eigvalsh((many[:, None] * apart).T @ apart)[0] <= 0:
-        return None
+    for values in (points, posterior.physical(points)):
+        apart = (values - many @ values) / values.std(axis=0)
+        if np.linalg.eigvalsh((many[:, None] * apart).T @ apart)[0] <= 0:
+            return None
     return (points, many) if many @ many < weights @ weights else None
 
 
@@ -252,7 +257,7 @@ def _continued(
     if gaussian is not None and affordable(len(posterior.inputs.names)):
         with suppress(SolveError):
             cloud = sample(fit(posterior, parts[0].density), gaussian, seed + 100)
-    return _weighted([*parts, rest], "importance", why, cloud)
+    return _weighted(posterior, [*parts, rest], "importance", why, cloud)
 
 
 def _deviation(gaussian: Laplace, density: Density) -> FloatArray:
@@ -313,7 +318,7 @@ def _by_surrogate(
         picked = posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1)
         parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)
-        found = _weighted(parts, "surrogate", why, cloud)
+        found = _weighted(posterior, parts, "surrogate", why, cloud)
         if k == 1 and found.ess < otherwise * len(found.log_weights):
             raise SolveError(f"a polynomial makes them worth {found.ess:.0f} of {len(found.log_weights)}")
     # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density with a
