@@ -132,10 +132,10 @@ def _lumps(
     usual = [_radius(one) for one in inclusions] or [_extent(body) / 4]
     width = min([one.width for one in inclusions], default=usual[0] / 2)
     for radius in sorted({max(size * max(usual), cell) for size in SIZES}, reverse=True):
-        spacing, centres = SPACING * radius, places
-        while len(centres) > MOST or centres is places:
-            _, chosen = np.unique(np.floor(places / spacing + 0.5), axis=0, return_index=True)
-            spacing, centres = WIDER * spacing, places[np.sort(chosen)]
+        spacing, centres = SPACING * radius, _lattice(body, places, SPACING * radius)
+        while len(centres) > MOST:
+            spacing *= WIDER
+            centres = _lattice(body, places, spacing)
         same = np.zeros(len(centres), dtype=bool)
         for one in inclusions:
             same |= np.linalg.norm(centres - (one.x, one.y, one.z), axis=1) < _radius(one)
@@ -143,6 +143,15 @@ def _lumps(
             lump = Sphere(x=x, y=y, z=z, radius=radius, contrast=np.exp(STIFFNESS), width=max(width, cell / 2))
             label = f"at {place((x, y, z))}, radius {told(radius, 'm')}"
             yield label, log_factor([lump], (), np.zeros((1, 0)), places)
+
+
+def _lattice(body: Body, places: FloatArray, spacing: float) -> FloatArray:
+    """Return the points (n, 3) of a lattice in the box around a body that are no farther than a cell from a vertex."""
+    from scipy.spatial import cKDTree
+
+    steps = [np.linspace(low, high, 1 + int(np.ceil((high - low) / spacing))) for low, high in body.bounds]
+    found = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(found[cKDTree(places).query(found)[0] <= body.longest_edge])
 
 
 def _layers(body: Body, places: FloatArray) -> Iterator[tuple[str, FloatArray]]:

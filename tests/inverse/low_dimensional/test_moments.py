@@ -108,13 +108,19 @@ def saturating_at_five(p):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("far", [0.5, 3.0])
-def test_a_polynomial_that_leaves_a_negative_variance_is_no_help(far):
-    """It gives half of its weight to points that the posterior does not have; near them that is a correction."""
+@pytest.mark.parametrize(
+    ("far", "physical", "helps"),
+    [(0.5, np.array, True), (3.0, np.array, False), (1.0, np.array, True), (1.0, lambda x: np.tanh(5 * x**9), False)],
+)
+def test_a_polynomial_that_leaves_a_negative_variance_is_no_help(far, physical, helps):
+    """It gives half of its weight to points that the posterior does not have; near them that is a correction.
+
+    Also where only the parameter, which lies near one of two ends, has a negative variance.
+    """
     n, rng = 64, np.random.default_rng(0)
     x = np.concatenate([0.01 * rng.standard_normal((n // 2, 1)), far * rng.choice([-1.0, 1.0], (n // 2, 1))])
     found = SimpleNamespace(density=SimpleNamespace(x=x), weights=np.repeat([2 / n, 0.0], n // 2))
     flat = SimpleNamespace(at=lambda points: SimpleNamespace(log_likelihood=np.zeros(len(points))))
     cloud = SimpleNamespace(surrogate=flat, x=rng.standard_normal((4096, 1)), weights=even(4096))
-    corrected = _corrected(found, np.zeros(n), cloud)
-    assert (corrected is None) == (far > 1)
+    corrected = _corrected(SimpleNamespace(physical=physical), found, np.zeros(n), cloud)
+    assert (corrected is not None) == helps
