@@ -184,7 +184,7 @@ TABLE: dict[str, str | Words] = {
         short="{name} is too uncertain for its first order",
     ),
     "called-for": Words(
-        "the data call for {question} ({form}): ln Z is {gain:.2g} larger with it{also}, and {answer} {size:.2g} "
+        "the data call for {question} ({form}): ln Z is {gain} larger with it{also}, and {answer} {size:.2g} "
         "deviations {way}; a right model looks so with a probability of {probability:.2g}. Make it part of the model, "
         "or a candidate in select",
         short="the data call for {question}",

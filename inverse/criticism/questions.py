@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
+from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Normal
 from uq.surrogates.linearisation import linearise
@@ -53,7 +55,7 @@ class Answer(NamedTuple):
     probability
         That questions to a right model make one of them look as much called for by chance.
     log_evidence
-        What it adds to ln Z, to first order.
+        What it adds to ln Z: to first order, or by Laplace's Gaussian where data call for it.
     move, left
         By how much answers (d,) are larger with it, in their deviations, and the deviation of that: what the data do
         not tell of it.
@@ -110,8 +112,10 @@ class Questions:
         return np.asarray(patterns @ solution.adjoint(np.eye(m))[:, d:].T)
 
 
-def asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
-    """Ask all questions, and solve for the posterior with each enlargement that data call for.
+def asked(
+    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int, steps: Steps = ALL_AGAIN
+) -> list[Answer]:
+    """Ask all questions, and solve for the posterior with each enlargement that data call for, which `steps` keep.
 
     Answers are NaN if the model has none at the mode.
     """
@@ -121,7 +125,12 @@ def asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Quest
         none = np.full(len(posterior.inputs.names), np.nan)
         unknown = "no answer", np.nan, np.nan, none, none, np.zeros(0), np.zeros((0, 0)), np.nan
         return [Answer(name, *unknown) for name in questions.forms(at.parameters[0])]
-    return [_solved(posterior, gaussian, questions, one) if one.probability <= CALLED else one for one in found]
+    return [
+        steps(f"with {one.name}", partial(_solved, posterior, gaussian, questions, one))
+        if one.probability <= CALLED
+        else one
+        for one in found
+    ]
 
 
 def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answer: Answer) -> Answer:
@@ -244,7 +253,7 @@ def _judged(found: Mapping[str, list[_Form]]) -> list[Answer]:
 
 def findings_in(one: xr.Dataset) -> list[Finding]:
     """Return what the results of a data set say of questions: what data call for, and what they leave open."""
-    answers = [str(name) for name in one["parameter"].values]
+    parameters = [str(name) for name in one["parameter"].values]
     moves, left = (one[f"question_{name}"].transpose("question", "parameter").to_numpy() for name in ("move", "left"))
     names, forms = one["question"].values.tolist(), str(one["question_forms"].item()).split("; ")
     probability, gain = one["question_probability"].to_numpy(), one["question_log_evidence"].to_numpy()
@@ -253,13 +262,13 @@ def findings_in(one: xr.Dataset) -> list[Finding]:
     if called:
         k, others = called[0], called[1:]
         i = int(np.nanargmax(np.abs(moves[k])))
-        also = "".join(f", or for {names[other]} ({gain[other]:+.2g})" for other in others)
-        values = {"question": names[k], "form": forms[k], "gain": gain[k], "also": also, "answer": answers[i]}
-        values |= {"size": abs(moves[k, i]), "way": "larger" if moves[k, i] > 0 else "smaller"}
+        also = "".join(f", or for {names[other]} (by {number(gain[other], 2)})" for other in others)
+        values = {"question": names[k], "form": forms[k], "gain": number(gain[k], 2), "also": also}
+        values |= {"answer": parameters[i], "size": abs(moves[k, i]), "way": "larger" if moves[k, i] > 0 else "smaller"}
         found.append(Finding("called-for", "warning", values | {"probability": probability[called].min()}))
     for k, name in enumerate(names):
         i = int(np.nan_to_num(left[k]).argmax())
         if k not in called and left[k, i] >= OPEN:
-            told.append((left[k, i], f"{name}, {answers[i]} by {number(left[k, i], 2)} deviations"))
+            told.append((left[k, i], f"{name}, {parameters[i]} by {number(left[k, i], 2)} deviations"))
     listed = "; ".join(text for _, text in sorted(told, reverse=True)[:SHOWN])
     return [*found, *([Finding("left-open", "note", {"listed": listed})] if listed else [])]

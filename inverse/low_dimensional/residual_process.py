@@ -60,7 +60,7 @@ def with_process(posterior: Posterior, gaussian: Laplace, data: Measurements) ->
     if len(data) > MOST:
         message = f"data.errors.process: {len(data):,} data, expected at most {MOST:,}; take fewer points"
         raise SolveError(message)
-    bare = replace(posterior, noise=replace(posterior.noise, process=None))
+    bare = posterior
     for _ in range(ROUNDS):
         at = bare.at(gaussian.mode[None], derivatives=True)
         found = process(bare, at, data)
@@ -94,7 +94,7 @@ def process(posterior: Posterior, at: Density, data: Measurements) -> Process:
     squares = (unit * SIZES) ** 2
     logs = np.array([log_evidence(kernel, squares) for kernel in kernels])
     weights = np.exp(logs - logsumexp(logs))
-    mean = np.einsum("l,lmn->mn", weights @ squares, kernels)
+    mean = sum(square * kernel for square, kernel in zip(weights @ squares, kernels, strict=True))
     more = float(logsumexp(logs) - np.log(logs.size) - log_evidence(mean, np.ones(1))[0])
     values, vectors = np.linalg.eigh(mean)
     kept = values > LEFT_OUT * unit**2

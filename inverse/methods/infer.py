@@ -128,15 +128,8 @@ def infer(
         posterior = over_prior(posterior, truth, steps)
     before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
     searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
-    for _ in range(ROUNDS):
-        if shared is None:
-            break
-        point, best = gaussian.mode, posterior.physical(gaussian.mode[None])[0]
-        posterior = _sharing(posterior, shared(best[:d]), *best[d:])
-        gaussian = laplace(posterior, starts=1, first=point)
-        move = gaussian.mode - point
-        if move @ gaussian.hessian @ move < SETTLED**2:
-            break
+    if shared is not None:
+        posterior, gaussian = _settled(posterior, gaussian, shared)
     if truth is not None:
         posterior, gaussian = over_posterior(posterior, gaussian, truth, steps)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
@@ -148,6 +141,19 @@ def infer(
         posterior, gaussian, process = with_process(posterior, gaussian, unexplained)
     one = assess(posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
     return Inferred(posterior, searched, one, mesh, before, process)
+
+
+def _settled(posterior: Posterior, gaussian: Laplace, shared: Shared) -> tuple[Posterior, Laplace]:
+    """Search on with what data share at the mode, until that stays."""
+    d = len(posterior.inputs.names)
+    for _ in range(ROUNDS):
+        point, best = gaussian.mode, posterior.physical(gaussian.mode[None])[0]
+        posterior = _sharing(posterior, shared(best[:d]), *best[d:])
+        gaussian = laplace(posterior, starts=1, first=point)
+        move = gaussian.mode - point
+        if move @ gaussian.hessian @ move < SETTLED**2:
+            break
+    return posterior, gaussian
 
 
 def _sharing(posterior: Posterior, shared: Mapping[str, Any], size: float = 1.0) -> Posterior:

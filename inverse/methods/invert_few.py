@@ -51,7 +51,7 @@ from inverse.methods.record import (
     of_process,
     of_verdict,
 )
-from uq.evaluation.evaluate import Recorder
+from uq.evaluation.evaluate import Recorder, Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
@@ -123,6 +123,7 @@ def invert_few(
     of_data_set = Posterior(inputs, counted, data.values, problem.noise, data.which)
     solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
     looked = None if problem.finer is None else Looked(problem.finer, data, method.treatment)
+    steps = replace(problem.steps, recorder=counted)
     inferred = infer(
         of_data_set,
         start or (lambda point: linearise(inputs, evaluate, point).prediction),
@@ -137,7 +138,7 @@ def invert_few(
         when=method.chains_when,
         model=model,
         say=problem.say,
-        steps=replace(problem.steps, recorder=counted),
+        steps=steps,
     )
     posterior, searched, one, mesh = inferred.posterior, inferred.searched, inferred.assessment, inferred.mesh
     gaussian, found, chains = one.gaussian, one.evidence, one.chains
@@ -164,7 +165,7 @@ def invert_few(
         **_moments(posterior, one, known, points, look),
         **_alone(posterior, gaussian, spectrum, data),
         **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
-        **({} if problem.questions is None else _asked(posterior, gaussian, at, problem.questions, method.seed)),
+        **({} if problem.questions is None else _asked(posterior, gaussian, at, problem.questions, method.seed, steps)),
         **_draws(posterior, *drawn),
         **_of_uncertain(posterior, points, gaussian.mode),
         "point": points.values,
@@ -255,9 +256,11 @@ def _of_assumed(posterior: Posterior, gaussian: Laplace, at: Density, known: Ans
     return {"assumption_shift": shift, "assumption_bend": bend}
 
 
-def _asked(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> Record:
+def _asked(
+    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int, steps: Steps
+) -> Record:
     """Answers to questions to the shape; how far (q, c) they move the parameters is NaN of the noise."""
-    found = asked(posterior, gaussian, at, questions, seed)
+    found = asked(posterior, gaussian, at, questions, seed, steps)
     nans = ((0, 0), (0, len(posterior.names) - len(posterior.inputs.names)))
     each = ([one.move for one in found], [one.left for one in found])
     move, left = (np.pad(np.array(of), nans, constant_values=np.nan) for of in each)

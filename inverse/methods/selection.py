@@ -33,6 +33,7 @@ from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
 from inverse.methods.mesh_correction import MeshTreatment
 from inverse.methods.model_error import Truth
+from inverse.methods.record import of_learnt
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
@@ -325,8 +326,9 @@ def _learnt(
         for rows, group in zip(found, data_groups, strict=True):
             noise, truth = posteriors[name, group].noise, truths[name, group]
             if truth is not None and noise.model is not None:
-                rows[:, k, : len(noise.sigma)] = [noise.model.error / noise.sigma, noise.model.std / noise.sigma]
-                solves[k] += 2 * truth.solves
+                of = of_learnt(noise, truth)
+                rows[:, k, : len(noise.sigma)] = [of["model_error"], of["model_error_std"]]
+                solves[k] += of["model_error_solves"]
     both, dims = np.concatenate(found, axis=2), ("model", "output")
     return {
         "model_error": (dims, both[0]),

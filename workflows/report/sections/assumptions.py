@@ -9,6 +9,7 @@ import numpy as np
 
 from forward.readable import number, size, spoken
 from inverse.criticism.assumptions import kept_in
+from inverse.criticism.questions import CALLED
 from workflows.report.blocks import Block, Folded, Heading, Table, Text
 from workflows.report.section import Results, section
 from workflows.report.sections.bodies import first
@@ -26,8 +27,8 @@ SAID = (
 ASKED = (
     "What the body could have beside what the model says of it, in the form that the data like best. p is the "
     "probability with which a right model makes one of all questions look as much called for; where it is at most "
-    "0.05 the evidence, and by how many posterior deviations each answer would be larger, are by Laplace's method "
-    "with that in the model, else to first order. What stands after ± is what the data leave open."
+    f"{CALLED:g} the evidence, and by how many posterior deviations each answer would be larger, are by Laplace's "
+    "method with that in the model, else to first order. What stands after ± is what the data leave open."
 )
 
 
