@@ -183,6 +183,9 @@ TABLE: dict[str, str | Words] = {
         "parameter, with a normal prior",
         short="{name} is too uncertain for its first order",
     ),
+    "uncertain-sampled": Words(
+        "{listed}: too uncertain for first order, and so sampled together with the parameters", short=""
+    ),
     "called-for": Words(
         "the data call for {question} ({form}): ln Z is {gain} larger with it{also}, and {answer} {size:.2g} "
         "deviations {way}; a right model looks so with a probability of {probability:.2g}. Make it part of the model, "

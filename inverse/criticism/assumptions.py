@@ -410,7 +410,11 @@ def findings_in(of: xr.Dataset) -> list[Finding]:
     )
     names = [str(name) for name in of["uncertain"].values]
     far = of["uncertain_mean"].to_numpy() if "uncertain_mean" in of else np.zeros(len(names))
-    return [*findings(kept_in(of), answers, shifts), *bent(names, answers, bends), *off(names, far)]
+    sampled = of["uncertain_sampled"].to_numpy() > 0 if "uncertain_sampled" in of else np.zeros(len(names), dtype=bool)
+    there = [name for name, one in zip(names, sampled, strict=True) if one]
+    told = [Finding("uncertain-sampled", "note", {"listed": ", ".join(there)})] if there else []
+    bends = np.where(sampled[:, None], np.nan, bends)
+    return [*findings(kept_in(of), answers, shifts), *told, *bent(names, answers, bends), *off(names, far)]
 
 
 def off(names: Sequence[str], means: FloatArray) -> list[Finding]:

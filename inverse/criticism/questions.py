@@ -28,10 +28,9 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
+from inverse.low_dimensional.wider import widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
-from uq.inputs.distributions import Normal
-from uq.surrogates.linearisation import linearise
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -138,29 +137,18 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
 
     To first order if the model has no answer there.
     """
-    own, d = posterior.inputs, len(posterior.inputs.names)
-    names = [f"{answer.name}, strength {k}" for k in range(len(answer.patterns))]
-    inputs = replace(own, own=own.own | dict.fromkeys(names, Normal(mean=0.0, std=1.0)))
-    old, new = ([inputs.names.index(name) for name in some] for some in (own.names, names))
+    d, names = len(posterior.inputs.names), [f"{answer.name}, strength {k}" for k in range(len(answer.patterns))]
 
-    def wider(rows: FloatArray) -> FloatArray:
-        found = np.zeros((len(rows), len(inputs.names)))
-        found[:, old] = rows
-        return found
+    def having(wanted: Sequence[str]) -> Evaluate:
+        return questions.having(wanted, answer.patterns)
 
-    x = wider(gaussian.mode[None, :d])
-    x[0, new] = answer.strengths
-    noise, evaluate = posterior.noise, questions.having(inputs.names, answer.patterns)
-    if noise.model is not None and noise.model.slopes.size:
-        more = {"point": wider(noise.model.point[None])[0], "slopes": wider(noise.model.slopes)}
-        noise = replace(noise, model=replace(noise.model, **more))
     try:
-        start = linearise(inputs, evaluate, inputs.from_normals(x)[0][0]).prediction
-        larger = replace(posterior, inputs=inputs, evaluate=evaluate, noise=noise, start=start)
-        found = laplace(larger, starts=1, exact=False, first=np.append(x[0], gaussian.mode[d:]))
+        wider = widened(posterior, gaussian.mode, names, answer.strengths, having)
+        found = laplace(wider.posterior, starts=1, exact=False, first=wider.first)
     except SolveError:
         return answer
-    move = larger.physical(found.mode[None])[0, old] - posterior.physical(gaussian.mode[None])[0, :d]
+    there = wider.posterior.physical(found.mode[None])[0, wider.own]
+    move = there - posterior.physical(gaussian.mode[None])[0, :d]
     gain = found.log_evidence - gaussian.log_evidence + answer.searched
     return answer._replace(log_evidence=gain, move=move / deviations(posterior, gaussian))
 

@@ -8,20 +8,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
+
+import numpy as np
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.assessment import Assessment, Kind, When, assess
+from inverse.criticism.assumptions import BENT, Assumptions, Moves, moved_by
 from inverse.criticism.finer import Finer, MeshFound
 from inverse.data.measurements import Measurements
 from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
-from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.residual_process import Process, with_process
+from inverse.low_dimensional.wider import Wider, missed, widened
 from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
 from inverse.methods.model_error import Truth, over_posterior, over_prior
-from uq.evaluation.evaluate import ALL_AGAIN, Steps
+from uq.evaluation.evaluate import ALL_AGAIN, Recorder, Steps
 from uq.evaluation.request import Evaluate, Start
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
@@ -45,13 +49,45 @@ class Looked:
 
 
 @dataclass(frozen=True, eq=False)
+class Sampled:
+    """A model with further unknowns: what is uncertain beside the parameters, in its deviations.
+
+    Attributes
+    ----------
+    names
+        Of these (s,), among the groups of what is taken for granted.
+    model, evaluate
+        The model of the parameters and these, as `Inputs.beside` puts them, and its evaluation.
+    """
+
+    names: tuple[str, ...]
+    model: ForwardModel
+    evaluate: Evaluate
+
+
+@dataclass(frozen=True, eq=False)
+class AtMode:
+    """A posterior, and Laplace's Gaussian of it."""
+
+    posterior: Posterior
+    gaussian: Laplace
+
+    @cached_property
+    def at(self) -> Density:
+        """The posterior at its mode, with derivatives."""
+        return self.posterior.at(self.gaussian.mode[None], derivatives=True)
+
+
+@dataclass(frozen=True, eq=False)
 class Inferred:
     """A posterior, and what was found of it.
 
     Attributes
     ----------
-    posterior
-        As it was corrected, with solves that start from its mode.
+    found
+        The posterior as it was corrected, with solves that start from its mode.
+    first
+        The same, with what is uncertain beside the parameters to first order only.
     searched
         Laplace's Gaussian as it was first found, with all starts of the search.
     assessment
@@ -61,14 +97,28 @@ class Inferred:
         None where they were not asked.
     process
         What no parameters explain, where that was asked for.
+    moves
+        How far what is taken for granted moves the first of them, if it is looked at.
+    sampled, solves
+        Where first order was not enough: places of the parameters, and of what is uncertain, among the unknowns; and
+        solves for these.
     """
 
-    posterior: Posterior
+    found: AtMode
+    first: AtMode
     searched: Laplace
     assessment: Assessment
     mesh: MeshFound | None
     before: float | None
     process: Process | None = None
+    moves: Moves | None = None
+    sampled: tuple[list[int], list[int]] | None = None
+    solves: int = 0
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior as it was corrected."""
+        return self.found.posterior
 
 
 def infer(
@@ -85,6 +135,8 @@ def infer(
     chains: Kind | None = None,
     when: When = "always",
     model: ForwardModel | None = None,
+    assumed: Assumptions | None = None,
+    sampled: Sampled | None = None,
     say: Callable[[str], None] = lambda line: None,
     steps: Steps = ALL_AGAIN,
 ) -> Inferred:
@@ -108,6 +160,8 @@ def infer(
         The data, if what the model does not explain of them is a process among their errors.
     truth
         What the errors of the model are learnt from; None where they are not, and always with finer meshes.
+    assumed, sampled
+        What is taken for granted; and what samples those of it that are uncertain, where first order is not enough.
     say
         Shows the user a line before the search.
     steps
@@ -139,8 +193,32 @@ def infer(
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
     if unexplained is not None:
         posterior, gaussian, process = with_process(posterior, gaussian, unexplained)
-    one = assess(posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
-    return Inferred(posterior, searched, one, mesh, before, process)
+    found = first = AtMode(posterior, gaussian)
+    moves = None if assumed is None else moved_by(posterior, gaussian, first.at, assumed)
+    places, recorder = None, None
+    if sampled is not None and assumed is not None:
+        recorder = Recorder(sampled.evaluate)
+        with suppress(SolveError):  # or else it stays at first order, which is said
+            wider, parts = _sampling(first, assumed, sampled, recorder), replace(steps.of("sampled"), recorder=recorder)
+            if (np.abs(missed(wider)) > BENT).any():
+                gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
+                say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
+                found, places = AtMode(wider.posterior, gaussian), (wider.own, wider.new)
+                model, steps = sampled.model, parts
+    one = assess(found.posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
+    solves = 0 if recorder is None else recorder.solves
+    return Inferred(found, first, searched, one, mesh, before, process, moves, places, solves)
+
+
+def _sampling(first: AtMode, assumed: Assumptions, sampled: Sampled, evaluate: Evaluate) -> Wider:
+    """Return a posterior with unknowns for what is uncertain, which is no error any more."""
+    posterior, mode = first.posterior, first.gaussian.mode
+    noise, which = posterior.noise, [list(assumed.groups).index(name) for name in sampled.names]
+    assert noise.uncertain is not None
+    likely = -noise.pull @ posterior.residuals(first.at.outputs, mode[None])[0]
+    others = np.delete(noise.uncertain, which, axis=0)
+    fewer = replace(posterior, noise=replace(noise, uncertain=others if len(others) else None))
+    return widened(fewer, mode, sampled.names, likely[which], lambda names: evaluate)
 
 
 def _settled(posterior: Posterior, gaussian: Laplace, shared: Shared) -> tuple[Posterior, Laplace]:

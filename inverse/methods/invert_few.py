@@ -6,7 +6,7 @@ hand (`Nearby`), or all groups solve at different points of one posterior.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ from inverse.criticism.assessment import (
     of_gaussian,
     weighted,
 )
-from inverse.criticism.assumptions import Assumptions, moved_by
+from inverse.criticism.assumptions import Moves
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.questions import Questions, asked
 from inverse.criticism.verdict import verdict_on_few
@@ -49,6 +49,7 @@ from inverse.methods.record import (
     of_motions,
     of_prior,
     of_process,
+    of_some,
     of_verdict,
 )
 from uq.evaluation.evaluate import Recorder, Steps
@@ -137,13 +138,15 @@ def invert_few(
         chains=method.chains,
         when=method.chains_when,
         model=model,
+        assumed=problem.assumed,
+        sampled=problem.sampled,
         say=problem.say,
         steps=steps,
     )
-    posterior, searched, one, mesh = inferred.posterior, inferred.searched, inferred.assessment, inferred.mesh
-    gaussian, found, chains = one.gaussian, one.evidence, one.chains
-    best = posterior.physical(gaussian.mode[None])[0]
-    at = posterior.at(gaussian.mode[None], derivatives=True)
+    posterior, one, mesh, first = inferred.posterior, inferred.assessment, inferred.mesh, inferred.first
+    gaussian, found, chains, at = one.gaussian, one.evidence, one.chains, inferred.found.at
+    own, new = inferred.sampled or (list(range(d)), [])
+    kept = [*own, *range(len(posterior.inputs.names), len(posterior.names))]
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
@@ -154,37 +157,43 @@ def invert_few(
     log_evidence, error = one.log_evidence
     more = 0.0 if inferred.process is None else inferred.process.log_evidence
     points, *drawn = _drawn(posterior, one, at, method)
+    asking, std = (first.posterior, first.gaussian, first.at), known.std[own]
+    others = len(kept) - d
+    of_all: Record = {
+        **_moments(posterior, one, known, points),
+        **_alone(posterior, gaussian, spectrum, data),
+        **_draws(posterior, *drawn),
+        "point": points.values,
+        "mode": posterior.physical(gaussian.mode[None])[0],
+        "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, others))),
+    }
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_verdict(verdict, test),
-        **of_prior(gaussian.mode[:d], spectrum),
-        **({} if mesh is None else of_mesh(mesh, inferred.before, len(best) - d)),
+        **of_prior(gaussian.mode[: len(posterior.inputs.names)], spectrum),
+        **({} if mesh is None else of_mesh(mesh, inferred.before, others)),
         **({} if problem.truth is None else of_learnt(posterior.noise, problem.truth)),
         **of_motions(spectrum, posterior.noise, root),
         **({} if inferred.process is None else of_process(inferred.process)),
-        **_moments(posterior, one, known, points, look),
-        **_alone(posterior, gaussian, spectrum, data),
-        **({} if problem.assumed is None else _of_assumed(posterior, gaussian, at, known, problem.assumed)),
-        **({} if problem.questions is None else _asked(posterior, gaussian, at, problem.questions, method.seed, steps)),
-        **_draws(posterior, *drawn),
-        **_of_uncertain(posterior, points, gaussian.mode),
-        "point": points.values,
+        **of_some(of_all, kept),
+        **({} if look is None else _stiffness(posterior, one, known, points, lambda values: look(values[:, own]))),
+        **({} if inferred.moves is None else _of_assumed(inferred.moves, std, others)),
+        **({} if problem.questions is None else _asked(*asking, problem.questions, others, method.seed, steps)),
+        **_of_uncertain(posterior, points, gaussian.mode, problem, new),
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
         **diagnosed(chains, used=known.source == "chains"),
-        "mode": best,
         "log_evidence": np.array(log_evidence + more),
         "log_evidence_error": np.array(error),
         "laplace_log_evidence": np.array(gaussian.log_evidence + more),
         "effective": np.array(found.ess),
         "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),
-        "solves": np.array(counted.solves + (0 if chains is None else chains.apart)),
+        "solves": np.array(counted.solves + inferred.solves + (0 if chains is None else chains.apart)),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
-        "step": np.array(searched.steps).reshape(-1, 4),
-        "start_mode": posterior.physical(searched.modes),
-        "start_log_posterior": searched.ends,
-        "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),
+        "step": np.array(inferred.searched.steps).reshape(-1, 4),
+        "start_mode": of_data_set.physical(inferred.searched.modes),
+        "start_log_posterior": inferred.searched.ends,
     }
     return Inverted(as_dataset(record), posterior, found)
 
@@ -207,28 +216,29 @@ def _drawn(posterior: Posterior, one: Assessment, at: Density, method: Invert) -
     return found, found.values[: method.draws], found.outputs[: method.draws]
 
 
-def _moments(posterior: Posterior, one: Assessment, known: Answer, points: Points, look: Look | None) -> Record:
-    """Moments and quantiles of the parameters, of the stiffness by weighted points; widths of the Gaussian."""
-    ends, gaussian = known.quantiles(ENDS), one.gaussian
-    record: Record = {
+def _moments(posterior: Posterior, one: Assessment, known: Answer, points: Points) -> Record:
+    """Moments and quantiles of the parameters; widths of the Gaussian."""
+    ends = known.quantiles(ENDS)
+    return {
         "mean": known.mean,
         "std": known.std,
         "lower": ends[:, 0],
         "upper": ends[:, 1],
         "covariance": known.covariance,
         "outermost": known.outermost,
-        "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, gaussian).std,
+        "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, one.gaussian).std,
     }
-    if look is None:
-        return record
+
+
+def _stiffness(posterior: Posterior, one: Assessment, known: Answer, points: Points, look: Look) -> Record:
+    """Moments of the stiffness by weighted points or chains, and at the mode."""
     values, weights = points.values[points.weights > 0], points.weights[points.weights > 0]
     if known.source == "chains" and one.chains is not None:
         values, weights = one.chains.flat, even(len(one.chains.flat))
-    d = len(posterior.inputs.names)
-    stiffness = look(values[:, :d])
+    stiffness = look(values)
     average = weights @ stiffness
-    return record | {
-        "stiffness_mode": look(posterior.physical(gaussian.mode[None])[:, :d])[0],
+    return {
+        "stiffness_mode": look(posterior.physical(one.gaussian.mode[None]))[0],
         "stiffness_mean": average,
         "stiffness_std": np.sqrt(np.maximum(weights @ (stiffness - average) ** 2, 0)),
     }
@@ -248,20 +258,19 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Me
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
 
 
-def _of_assumed(posterior: Posterior, gaussian: Laplace, at: Density, known: Answer, assumed: Assumptions) -> Record:
+def _of_assumed(moves: Moves, std: FloatArray, others: int) -> Record:
     """How far (…, c) what is taken for granted moves the parameters, in their deviations; of the noise NaN."""
-    moves, d = moved_by(posterior, gaussian, at, assumed), len(posterior.inputs.names)
-    nans = ((0, 0), (0, len(known.std) - d))
-    shift, bend = (np.pad(of / known.std[:d], nans, constant_values=np.nan) for of in (moves.parameters, moves.bends))
+    nans = ((0, 0), (0, others))
+    shift, bend = (np.pad(of / std, nans, constant_values=np.nan) for of in (moves.parameters, moves.bends))
     return {"assumption_shift": shift, "assumption_bend": bend}
 
 
 def _asked(
-    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int, steps: Steps
+    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, others: int, seed: int, steps: Steps
 ) -> Record:
     """Answers to questions to the shape; how far (q, c) they move the parameters is NaN of the noise."""
     found = asked(posterior, gaussian, at, questions, seed, steps)
-    nans = ((0, 0), (0, len(posterior.names) - len(posterior.inputs.names)))
+    nans = ((0, 0), (0, others))
     each = ([one.move for one in found], [one.left for one in found])
     move, left = (np.pad(np.array(of), nans, constant_values=np.nan) for of in each)
     return {
@@ -281,20 +290,30 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
     return {"draw": draws, "draw_log_likelihood": -noise.minus_log(gaps) - np.log(scale)}
 
 
-def _of_uncertain(posterior: Posterior, points: Points, mode: FloatArray) -> Record:
+def _of_uncertain(
+    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem, new: Sequence[int]
+) -> Record:
     """Moments of what is uncertain beside the parameters, in its deviations, at each point and over all.
 
-    With the most probable size of the errors, for which it was made.
+    With the most probable size of the errors, for which it was made; what was sampled is known at each point.
     """
-    pull, seen = posterior.noise.pull, points.weights[:, None] > 0
-    if not len(pull):
+    pull, seen, sampled = posterior.noise.pull, points.weights[:, None] > 0, np.zeros(0, dtype=int)
+    count = len(pull) + len(new)
+    if not count:
         return {}
-    there = -posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None]) @ pull.T
-    mean, covariance = points.weights @ there, np.eye(len(pull)) - pull @ pull.T
+    if new and problem.assumed is not None and problem.sampled is not None:
+        sampled = np.array([list(problem.assumed.groups).index(name) for name in problem.sampled.names])
+    others = np.delete(np.arange(count), sampled)
+    there, covariance = np.zeros((len(points.values), count)), np.zeros((count, count))
+    there[:, others] = -posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None]) @ pull.T
+    there[:, sampled] = np.where(seen, points.values[:, list(new)], 0.0)
+    covariance[np.ix_(others, others)] = np.eye(len(pull)) - pull @ pull.T
+    mean = points.weights @ there
     squares = np.diag(covariance) + points.weights @ (there - mean) ** 2
     return {
         "uncertain_point": there,
         "uncertain_covariance": covariance,
         "uncertain_mean": mean,
         "uncertain_std": np.sqrt(np.maximum(squares, 0)),
+        "uncertain_sampled": np.isin(np.arange(count), sampled),
     }

@@ -26,6 +26,7 @@ from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared, determined
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.residual_process import Process
+from inverse.methods.infer import Sampled
 from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
 from uq.estimators.estimate import BAND, part
@@ -67,7 +68,7 @@ _ARRAYS = {
     "uncertain parameter": "assumption_bend",
     "question": "question_probability question_log_evidence",
     "question parameter": "question_move question_left",
-    "uncertain": "uncertain_mean uncertain_std",
+    "uncertain": "uncertain_mean uncertain_std uncertain_sampled",
     "uncertain uncertain_partner": "uncertain_covariance",
     "point uncertain": "uncertain_point",
     "iteration column": "step",
@@ -120,6 +121,8 @@ class Problem:
         What the body does not have, to be asked about; None if nothing is asked.
     truth
         What the errors of the model are learnt from; None where they are not.
+    sampled
+        What samples that of `assumed` which is too uncertain for first order; None where nothing can be.
     """
 
     data: Measurements
@@ -132,6 +135,7 @@ class Problem:
     assumed: Assumptions | None = None
     questions: Questions | None = None
     truth: Truth | None = None
+    sampled: Sampled | None = None
 
     @property
     def noise(self) -> Noise:
@@ -145,6 +149,20 @@ def as_dataset(record: Record) -> xr.Dataset:
 
     kinds = {name: str if name in WORDS else float for name in DIMS if name in record}
     return xr.Dataset({name: (DIMS[name], np.asarray(record[name], kind)) for name, kind in kinds.items()})
+
+
+def of_some(record: Record, parameters: Sequence[int]) -> Record:
+    """Return arrays of a record with some of their parameters (p,) only."""
+    chosen = {"parameter": parameters, "partner": parameters}
+    return {name: _taken(values, [chosen.get(dim) for dim in DIMS[name]]) for name, values in record.items()}
+
+
+def _taken(values: FloatArray | str, places: Sequence[Sequence[int] | None]) -> FloatArray:
+    """Return some places along axes of an array; None: all of them."""
+    found = np.asarray(values)
+    for axis, some in enumerate(places):
+        found = found if some is None else np.take(found, some, axis=axis)
+    return found
 
 
 def with_record(found: xr.Dataset, record: Record) -> xr.Dataset:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
-from uq.inputs.distributions import Distribution
+from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.sampling import random_points, sobol_points
 
 if TYPE_CHECKING:
@@ -89,6 +89,10 @@ class Inputs:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return tuple(self.marginals)
+
+    def beside(self, names: Sequence[str]) -> Inputs:
+        """Return the same with further parameters, which are standard normal and independent."""
+        return replace(self, own=self.own | dict.fromkeys(names, Normal(mean=0.0, std=1.0)))
 
     @property
     def independent(self) -> bool:

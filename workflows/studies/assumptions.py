@@ -35,8 +35,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from uq.evaluation.request import Evaluate
+    from uq.inputs.random_parameters import Inputs
 
-ASSUMED = "taken for granted"  # in names of models
+ASSUMED, SAMPLED = "taken for granted", "what is sampled"  # in names of models
 KEPT = ("size", "unit", "part")  # of what is taken for granted, in results
 
 
@@ -190,17 +191,32 @@ class TakenForGranted:
 
     def by_deviations(self, comm: Any) -> ForwardModel:
         """Make the model with what is uncertain among its parameters, each in its standard deviations; collective."""
-        if not self.groups:
-            found: ForwardModel = self.build(comm)
-            return found
-        from scipy.sparse import block_diag, eye
+        found: ForwardModel = self.build(comm)
+        return self._by(found, tuple(self.groups), (*self.unknown, *self.groups)) if self.groups else found
+
+    def _by(self, model: ForwardModel, groups: Sequence[str], names: tuple[str, ...]) -> ForwardModel:
+        """Return a model with all of these numbers, of parameters of some names: the unknown, and groups."""
+        from scipy.sparse import csr_matrix
 
         from forward.affine import Sparse
         from forward.combine import Mapped
 
-        d = len(self.unknown)
-        by = Sparse(block_diag((eye(d), self.loadings), format="csr"), np.append(np.zeros(d), self.values))
-        return Mapped(self.build(comm), by, (*self.unknown, *self.groups))
+        d, columns = len(self.unknown), list(self.groups)
+        by = np.zeros((d + len(self.numbers), len(names)))
+        by[range(d), [names.index(name) for name in self.unknown]] = 1.0
+        for name in groups:
+            by[d:, names.index(name)] = self.loadings[:, columns.index(name)]
+        return Mapped(model, Sparse(csr_matrix(by), np.append(np.zeros(d), self.values)), names)
+
+    @property
+    def sampled(self) -> tuple[str, ...]:
+        """Names of what is uncertain of the model only, which can be sampled."""
+        k = len(self.numbers)
+        return tuple(name for name, row in self.groups.items() if row[:k].any() and not row[k:].any())
+
+    def sampling(self, model: ForwardModel, inputs: Inputs) -> ForwardModel:
+        """Return a model with all of these numbers, of parameters as `Inputs.beside` has them with those sampled."""
+        return self._by(model, self.sampled, inputs.beside(self.sampled).names)
 
     @property
     def asked(self) -> bool:

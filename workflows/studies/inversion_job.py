@@ -19,6 +19,7 @@ from forward.settings import one_line
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
+from inverse.methods.infer import Sampled
 from inverse.methods.invert import derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.model_error import Truth
@@ -30,7 +31,7 @@ from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
-from workflows.studies.assumptions import ASSUMED
+from workflows.studies.assumptions import ASSUMED, SAMPLED
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import (
     BATCH,
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from workflows.studies.predicted import FieldPredictions
 
 BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
+Held = tuple[ForwardModel | None, ForwardModel | None]
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
@@ -91,7 +93,8 @@ class _Observed:
     shared
         What errors the data share, and the model that tells what they are; None if they are independent.
     held
-        The model with the numbers that are taken for granted; None where it is not asked.
+        The model with the numbers that are taken for granted, and with those that can be sampled; None where it is not
+        asked, or nothing can be.
     questions
         Questions to its shape; None where there are none.
     truth
@@ -101,7 +104,7 @@ class _Observed:
     model: ForwardModel
     there: There
     shared: tuple[SharedMotion, ForwardModel] | None = None
-    held: ForwardModel | None = None
+    held: Held = (None, None)
     questions: Questions | None = None
     truth: ForwardModel | None = None
 
@@ -143,13 +146,19 @@ def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
     return _Made(model, lambda number: _Observed(model, there, None, held(number), asked(number), truth))
 
 
-def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], ForwardModel | None]:
-    """Return what makes the model of a data set, by its number, with what is taken for granted; collective."""
+def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Held]:
+    """Return what makes the models of a data set, by its number, with what is taken for granted; collective."""
     taken = study.taken
     if taken is None:
-        return lambda number: None
+        return lambda number: (None, None)
     model = taken.build(ensemble.group)
-    return lambda number: taken.observed(model, study.measurements[number])
+    can = bool(taken.sampled) and not study.field
+
+    def held(number: int) -> Held:
+        data = study.measurements[number]
+        return taken.observed(model, data), taken.sampling(observing(model, data), study.inputs) if can else None
+
+    return held
 
 
 def _asking(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Questions | None]:
@@ -231,18 +240,19 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensem
         finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
     shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
     steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
-    data, taken, assumed = study.measurements[number], study.taken, None
+    data, taken, assumed, sampled = study.measurements[number], study.taken, None, None
     if taken is not None:
-        held, ask = seen.held, None
+        (held, wider), ask = seen.held, None
         if held is not None:
             ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
         assumed = taken.of(data, ask)
         shared = together(shared, assumed.shared)
+        sampled = None if wider is None else Sampled(taken.sampled, wider, on(SAMPLED, wider))
     truth = None
     if seen.truth is not None and study.model_error is not None:
         truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
     errors, questions = study.data.errors, seen.questions
-    return Problem(data, study.method, errors, finer, shared, ensemble.say, steps, assumed, questions, truth)
+    return Problem(data, study.method, errors, finer, shared, ensemble.say, steps, assumed, questions, truth, sampled)
 
 
 def _inverted(
@@ -411,7 +421,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Ch
     cheap = _reduced(study)(seen.model)
     moved = None if seen.shared is None else seen.shared[1]
     fine = None if seen.there is None else seen.there[0]
-    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: seen.held, TRUTH: seen.truth}
+    held, wider = seen.held
+    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: held, SAMPLED: wider, TRUTH: seen.truth}
     others = {name: partial(lambda one: one, model) for name, model in models.items() if model is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:

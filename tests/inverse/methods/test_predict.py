@@ -38,6 +38,31 @@ def linear(matrix):
     return FunctionModel(lambda m: matrix @ m + 1, names, tuple(map(str, range(len(matrix)))), lambda m: matrix)
 
 
+@pytest.mark.parametrize("more", [[], ["data.outputs={}", "data.files='sets'"]], ids=["alone", "side by side"])
+def test_what_is_too_uncertain_for_first_order_is_sampled(folder, more):
+    """As if it were one more unknown, and so with the same numbers; also in what is predicted."""
+    text = (folder / "wider.toml").read_text().replace(".wider", ".bent").replace(".bent_other", ".wider_other")
+    (folder / "bent.toml").write_text(text)
+    known = 's = { kind = "normal", mean = 2.0, std = 0.4 }\n\n[data]'
+    (folder / "known.toml").write_text(text.replace("s = 0.4\n", "").replace("\n[data]", known))
+    (folder / "sets").mkdir(exist_ok=True)
+    for name in ("one", "two"):
+        (folder / "sets" / f"{name}.csv").write_text("output,value,sigma\nu,0.4,0.05\nw,3.1,0.31\nw,2.9,0.29\n")
+    found, right = (folder / f"{name}-{len(more)}" for name in ("bent", "known"))
+    assert ran(folder / "bent.toml", found, *more) == ran(folder / "known.toml", right, *more) == 0
+    one, other = (results(out).isel(data_set=-1) for out in (found, right))
+    for name in ("mode", "mean", "std", "lower", "upper", "log_evidence"):
+        of = other[name].sel(parameter=["a", "b"]) if "parameter" in other[name].dims else other[name]
+        np.testing.assert_allclose(one[name], of, rtol=2e-3, err_msg=name)  # the searches end a little apart
+    assert float(one["uncertain_mean"][0]) == pytest.approx((other["mean"].values[2] - 2) / 0.4, abs=0.05)
+    assert float(one["uncertain_std"][0]) == pytest.approx(other["std"].values[2] / 0.4, rel=0.05)
+    assert float(one["prediction_mean"][0]) == pytest.approx(float(other["prediction_mean"][0]), rel=1e-3)
+    assert float(one["prediction_std"][0]) == pytest.approx(float(other["prediction_std"][0]), rel=0.02)
+    (said, *_) = [one for one in findings(found) if one["code"] == "uncertain-sampled"]
+    assert "s: too uncertain for first order" in said["text"]
+    assert not any(one["code"] == "uncertain-bent" for one in findings(found))
+
+
 def test_a_linear_chain_from_data_to_prediction_is_exact_for_fields():
     """Against dense linear algebra, to 1e-8; pairs of draws find nothing that the gradients leave out."""
     values = SEEN @ ROOT @ RNG.standard_normal(SIZE) + 1 + SIGMA * RNG.standard_normal(DATA)
@@ -155,6 +180,14 @@ def wider_slopes(p):
     return np.column_stack([A, B])
 
 
+def bent(p):
+    return A @ p[:2] * np.exp(p[2] - 2)
+
+
+def bent_slopes(p):
+    return np.column_stack([A, A @ p[:2]]) * np.exp(p[2] - 2)
+
+
 def wider_other(p):
     return np.array([p[0] - p[1] + 2 * p[2] + 3 * p[3]])
 
@@ -219,6 +252,10 @@ def ran(study, out, *changes, report=False):
 
 def results(out):
     return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+
+
+def findings(out):
+    return json.loads((out / "summary.json").read_text())["findings"]
 
 
 def exactly():
