@@ -117,8 +117,9 @@ def with_beside(
 
 def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
     """Return what draws of the parameters of a model, in their order, say on its outputs, with `samples` solves."""
+    from uq.estimators.indices import moments
     from uq.estimators.input_sample_error import with_errors_of_draws
-    from uq.methods.chaos import Chaos
+    from uq.methods.chaos import Chaos, expansion_dataset
 
     objection = draws.objection()
     if objection is not None:
@@ -126,7 +127,9 @@ def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
     inputs = Inputs({}, draws=draws)
     method = Chaos(samples=samples, seed=seed, fields=False, quantiles=ENDS)
     try:
-        found = with_errors_of_draws(method.run(inputs, evaluate), inputs)
+        expanded = method.expand(inputs, evaluate)
+        whole = expansion_dataset(evaluate, expanded, seed, ENDS, fields=False, of=moments)  # nobody asks for effects
+        found = with_errors_of_draws(whole, inputs)
     except SolveError as error:
         return Band.unknown(len(evaluate.outputs), error.reason)
     mean, mean_error, std, std_error = (found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error"))

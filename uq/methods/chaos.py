@@ -18,6 +18,7 @@ from pydantic import Field
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.estimate import Variables
+from uq.estimators.indices import Analysis
 from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -270,9 +271,9 @@ class Expanded:
         found = replace(self, unseen=spread)
         return found, goal.reached(found.estimates())
 
-    def estimates(self) -> dict[str, FloatArray]:
+    def estimates(self, of: Analysis | None = None) -> dict[str, FloatArray]:
         """Return estimates by output with their errors, as `Regression.estimates` does."""
-        found = self.regression.estimates()
+        found = self.regression.estimates(of)
         if self.unseen is not None:
             for name, error in zip(("mean_error", "std_error"), self.unseen, strict=True):
                 found[name] = np.hypot(found[name], error)
@@ -311,15 +312,16 @@ def expansion_dataset(
     further: Mapping[str, FloatArray] | None = None,
     *,
     fields: bool,
+    of: Analysis | None = None,
 ) -> xr.Dataset:
     """Return the results of an expansion, with quantiles from points of a seed, and the displacement field or without.
 
-    `further` errors (m,) of "mean" and "std" are known from elsewhere.
+    `further` errors (m,) of "mean" and "std" are known from elsewhere; analyses other than indices are `of` these.
     """
     centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
     inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = expanded.estimates()
+    estimates = expanded.estimates(of)
     for name, error in (further or {}).items():
         estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
     lower, upper = (

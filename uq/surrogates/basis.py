@@ -73,10 +73,7 @@ class Joint:
 
     def values(self, t: FloatArray) -> FloatArray:
         """Return the functions (n, Q) at coordinates (n, k)."""
-        return self.made([hermite(column, int(self.indices.max(initial=1))) for column in t.T])
-
-    def made(self, tables: list[FloatArray]) -> FloatArray:
-        """Return the functions (n, Q), or derivatives of them, from tables (n, N + 1) of single coordinates."""
+        tables = [hermite(column, int(self.indices.max(initial=1))) for column in t.T]
         return np.asarray(_products(tables, self.indices) @ self.inverse)
 
     def number(self, indices: IntArray) -> IntArray:
@@ -168,15 +165,16 @@ class Basis:
                 slopes.append(np.column_stack(columns[1]))
         if self.joint is None:
             return values, slopes
-        start, joint = int(self.joint.members[0]), self.joint
+        start, used = int(self.joint.members[0]), self._joined[0]
         own, together = values[:start], values[start:]
-
+        indices = self.joint.indices[: used[-1] + 1]  # each function is made of products up to its own
+        inverse = self.joint.inverse[: len(indices), used]
         for i, table in enumerate(slopes[start:]):
-            derived = np.zeros((len(t), len(joint.indices)))
-            varying = np.flatnonzero(joint.indices[:, i])
-            derived[:, varying] = _products([*together[:i], table, *together[i + 1 :]], joint.indices[varying])
-            slopes[start + i] = derived @ joint.inverse
-        return [*own, joint.made(together)], slopes
+            derived = np.zeros((len(t), len(indices)))
+            varying = np.flatnonzero(indices[:, i])
+            derived[:, varying] = _products([*together[:i], table, *together[i + 1 :]], indices[varying])
+            slopes[start + i] = derived @ inverse
+        return [*own, _products(together, indices) @ inverse], slopes
 
     @property
     def _degrees(self) -> list[int]:
@@ -193,7 +191,14 @@ class Basis:
         if self.joint is None:
             return self.indices
         own = self.indices[:, : int(self.joint.members[0])]
-        return np.column_stack([own, self.joint.number(self.indices)])
+        return np.column_stack([own, self._joined[1]])
+
+    @cached_property
+    def _joined(self) -> tuple[IntArray, IntArray]:
+        """Which joint functions are needed, the constant one first; and which of these is in each function (P,)."""
+        assert self.joint is not None
+        used, places = np.unique([0, *self.joint.number(self.indices)], return_inverse=True)
+        return used, places.ravel()[1:]
 
 
 def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
