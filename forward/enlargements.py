@@ -7,7 +7,7 @@ the strengths are standard normal beforehand: changes of ln of the stiffness at 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,11 +26,68 @@ EDGE, RATIO, STIFFNESS = np.log(2), 0.25, np.log(2)
 STEP, TINY = 1e-4, 1e-6  # of these, by which they are changed for derivatives; of a field that is none
 SIZES = (1.0, 0.6)  # of another lump, over that of the one that there is
 SPACING = 0.6  # of its radius, between the places where it may be
+ROUND = 0.5  # standard deviation of ln of its radius, where that is fitted
 MOST, WIDER = 600, 1.1  # places of one size, and by what they are farther apart where there would be more
 DEPTHS = (0.1, 0.2)  # of a layer, over the smallest extent of the body
 LENGTH, MODES = 0.5, 16  # of a field: its correlation length over the smallest extent, and its modes
 DIRECTIONS = 48  # of fibres
 ASKED = "asked"  # name of what is added
+
+
+class Lump(NamedTuple):
+    """Another lump: a form that can be moved. Its place, its radius, and the width of its edge (m)."""
+
+    x: float
+    y: float
+    z: float
+    radius: float
+    width: float
+
+    def __str__(self) -> str:
+        """Say where it is."""
+        return f"at {place(self[:3])}, radius {told(self.radius, 'm')}"
+
+    def pattern(self, places: FloatArray) -> FloatArray:
+        """Return what it adds to ln of the stiffness (N,) at places (N, 3)."""
+        ball = Sphere(x=self.x, y=self.y, z=self.z, radius=self.radius, contrast=np.exp(STIFFNESS), width=self.width)
+        return np.asarray(log_factor([ball], (), np.zeros((1, 0)), places)[0])
+
+
+def fitted(
+    spec: Solid, form: Any, strengths: FloatArray, places: FloatArray
+) -> tuple[Lump, FloatArray, FloatArray] | None:
+    """Return a lump as it is moved, its patterns (5, N + 15), and the means (5,) of their strengths beforehand.
+
+    The first is the lump, of which the strength is known, others by how many deviations its place and radius change.
+    These are normal beforehand, all over the body. None for what is no lump.
+
+    Parameters
+    ----------
+    spec, places
+        As of `enlargements`.
+    form, strengths
+        The lump, and the most probable strengths: of the lump alone (1,), or of all of these (5,).
+    """
+    if not isinstance(form, Lump):
+        return None
+    box = np.array(spec.body.bounds)
+    widths = np.append(np.ptp(box, axis=1) / np.sqrt(12), ROUND)
+    centre = np.append(box.mean(axis=1), np.log(max(_usual(spec.body, spec.inclusions))))
+    here = np.array([*form[:3], np.log(form.radius)])
+    if len(strengths) > 1:
+        far = np.append(np.full(3, form.radius / 2), ROUND)
+        here = here + np.clip(widths * strengths[1:], -far, far)
+        here[:3] = np.clip(here[:3], *box.T)
+
+    def at(numbers: FloatArray) -> Lump:
+        x, y, z, log_radius = map(float, numbers)
+        return Lump(x, y, z, float(np.exp(log_radius)), form.width)
+
+    steps = STEP * np.diag(np.append(np.full(3, form.radius), 1.0))
+    slopes = [(at(here + h).pattern(places) - at(here - h).pattern(places)) / (2 * h.sum()) for h in steps]
+    moves = strengths[0] * widths[:, None] * slopes
+    patterns = np.pad(np.vstack([at(here).pattern(places), moves]), ((0, 0), (0, len(QUARTICS))))
+    return at(here), patterns, np.append(0.0, (centre - here) / widths)
 
 
 def enlarged(spec: Any) -> tuple[Any, tuple[str, ...]]:
@@ -58,8 +115,8 @@ def asked_of(spec: Any) -> tuple[str, ...]:
 
 def enlargements(
     spec: Solid, parameters: Sequence[str], point: FloatArray, places: FloatArray
-) -> dict[str, dict[str, FloatArray]]:
-    """Return what a body with inclusions could have beside them, by names: its forms by names.
+) -> dict[str, dict[Any, FloatArray]]:
+    """Return what a body with inclusions could have beside them, by names: its forms, which say what they are.
 
     Each is an array (k, N + 15) of its patterns: of ln of the stiffness at the vertices, and of fibres.
 
@@ -73,7 +130,7 @@ def enlargements(
         The vertices (N, 3) of the body, in canonical order (m).
     """
     body, now = spec.body, [_at(one, parameters, point) for one in spec.inclusions]
-    found: list[dict[str, FloatArray]] = []
+    found: list[dict[Any, FloatArray]] = []
     for one in now:
         found.append({"another width": _slope(one, {"width": EDGE}, places)[None]})
         if isinstance(one, Sphere):
@@ -124,12 +181,16 @@ def _squeezed(ball: Sphere, places: FloatArray) -> Iterator[FloatArray]:
         yield _slope(turned, {grown: RATIO, shrunk: -RATIO}, places)
 
 
+def _usual(body: Body, inclusions: Sequence[Sphere | Ellipsoid]) -> list[float]:
+    """Radii (m) that lumps usually have: those of the inclusions, if there are any."""
+    return [_radius(one) for one in inclusions] or [_extent(body) / 4]
+
+
 def _lumps(
     body: Body, inclusions: Sequence[Sphere | Ellipsoid], places: FloatArray
-) -> Iterator[tuple[str, FloatArray]]:
+) -> Iterator[tuple[Lump, FloatArray]]:
     """Yield lumps at places all over the body, as large as those that it has, or somewhat smaller."""
-    cell = body.longest_edge
-    usual = [_radius(one) for one in inclusions] or [_extent(body) / 4]
+    cell, usual = body.longest_edge, _usual(body, inclusions)
     width = min([one.width for one in inclusions], default=usual[0] / 2)
     for radius in sorted({max(size * max(usual), cell) for size in SIZES}, reverse=True):
         spacing, centres = SPACING * radius, _lattice(body, places, SPACING * radius)
@@ -140,9 +201,8 @@ def _lumps(
         for one in inclusions:
             same |= np.linalg.norm(centres - (one.x, one.y, one.z), axis=1) < _radius(one)
         for x, y, z in (centres if same.all() else centres[~same]).tolist():
-            lump = Sphere(x=x, y=y, z=z, radius=radius, contrast=np.exp(STIFFNESS), width=max(width, cell / 2))
-            label = f"at {place((x, y, z))}, radius {told(radius, 'm')}"
-            yield label, log_factor([lump], (), np.zeros((1, 0)), places)
+            lump = Lump(x, y, z, radius, max(width, cell / 2))
+            yield lump, lump.pattern(places)[None]
 
 
 def _lattice(body: Body, places: FloatArray, spacing: float) -> FloatArray:

@@ -27,8 +27,18 @@ def pytest_configure(config):
         config.option.loadscopereorder = False
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Files that start most programs come first, since they take longest: workers end with short files together."""
+    """Of tests with `few(n)` cases the first n are enough by default: the others are slow.
+
+    Files that start most programs come first, since they take longest: workers end with short files together.
+    """
+    seen = Counter()
+    for item in items:
+        few = item.get_closest_marker("few")
+        seen[item.function] += 1
+        if few is not None and seen[item.function] > few.args[0]:
+            item.add_marker("slow")
     launching = Counter(item.path for item in items if item.get_closest_marker("mpi"))
     solving = Counter(item.path for item in items if item.get_closest_marker("fem"))
     items.sort(key=lambda item: (-launching[item.path], -solving[item.path]))

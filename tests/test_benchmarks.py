@@ -25,6 +25,7 @@ def test_the_map_of_hard_cases_can_be_listed() -> None:
     assert "beam-million" not in shipped
 
 
+@pytest.mark.slow
 def test_time_and_memory_of_a_size_are_measured() -> None:
     unknowns, build, first, counting, tangents, memory = size.measured((3, 1, 1), "multigrid", 1)
     assert unknowns == 3 * 7 * 3 * 3

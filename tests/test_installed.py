@@ -196,6 +196,7 @@ noise = {}
 """
 
 
+@pytest.mark.slow
 def test_a_candidate_of_material_tests(site, tmp_path, monkeypatch, undrawn):
     (tmp_path / "points.toml").write_text(POINTS)
     monkeypatch.syspath_prepend(site)

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 
-from tests.launch import ROOT, environment
+from tests.launch import ROOT, environment, run_script
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +80,16 @@ def test_a_run_without_fenicsx_says_in_a_line_how_to_get_it(site, tmp_path, abse
     assert "pip install 'tissuq[fenicsx]'" in line
 
 
+def test_a_dolfinx_that_nobody_has_tried_is_named(tmp_path, monkeypatch):
+    """With its version and those that were tried; on request it is taken, as if it were the newest of these."""
+    script = "import sys, dolfinx; dolfinx.__version__ = '0.9.0'; from tissuq.__main__ import main; sys.exit(main())"
+    words = ["run", str(ROOT / "configs" / "tiny.toml"), "--out", str(tmp_path / "out"), "--set", "method.samples=2"]
+    for asked in ("", "1"):
+        monkeypatch.setenv("TISSUQ_ANY_DOLFINX", asked)
+        done = run_script(None, script, *words)
+        assert ("DOLFINx 0.9.0, expected one of 0.5.x, 0.11.x" in done.stderr) is (not asked)
+
+
 def test_a_script_without_fenicsx_is_told_too(site, tmp_path):
     script = (
         "import sys; sys.modules['petsc4py'] = None; import tissuq; "
@@ -100,6 +110,7 @@ def test_on_debian_pip_takes_nothing_that_its_dolfinx_brings(site):
     assert "1.26.0" not in on_debian["numpy"].specifier
 
 
+@pytest.mark.slow
 def test_the_source_archive_holds_what_the_wheel_is_made_from(site, tmp_path):
     build = "import sys; from hatchling.build import build_sdist; print(build_sdist(sys.argv[1]))"
     done = subprocess.run(

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -28,7 +28,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
-from inverse.low_dimensional.wider import widened
+from inverse.low_dimensional.wider import Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 DRAWS = 4000  # of scores as they are by chance
 CALLED = 0.05  # probability up to which data call for something
 OPEN, SHOWN = 1.0, 3  # deviations that data leave open from which on that is told, and of how many
-Forms = Mapping[str, Mapping[str, FloatArray]]  # names of enlargements → names of their forms → patterns (k, N)
+ROUNDS, SETTLED = 5, 0.05  # how often a form is moved at most, until it moves by fewer deviations
+Forms = Mapping[str, Mapping[Any, FloatArray]]  # names of enlargements → their forms, which say it → patterns (k, N)
 
 
 class Answer(NamedTuple):
@@ -65,7 +66,7 @@ class Answer(NamedTuple):
     """
 
     name: str
-    form: str
+    form: Any
     probability: float
     log_evidence: float
     move: FloatArray
@@ -87,11 +88,15 @@ class Questions:
         Parameters (d,) → the enlargements there.
     having
         Names of parameters, strengths of patterns (k, N) behind the d of the model, and these → the model of these.
+    fitted
+        A form and its most probable strengths → the form as these move it, its patterns (k, N) there, and the means of
+        their strengths (k,); None of forms that do not move.
     """
 
     model: ForwardModel
     forms: Callable[[FloatArray], Forms]
     having: Callable[[Sequence[str], FloatArray], Evaluate]
+    fitted: Callable[[Any, FloatArray], tuple[Any, FloatArray, FloatArray] | None] = lambda form, strengths: None
 
     def changes(self, posterior: Posterior, point: FloatArray, patterns: FloatArray) -> FloatArray:
         """Return derivatives (k, M) of the outputs by strengths of patterns (k, N) at parameters (d,); collective.
@@ -135,22 +140,43 @@ def asked(
 def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answer: Answer) -> Answer:
     """Return an answer with evidence and moves by Laplace's Gaussian with the enlargement, as Gauss–Newton has it.
 
-    To first order if the model has no answer there.
+    A form that can be moved is moved to where the data like it best; its evidence is then that over all places. To
+    first order if the model has no answer there.
     """
-    d, names = len(posterior.inputs.names), [f"{answer.name}, strength {k}" for k in range(len(answer.patterns))]
+    before, own = posterior.physical(gaussian.mode[None])[0, : len(posterior.inputs.names)], gaussian.log_evidence
+    form, patterns, means, searched = answer.form, answer.patterns, np.zeros(len(answer.patterns)), answer.searched
+    strengths, found = answer.strengths, answer
+    for _ in range(ROUNDS):
+        try:
+            wider, end = _with(posterior, gaussian, questions, answer.name, patterns, means, strengths)
+        except SolveError:
+            return found
+        strengths = wider.posterior.physical(end.mode[None])[0, wider.new]
+        move = (wider.posterior.physical(end.mode[None])[0, wider.own] - before) / deviations(posterior, gaussian)
+        found = answer._replace(form=form, log_evidence=end.log_evidence - own + searched, move=move)
+        moved = questions.fitted(form, strengths)
+        if moved is None or (len(strengths) > 1 and np.abs(strengths[1:]).max() < SETTLED):
+            break
+        (form, patterns, means), searched = moved, 0.0
+        strengths = np.append(strengths[0], np.zeros(len(means) - 1))
+    return found
 
-    def having(wanted: Sequence[str]) -> Evaluate:
-        return questions.having(wanted, answer.patterns)
 
-    try:
-        wider = widened(posterior, gaussian.mode, names, answer.strengths, having)
-        found = laplace(wider.posterior, starts=1, exact=False, first=wider.first)
-    except SolveError:
-        return answer
-    there = wider.posterior.physical(found.mode[None])[0, wider.own]
-    move = there - posterior.physical(gaussian.mode[None])[0, :d]
-    gain = found.log_evidence - gaussian.log_evidence + answer.searched
-    return answer._replace(log_evidence=gain, move=move / deviations(posterior, gaussian))
+def _with(
+    posterior: Posterior,
+    gaussian: Laplace,
+    questions: Questions,
+    name: str,
+    patterns: FloatArray,
+    means: FloatArray,
+    strengths: FloatArray,
+) -> tuple[Wider, Laplace]:
+    """Search for the mode with strengths (k,) of patterns (k, N) too, of which the means beforehand are known."""
+    names = [f"{name}, strength {k}" for k in range(len(patterns))]
+    wider = widened(
+        posterior, gaussian.mode, names, strengths, lambda wanted: questions.having(wanted, patterns), means
+    )
+    return wider, laplace(wider.posterior, starts=1, exact=False, first=wider.first)
 
 
 def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
@@ -186,7 +212,7 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
 class _Form(NamedTuple):
     """One form: ln B of the data (), and by chance (n,), strengths (k,), covariance (k, k), moves (d, k), patterns."""
 
-    label: str
+    label: Any
     log_evidence: float
     by_chance: FloatArray
     strengths: FloatArray

@@ -47,8 +47,11 @@ def widened(
     names: Sequence[str],
     values: FloatArray,
     evaluate: Callable[[Sequence[str]], Evaluate],
+    means: FloatArray | None = None,
 ) -> Wider:
     """Return a posterior with unknowns of further names, near its mode (c,) and most probable values (k,) of these.
+
+    These have the standard deviation 1 beforehand, and means that are zero by default.
 
     Names of parameters → the model of these. What the model misses is taken to be the same whatever the others are.
 
@@ -58,7 +61,8 @@ def widened(
         If the model has no answer there.
     """
     before, d = posterior.inputs, len(posterior.inputs.names)
-    inputs = before.beside(names)
+    means = np.zeros(len(names)) if means is None else means
+    inputs = before.beside(names, means)
     own, new = ([inputs.names.index(name) for name in some] for some in (before.names, names))
 
     def wider(rows: FloatArray) -> FloatArray:
@@ -67,7 +71,7 @@ def widened(
         return found
 
     x = wider(mode[None, :d])
-    x[0, new] = values
+    x[0, new] = values - means
     noise, model = posterior.noise, evaluate(inputs.names)
     if noise.model is not None and noise.model.slopes.size:
         more = {"point": wider(noise.model.point[None])[0], "slopes": wider(noise.model.slopes)}

@@ -274,7 +274,7 @@ def _asked(
     each = ([one.move for one in found], [one.left for one in found])
     move, left = (np.pad(np.array(of), nans, constant_values=np.nan) for of in each)
     return {
-        "question_forms": "; ".join(one.form for one in found),
+        "question_forms": "; ".join(str(one.form) for one in found),
         "question_probability": np.array([one.probability for one in found]),
         "question_log_evidence": np.array([one.log_evidence for one in found]),
         "question_move": move,

@@ -13,6 +13,7 @@ LONG = {"02_error_against_time", "04_materials", "06_pipeline"}  # repeats, five
 SHORT = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG)) for path in NOTEBOOKS]
 
 
+@pytest.mark.few(2)
 @pytest.mark.fem
 @pytest.mark.parametrize("path", SHORT, ids=lambda path: path.stem)
 def test_every_line_runs(path, monkeypatch, tmp_path):

@@ -90,9 +90,10 @@ class Inputs:
         """Names of the parameters."""
         return tuple(self.marginals)
 
-    def beside(self, names: Sequence[str]) -> Inputs:
-        """Return the same with further parameters, which are standard normal and independent."""
-        return replace(self, own=self.own | dict.fromkeys(names, Normal(mean=0.0, std=1.0)))
+    def beside(self, names: Sequence[str], means: FloatArray | None = None) -> Inputs:
+        """Return the same with further independent normal parameters of standard deviation 1, of mean 0 by default."""
+        each = zip(names, np.zeros(len(names)) if means is None else means, strict=True)
+        return replace(self, own=self.own | {name: Normal(mean=float(mean), std=1.0) for name, mean in each})
 
     @property
     def independent(self) -> bool:

@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 
 from forward.affine import Sparse
 from forward.combine import Mapped
-from forward.enlargements import enlarged, enlargements
+from forward.enlargements import enlarged, enlargements, fitted
 from forward.fem.layout import vertex_matrices
 from forward.model import FloatArray
 from inverse.criticism.questions import Questions
@@ -24,7 +24,8 @@ def asking(spec: Any, names: tuple[str, ...], comm: Any) -> Callable[[Measuremen
     """Return what makes the questions for a data set on a body with unknown numbers, by their paths; collective."""
     larger, paths = enlarged(spec)
     model = larger.build(comm, (*names, *paths))
-    forms = partial(enlargements, spec, names, places=vertex_matrices(spec.body)[3])
+    places = vertex_matrices(spec.body)[3]
+    forms = partial(enlargements, spec, names, places=places)
 
     def of(data: Measurements) -> Questions:
         own = observing(model, data)
@@ -35,6 +36,6 @@ def asking(spec: Any, names: tuple[str, ...], comm: Any) -> Callable[[Measuremen
             by[len(names) :, [i for i, name in enumerate(wanted) if name not in names]] = patterns.T
             return SerialEvaluate(Mapped(own, Sparse(csr_matrix(by), np.zeros(len(by))), tuple(wanted)))
 
-        return Questions(own, forms, having)
+        return Questions(own, forms, having, partial(fitted, spec, places=places))
 
     return of

@@ -100,6 +100,7 @@ for comm in groups(1, 2):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_ranks_agree(tmp_path):

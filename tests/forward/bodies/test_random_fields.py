@@ -273,6 +273,7 @@ def alone():
     return shared(Ensemble.split(MPI.COMM_SELF))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ranks", "share"), [(2, 2), pytest.param(4, 2, marks=pytest.mark.slow), pytest.param(4, 4, marks=pytest.mark.slow)]
 )
@@ -351,6 +352,7 @@ def noisy():
     return study, study.model.build(MPI.COMM_SELF, study.inputs.names)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "method",
     [

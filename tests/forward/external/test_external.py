@@ -187,6 +187,7 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     sys.modules.pop("changing_model")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [b"{}", b"[]", b"", b"nan", b"\xff", b"[" * 5000, b'{"failed": 0}'])
 def test_a_damaged_summary_is_made_again(tmp_path, text):
     case = study("method.samples=8")

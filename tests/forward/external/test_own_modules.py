@@ -98,6 +98,7 @@ def tissuq(monkeypatch, capsys):
     return command
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_module_that_changes_between_interrupt_and_restart_is_refused(tmp_path, tissuq, way):
     write(tmp_path, way)
@@ -170,6 +171,7 @@ def test_modules_are_walked_through_again_once_a_text_or_a_folder_has_changed(tm
     assert len(walks) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["queue", "pyvista", "numpy", "inverse", "json", "h5py"])
 def test_what_stands_beside_a_study_is_not_run_in_place_of_others(tmp_path, name):
     """As a process, under a study of a Python model, which needs the folder, and of a body, which does not."""

@@ -236,6 +236,7 @@ def test_hosts_that_are_this_machine(function, host):
     assert raw(function, post(body, f"Host: {host}", f"Origin: http://{host}"))[0] == 200
 
 
+@pytest.mark.slow
 def test_fifty_clients_at_once_clients_that_leave_and_one_that_dawdles(tmp_path):
     path = tmp_path / "function.toml"
     path.write_text(FUNCTION.format("beam"))
@@ -362,6 +363,7 @@ def test_options_select_mesh_and_tolerance(beam):
     np.testing.assert_allclose(tight, coarse, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_inversion_with_gradients_of_the_server(beam):
     """Density and stiffness from both deflections, by a program that knows nothing but the protocol."""
@@ -579,6 +581,7 @@ def test_a_specimen_is_served():
     assert slope == pytest.approx([expected.gradient("up.points.0.z")["material.mu"]], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_model_of_an_inversion_is_served_and_that_of_a_comparison_is_not(tmp_path):
     data = "[data]\noutputs = { tip = 0.3 }\nsigma = { tip = 0.01 }\n"
     blocks, _, _ = FUNCTION.format("beam").partition("[method]")

@@ -122,6 +122,7 @@ def test_refined_boxes_begin_as_they_are_meshed_without():
         spec.build(MPI.COMM_SELF, ())
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 @UP_TO_RANKS
 def test_the_ranks_do_not_decide(file, ranks):

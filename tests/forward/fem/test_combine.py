@@ -123,6 +123,7 @@ for made, point in MADE.values():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_two_ranks_give_what_one_gives():
     done = on_kept_ranks(2, SCRIPT)

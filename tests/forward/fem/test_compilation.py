@@ -53,6 +53,7 @@ def found(process):
     return [line.split() for line in output.splitlines()]
 
 
+@pytest.mark.slow
 @pytest.mark.wheel
 def test_forms_are_compiled_once_by_many_processes(tmp_path):
     lines = [line for process in [start(tmp_path, ranks) for ranks in (None, 2)] for line in found(process)]
@@ -62,6 +63,7 @@ def test_forms_are_compiled_once_by_many_processes(tmp_path):
     assert all(len(list(folder.glob("*.so"))) == 1 for folder in folders)
 
 
+@pytest.mark.slow
 def test_whoever_is_killed_while_compiling_is_not_waited_for(tmp_path):
     killed = start(tmp_path)
     while not list((tmp_path / "tissuq").glob("forms-*/*/*.c")):

@@ -95,6 +95,7 @@ class Forced(Discretisation):
         return [np.sqrt(volumes.ravel() @ (e**2).reshape(volumes.size, -1).sum(axis=1)) for e in (gap, slope)]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("cell", "degree", "cells", "bound"),
     [

@@ -334,6 +334,7 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
     assert gaps[0] < 0.3 * gaps[1]
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.parametrize("basis", ["nodes", pytest.param("modes", marks=pytest.mark.slow)])
 def test_fields_are_those_of_the_mesh_itself(basis):

@@ -192,6 +192,7 @@ for item in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 @UP_TO_RANKS

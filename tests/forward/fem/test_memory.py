@@ -50,6 +50,7 @@ def test_without_symmetry_two_triangles_are_foreseen_and_a_factor_of_the_symmetr
     assert found[whole] / found[half] == pytest.approx(whole.entries / half.entries, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_models_that_are_gone_give_their_factors_back():
     """Before, a process that made one model after another kept all their factors."""

@@ -100,6 +100,7 @@ def finely_bent():
     return solved(bent(cells=(12, 6, 6), degree=2)).outputs
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
 def test_the_error_of_a_coarse_mesh_is_told(cell):
     solution = solved(bent(cells=(4, 2, 2), cell=cell))
@@ -384,6 +385,7 @@ for comm in groups():
 SHAPES = ("neo-hookean mixed", "mooney-rivlin", "demiray")
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 @UP_TO_RANKS
 def test_ranks_agree(tmp_path, ranks):

@@ -47,6 +47,7 @@ def bent(model, ratio):
     return model.solve(np.array([ratio * SHEAR / 2, LOAD]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cell", "coarse", "fine"),
     [("tetrahedron", (10, 2, 2), (15, 3, 3)), ("hexahedron", (5, 1, 1), (10, 2, 2))],

@@ -32,6 +32,7 @@ def outputs_at(spec, factors):
     return model.outputs, np.array([one.outputs for one in found]), np.array([one.state for one in found])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("material", [*MATERIALS, *MORE_MATERIALS, *MIXED])
 def test_it_is_what_finite_strains_tend_to(material):
     if material == "holzapfel-gasser-ogden":  # stretched fibres stiffen from the first moment on

@@ -211,6 +211,7 @@ def test_a_stated_square_is_the_form_of_D1():
     np.testing.assert_allclose(theirs, ours, rtol=1e-8)
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize("kind", ["my_tissue.of_log", "my_tissue.of_both"])
 def test_stated_volumes_have_a_mixed_form_that_agrees_with_displacements(kind):
@@ -268,6 +269,7 @@ seed = 1
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_a_study_is_checked_and_run(outside, undrawn):
     assert "Isotropic Fung" in report_of_own(outside, STUDY)

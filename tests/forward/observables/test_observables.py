@@ -120,5 +120,6 @@ seed = 1
 """
 
 
+@pytest.mark.slow
 def test_a_study_is_checked_and_run(outside, undrawn):
     assert "swept: my_outputs.Flux, on = x-max (m³)" in report_of_own(outside, STUDY)

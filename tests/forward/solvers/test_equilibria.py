@@ -88,6 +88,7 @@ def test_the_subset_that_is_counted_depends_on_the_parameters_only():
 # --- bodies ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.fem
 @pytest.mark.parametrize("name", ["column", "clamped block", "sideways cantilever", "mixed form", "follower pressure"])
 def test_no_unstable_equilibrium_is_returned(name):
@@ -115,6 +116,7 @@ def changed(spec, **solver):
     return Hyperelastic.model_validate(spec.model_dump() | {"solver": {"tolerance": 1e-11} | solver})
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_the_answer_does_not_depend_on_the_path(column):
     problem, centre = column

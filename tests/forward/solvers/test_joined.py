@@ -61,6 +61,7 @@ def alone(spec):
 PLAIN = ("demiray", "neo-hookean")  # by Newton's method alone the others go the same way
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.parametrize("form", ["mixed", "displacement"])
 @pytest.mark.parametrize(
@@ -119,6 +120,7 @@ def small_steps(model, point, count=32):
     return state
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize(
     ("body", "form"),
@@ -218,6 +220,7 @@ def sags(arch):
     return found
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize("mean", [15.0, 50.0])
 def test_an_arch_snaps_where_raising_the_load_makes_it(arch, sags, mean):
@@ -240,6 +243,7 @@ def test_an_arch_snaps_where_raising_the_load_makes_it(arch, sags, mean):
         assert others > 0 if mean > limit else others == 0
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
     """Where no equilibrium is near and residuals are small all the same."""

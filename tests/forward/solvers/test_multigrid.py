@@ -242,6 +242,7 @@ for load in (55.0, 70.0):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_ranks_that_share_a_body_agree_with_one():
     done = on_kept_ranks(2, SHARED)

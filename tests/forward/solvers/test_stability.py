@@ -27,6 +27,7 @@ def test_an_answer_that_every_check_confirms(case):
     assert 1e2 < row.condition < 1e4
 
 
+@pytest.mark.slow
 def test_a_failure_is_explained(case):
     ((path, traction),) = case.numbers
     soon = case.spec.model_copy(update={"solver": case.spec.solver.model_copy(update={"minimum_load_step": 1e-2})})

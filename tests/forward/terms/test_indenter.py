@@ -524,6 +524,7 @@ for comm in groups():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 @UP_TO_RANKS

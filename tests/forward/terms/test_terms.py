@@ -142,6 +142,7 @@ seed = 1
 """
 
 
+@pytest.mark.slow
 def test_a_study_with_springs_is_checked_and_run(outside, undrawn):
     assert "Springs: on = x-max, k = random" in report_of_own(outside, STUDY)
 

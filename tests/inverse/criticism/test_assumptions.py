@@ -337,6 +337,7 @@ def test_a_factor_on_all_steps_of_a_path():
     np.testing.assert_allclose(ends[2].outputs, more.outputs, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_a_body_moves_as_inversions_done_again():
     case = bench.cube(2)

@@ -62,6 +62,7 @@ def test_linear_models(run):
         assert found.mixed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [chains_of_few, pytest.param(ensemble, marks=pytest.mark.slow)])
 def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
     posterior = quick(ridge(0.1))

@@ -21,6 +21,7 @@ from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 
 
+@pytest.mark.slow
 def test_residuals_of_a_right_model_pass_as_often_as_they_should():
     """The moments of |r|² are exact, its probability is uniform, and so is that of neighbours."""
     squares, probabilities, agreements = [], [], []

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from benchmarks import assumptions as bench
-from forward.enlargements import asked_of, enlarged, enlargements
+from forward.enlargements import Lump, asked_of, enlarged, enlargements, fitted
 from forward.fem.layout import vertex_matrices
 from forward.hyperelastic import Hyperelastic
 from forward.model import SolveError
@@ -96,6 +96,7 @@ def test_what_data_leave_open_widens_the_answers():
     np.testing.assert_allclose(two.left, np.sqrt(more / np.diag(gaussian.covariance)), rtol=1e-5)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("dof", [None, 4.0])
 def test_a_right_model_is_accused_once_in_twenty(dof):
     """Over all questions, whichever: the share of 400 data sets is binomial."""
@@ -157,6 +158,27 @@ def test_a_body_without_lumps_is_asked_for_one():
     assert asked_of(plain) == ("a lump", "a layer", "a field", "fibres")
     found = enlargements(plain, (), np.zeros(0), vertex_matrices(SPEC.body)[3])
     assert len(found["a lump"]) > 8
+
+
+@pytest.mark.fem
+def test_a_lump_is_moved_by_its_strengths():
+    """Along derivatives by its place and radius, half a radius at most, within the body."""
+    places = vertex_matrices(SPEC.body)[3]
+    lump = Lump(0.03, 0.02, 0.02, 0.012, 8e-3)
+    here, rows, means = fitted(SPEC, lump, np.array([1.5]), places)
+    np.testing.assert_allclose(here, lump)
+    np.testing.assert_allclose(rows[0, : len(places)], lump.pattern(places))
+    step, width = 1e-6, 0.05 / np.sqrt(12)
+    for k, name in enumerate("xyz"):
+        ends = [lump._replace(**{name: getattr(lump, name) + h}).pattern(places) for h in (step, -step)]
+        slope = 1.5 * width * (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(rows[1 + k, : len(places)], slope, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(means, [0, -0.005 / width, 0.005 / width, 0.005 / width, np.log(14 / 12) / 0.5])
+    far, *_ = fitted(SPEC, lump, np.array([1.5, 0.1, -9.0, 9.0, 0.2]), places)
+    np.testing.assert_allclose(far[:3], [0.03 + 0.1 * width, 0.014, 0.026])
+    assert far.radius == pytest.approx(0.012 * np.exp(0.1))
+    assert str(far) == "at 3.14, 1.4, 2.6\xa0cm, radius 1.3 cm"
+    assert fitted(SPEC, "all over the body", np.ones(3), places) is None
 
 
 @pytest.mark.unit

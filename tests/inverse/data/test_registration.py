@@ -94,6 +94,7 @@ def test_landmarks_are_those_of_scipy():
     assert np.mean(squares) == pytest.approx(6, rel=0.15)
 
 
+@pytest.mark.slow
 def test_points_find_the_surface():
     """From 5° and 10 mm away, also among points of something else, and as uncertain as it says."""
     exact = ToSurface().registered(back(on_box(200)), 1.0, BOX, 0.05, "scan")

@@ -39,6 +39,7 @@ def brute_force(posterior, draws=2**19):
     return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.noise.sigma.prod())
 
 
+@pytest.mark.few(1)
 @pytest.mark.flags
 @pytest.mark.parametrize(
     ("noise", "allowed", "repeats"), [(0.3, 0.03, 4), pytest.param(0.1, 0.1, 4, marks=pytest.mark.slow), (0.03, 0.3, 4)]
@@ -196,6 +197,7 @@ def test_nested_sampling_agrees_on_brain():
         assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("correlated", "by_nested_sampling"),
     [(False, False), (True, False), pytest.param(False, True, marks=pytest.mark.slow)],

@@ -87,6 +87,7 @@ def test_where_it_is_gaussian_everything_is_of_the_gaussian(size):
     assert found.ess > 200  # its points are draws of it
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("size", "seed"), [(9, 7), (25, 7), (40, 7), pytest.param(40, 8, marks=pytest.mark.slow)])
 def test_bent_a_little(size, seed):
     posterior, A = bent(size, 0.25, seed)
@@ -214,6 +215,7 @@ def test_the_mode_is_found_where_gauss_newton_crawls(short):
         assert width == pytest.approx((short * np.cos(cost.x - start) / sigma**2 + 1) ** -0.5, rel=0.01)
 
 
+@pytest.mark.slow
 def test_chains_that_follow_gradients():
     """Bent posteriors of 12 unknowns: moments and ln Z of weighted points; gradients are those of the density."""
     pytest.importorskip("mici")
@@ -266,6 +268,7 @@ def test_how_far_a_search_that_did_not_converge_is_from_its_end():
     assert said.endswith("did not converge: its next step would move an unknown by up to 0.31 standard deviations")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("size", "seed"),
     [(25, 7), *(pytest.param(25, seed, marks=pytest.mark.slow) for seed in (8, 9)), (40, 7), (60, 7)],

@@ -94,6 +94,7 @@ def test_priors_of_specimens_that_are_drawn_again_cover_the_population(logarithm
     assert np.corrcoef(z.T)[0, 1] == pytest.approx(0.45, abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.05, 0.4])  # of a population, over the errors of its specimens
 def test_specimens_are_shrunken_as_the_closed_form_says(width):
     rng = np.random.default_rng(1)

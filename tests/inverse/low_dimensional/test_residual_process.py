@@ -65,6 +65,7 @@ def test_size_length_and_evidence_in_closed_form():
     assert noise.of(np.arange(5)).process.shape[1] == 5
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("size", "length"), [(0.0, 1.0), (0.1, 0.5), (0.5, 0.4)])
 def test_intervals_hold_where_the_model_is_wrong(size, length):
     """95 % of the intervals hold, of 60 data sets and two parameters; without the process they do not."""

@@ -133,6 +133,7 @@ def test_what_cannot_stand_for_the_body_is_refused_in_one_line(folder):
     assert any("was trained from" in one.text for one in load(study, [reduced, wider]).findings)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_a_specimen_has_a_reduced_model_for_each_load_case(tmp_path):
     (tmp_path / "made.toml").write_text(MADE)

@@ -241,6 +241,7 @@ def test_synthetic_tables_hold_forces_with_errors_of_their_own(folder):
     assert study.measurements[0].data_labels()[int(np.flatnonzero(forces)[0])].endswith(", pull, grip")
 
 
+@pytest.mark.slow
 def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(folder, looked_at):
     blind, seeing = load(folder / "blind.toml"), load(folder / "few.toml")
     assert any(RATIOS in finding.text and "material.mu" in finding.text for finding in blind.findings)

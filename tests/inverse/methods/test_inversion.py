@@ -513,6 +513,7 @@ def test_solves_without_a_model_are_counted_in_batches_too(folder, monkeypatch):
 KILLED = 40  # blocks, of which the second data set has some
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, one, monkeypatch):
     """Killed in the second data set: nothing is solved twice, and what is finished is shown.
@@ -656,6 +657,7 @@ def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
     assert any("mesh check  about 4 solves of 1,029 displ" in line for line in plan(load(folder / "few.toml")))
 
 
+@pytest.mark.slow
 def test_what_the_model_does_not_explain_is_inferred(folder, monkeypatch):
     """On a mesh that is too coarse, whose error is not corrected: with a process intervals hold the truth."""
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
@@ -672,6 +674,7 @@ def test_what_the_model_does_not_explain_is_inferred(folder, monkeypatch):
     assert "taken to be a process among the errors" in said
 
 
+@pytest.mark.slow
 def test_what_is_strange_is_said_with_the_inversion(folder, monkeypatch):
     """Data that do not belong by their line, on the mesh that made the data; and the end of a range."""
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)

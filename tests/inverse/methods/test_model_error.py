@@ -118,6 +118,7 @@ def test_many_pairs_find_the_known_gaussian_error():
     assert np.abs((covariance - WILD @ WILD.T) / np.outer(size, size)).max() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.unit
 def test_intervals_hold_and_without_they_do_not():
     def share(other):

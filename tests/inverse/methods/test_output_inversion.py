@@ -286,6 +286,7 @@ draws = 50
 """
 
 
+@pytest.mark.slow
 def test_outputs_of_a_body(tmp_path):
     """What is predicted at the mode is what was measured; the error of its two linear cells is the true one."""
     (tmp_path / "bar.toml").write_text(BAR)

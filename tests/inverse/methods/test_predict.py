@@ -38,6 +38,7 @@ def linear(matrix):
     return FunctionModel(lambda m: matrix @ m + 1, names, tuple(map(str, range(len(matrix)))), lambda m: matrix)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("more", [[], ["data.outputs={}", "data.files='sets'"]], ids=["alone", "side by side"])
 def test_what_is_too_uncertain_for_first_order_is_sampled(folder, more):
     """As if it were one more unknown, and so with the same numbers; also in what is predicted."""
@@ -333,6 +334,7 @@ def test_another_model_with_the_same_unknowns(folder):
     assert any("predicts    q, by 33 solves" in line for line in plan(study, 1))
 
 
+@pytest.mark.slow
 def test_a_batch_predicts_from_each_posterior(folder):
     """The same of each data set as alone; the prior is solved for once."""
     (folder / "data").mkdir()
@@ -385,6 +387,7 @@ def test_what_cannot_be_predicted(folder, block, said):
     assert said in str(refused.value)
 
 
+@pytest.mark.slow
 def test_an_inversion_that_predicts_nothing_imports_nothing_of_it(folder):
     (folder / "none.toml").write_text(STUDY.replace("[predict]\nPREDICT\n", ""))
     script = (
@@ -470,6 +473,7 @@ def test_other_loads_and_places_of_a_specimen(specimens):
     assert any("the mesh is estimated to move" in one["text"] for one in said)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.parametrize("unknown", [NUMBER, FIELD])
 def test_a_load_that_is_uncertain_in_what_was_measured_and_predicted(specimens, tmp_path, unknown):

@@ -121,6 +121,7 @@ def test_uniaxial_data_alone_mislead():
     assert texts(found)[0].startswith("yeoh is the most probable")
 
 
+@pytest.mark.slow
 def test_discrepancy_is_found_when_no_candidate_is_right():
     """Stiffening rubber and two models that cannot stiffen, with known and with inferred errors; not where one can."""
     rng = np.random.default_rng(2)
@@ -435,6 +436,7 @@ def test_priors_with_inadmissible_tails_are_no_failures(small):
     assert any(text.startswith("mooney-rivlin: 23 % of the prior") for text in texts)
 
 
+@pytest.mark.slow
 def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
     """Gent's energy ends at I1 − 3 = Jm: points of the prior that do not reach the data are weighted by nothing."""
     text = SMALL.replace('"neo-hookean" }', '"gent" }').replace("parameters.C1", "parameters.mu", 1)
@@ -711,6 +713,7 @@ def test_where_points_count_little_a_comparison_says_what_an_inversion_says():
     assert not found["score_trusted"]
 
 
+@pytest.mark.slow
 def test_chains_of_a_comparison():
     """6 unknowns, curved: constants, predictions and ln Z by gradients, against closed forms."""
     pytest.importorskip("mici")

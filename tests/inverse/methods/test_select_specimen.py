@@ -119,6 +119,7 @@ def test_evidence_is_that_of_quadrature(study):
     assert found["misfit_probability"].values[0, 0] > 0.01
 
 
+@pytest.mark.slow
 def test_motions_that_are_uncertain_are_integrated_out(study):
     """ln Z by the trapezoidal rule with the dense covariance σ² + GᵀG of the data."""
     uncertain = 'registration = { kind = "given", rotation_std = 1.0, translation_std = 0.01 }'
@@ -217,6 +218,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
     assert shift == pytest.approx(gone, rel=0.5)
 
 
+@pytest.mark.slow
 def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     """A mesh that is too coarse no longer loses for that alone, but for what is uncertain of its correction."""
     it = load(study, ["method.noise.absolute=0.02"])

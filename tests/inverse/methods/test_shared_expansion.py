@@ -98,6 +98,7 @@ def run(folder, name, *changes):
     return code, found, json.loads((folder / name / "summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_an_expansion_gives_the_posteriors_of_the_model(folder):
     _, direct, _ = run(folder, "direct")
     code, found, summary = run(folder, "expanded", "method.expansion=24")

@@ -97,6 +97,7 @@ def study(tmp_path_factory):
     return folder, blocks, values, sigma
 
 
+@pytest.mark.slow
 def test_the_posterior_is_that_of_the_product_of_the_likelihoods(study, tmp_path):
     """Against quadrature over the likelihoods of the displacement and of the stresses, each of a model of its own."""
     folder, blocks, values, sigma = study

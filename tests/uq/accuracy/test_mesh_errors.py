@@ -134,6 +134,7 @@ def test_of_every_method_moments_and_quantiles_are_corrected(method):
         np.testing.assert_allclose(found["sobol_first_mesh_error"][1], 0, atol=1e-6)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "method",
     [
@@ -268,6 +269,7 @@ def test_correlated_parameters():
     np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.1)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("more", "method"), [(20, Chaos(samples=48, max_order=3)), (300, MonteCarlo(samples=400))])
 def test_many_parameters_by_few_estimates(more, method):
     names = ("a", "b", *(f"z{i}" for i in range(more)))
@@ -383,6 +385,7 @@ def test_a_tolerance_that_hides_the_mesh_is_told():
     assert "mesh in u:" in said.text
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: f"{m.kind}-{getattr(m, 'design', '')}")
 def test_what_facets_hide_is_doubted_in_all_that_has_units(method):
     """As if each output were so many per cent larger: no share of a variance changes by that."""

@@ -46,6 +46,7 @@ def coverage(found, freedom):
     return (np.abs(mean) < t * mean_error).mean(), (np.abs(variance) < t * variance_error).mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "freedom"),
     [

@@ -225,6 +225,7 @@ def test_indices_beyond_their_bounds_are_errors_of_the_program(changes, said):
 # --- coverage ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -26,6 +26,7 @@ def drawn(seed, counts):
     return found
 
 
+@pytest.mark.slow
 def test_intervals_hold_and_are_closer_than_those_of_the_model_alone():
     exact = np.exp(np.hypot(0.5, 0.03) * stats.norm.ppf(P))
     held, errors, alone = [], [], []

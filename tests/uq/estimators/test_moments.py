@@ -99,6 +99,7 @@ def test_an_estimated_variance_below_nothing_has_a_finite_error():
 EXACT = {np.random.Generator.random: stats.uniform, np.random.Generator.standard_exponential: stats.expon}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [16, 24, 40, 400])
 @pytest.mark.parametrize("draw", [np.random.Generator.random, np.random.Generator.standard_exponential])
 def test_quantile_intervals_cover(n, draw):

@@ -56,6 +56,7 @@ def test_so_many_are_chosen_with_probabilities_by_their_sizes():
     np.testing.assert_allclose(times / 2000, expected, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True])
 def test_no_bias_and_honest_errors(known):
     rows = []

@@ -58,6 +58,7 @@ def test_what_does_not_look_log_normal_has_no_spread():
         assert estimator.unseen(TAIL, values[:, None]).item() == 0
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("method", "name"),
     [
@@ -144,6 +145,7 @@ def test_what_influences_miss_is_their_integral_beyond(n):
 ODD = {case.name: case for case in (*oddities.cases(), *held_out.first())}
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("method", "name"),
     [

@@ -118,6 +118,7 @@ for case in sys.argv[1:]:
 CASES = ("plain", "fails", "uneven", "many", "models", "passing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ranks", [pytest.param(2, marks=pytest.mark.slow), 3])  # two are two of three
 def test_same_numbers_as_in_one_process(ranks):
     done = run_script(ranks, STUDY, *CASES)

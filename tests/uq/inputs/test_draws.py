@@ -125,6 +125,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("method", METHODS, ids=lambda one: f"{one.kind} {getattr(one, 'control', '')}")
 def test_methods_integrate_over_the_draws(method, weighted):
@@ -222,6 +223,7 @@ def test_one_parameter_of_draws_is_independent():
     np.testing.assert_allclose(found["sobol_total"][0], [share, 1 - share], atol=0.02)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "method", [MonteCarlo(samples=200), QuasiMonteCarlo(samples=256), Chaos(samples=12, max_order=2, quantiles=())]
 )

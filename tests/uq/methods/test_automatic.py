@@ -78,6 +78,7 @@ def test_a_smooth_model_takes_an_expansion(tolerance):
     assert "Polynomial chaos" in chosen(found)["reasons"][0]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_kink_takes_quasi_monte_carlo(seed):
     goal = Goal.of(2e-3, ["1"], 10_000)

@@ -230,6 +230,7 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradients", [True, False])
 @pytest.mark.parametrize(("cv", "within"), [(0.5, 5e-3), (1.0, 0.1)])
 def test_products_and_reciprocals_of_log_normals(cv, within, gradients):

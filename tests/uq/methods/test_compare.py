@@ -102,6 +102,7 @@ def test_rates(compared):
         assert float(quasi[f"{estimated}_rate"]) + 3 * float(quasi[f"{estimated}_rate_error"]) < -0.7
 
 
+@pytest.mark.slow
 def test_the_error_of_a_rate_is_its_scatter():
     slopes, claims = [], []
     for seed in range(8):
@@ -111,6 +112,7 @@ def test_the_error_of_a_rate_is_its_scatter():
     assert 0.45 < np.std(slopes, ddof=1) / np.sqrt(np.mean(np.square(claims))) < 1.7  # 99 %
 
 
+@pytest.mark.slow
 def test_honest_claims_cover(compared):
     shares = [of(compared, name)["mean_coverage"].to_numpy() for name in ("monte-carlo", "sensitivity-monte-carlo")]
     assert np.mean(shares) > 0.91

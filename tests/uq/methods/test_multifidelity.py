@@ -70,6 +70,7 @@ def waves(amplitude, tilt, missing=lambda a: False):
 SEEDS = 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reuse", [True, False])
 def test_unbiased_with_honest_errors_and_gain(reuse):
     """Of 300 seeds 92 to 97 % of the intervals hold the truth (`python -m benchmarks multifidelity --only closed`).
@@ -216,6 +217,7 @@ def test_full_solves_where_cheap_models_differ():
         np.testing.assert_array_equal(again[name], data[name])
 
 
+@pytest.mark.slow
 def test_full_solves_are_even_where_the_difference_tells_nothing():
     """The better model costs half of a solve: all that is spent on asking it everywhere is lost."""
     models = team(wave(0.29, 0.1), wave(0, 0.3))
@@ -290,6 +292,7 @@ def test_failures_of_any_model_are_recorded():
         Multifidelity(samples=60, cheap=cheap(0.05)).run(INPUTS, team(FunctionModel(never, ("a", "b"), ("f", "g"))))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("fails", "bends"), [("cheap", 1), pytest.param("own", 1, marks=pytest.mark.slow), ("own", 2)])
 def test_where_a_model_fails_the_others_cause_no_bias(fails, bends):
     """A cheap model may fail anywhere; where the study's does, estimates are those of the points where it does not."""

@@ -103,6 +103,7 @@ def repeats(control, count=REPEATS):
     return np.array(rows).T
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("control", CONTROLS)
 def test_unbiased_on_the_finest_mesh_with_honest_errors(control):
     mean, mean_error, variance, variance_error = repeats(control)

@@ -144,6 +144,7 @@ def test_a_model_without_a_state_is_fitted_twice():
     assert data["mean_error"].item() < 1e-12
 
 
+@pytest.mark.slow
 def test_claimed_errors_cover():
     mean, std = truth()
     runs = [MultilevelChaos(seed=s, fields=False).run(INPUTS, SerialEvaluate(Contraction())) for s in range(20)]

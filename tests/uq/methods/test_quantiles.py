@@ -35,6 +35,7 @@ def at_least(held, count):
     return (held * count >= stats.binom.ppf(0.001, count, 0.95)).all()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("name", "method", "count"),
     [

@@ -308,6 +308,7 @@ def test_claims_of_means_count_what_no_sample_has_seen(monkeypatch):
     assert row.claimed[0] < 2
 
 
+@pytest.mark.slow
 def test_claims_of_polynomial_controls_count_what_no_sample_has_seen(monkeypatch):
     monkeypatch.setattr(coverage, "REFERENCE", 8)
     case = next(case for case in tails.cases() if case.name == "sum, cv 0.5")

@@ -360,6 +360,7 @@ def saltelli(beam):
     return Sobol(design="saltelli", samples=32, groups={"both": tuple(inputs.names)}).run(inputs, evaluate)
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 def test_fields_of_exchanged_samples_are_those_of_all_states(beam, saltelli):
     inputs, evaluate = beam
@@ -488,6 +489,7 @@ def test_fields_have_functions_of_their_own(moved, tmp_path, samples, gradients)
         np.testing.assert_allclose(again[name], data[name], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_errors_of_fields_hold_what_their_functions_leave(moved):
     """Of order 1, nothing of the field is known beyond its slopes: indices and moments say by how much."""

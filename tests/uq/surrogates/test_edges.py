@@ -52,6 +52,7 @@ def moments_along():
     return values.mean(), values.std()
 
 
+@pytest.mark.slow
 @pytest.mark.unit
 def test_claims_hold_at_limit_points():
     """At most 7 % of intervals miss, of mean or standard deviation: by what samples show alone 10 to 17 % did."""
@@ -99,6 +100,7 @@ def test_what_is_next_to_a_basis():
     assert list(map(tuple, beside(even, np.array([True, False])).tolist())) == alone
 
 
+@pytest.mark.slow
 @pytest.mark.unit
 def test_claims_hold_where_few_samples_are_next_to_corners():
     """A hill, in at most 7 % of cases: without the functions next to those of a fit, 18 % miss mean or deviation."""
@@ -112,6 +114,7 @@ def test_claims_hold_where_few_samples_are_next_to_corners():
     assert np.mean([missed(one, values.mean(), values.std()) for one in found]) <= 0.07
 
 
+@pytest.mark.few(1)
 @pytest.mark.unit
 @pytest.mark.parametrize("name", ["exp", "1/(1 + u)"])
 def test_claims_of_smooth_functions_stay_of_their_size(name, monkeypatch):
@@ -140,6 +143,7 @@ def test_gradients_that_are_not_of_a_staircase_are_said(slope):
     assert all(accused(one) for one in found)
 
 
+@pytest.mark.few(2)
 @pytest.mark.unit
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_of_functions_are_not_accused(name):

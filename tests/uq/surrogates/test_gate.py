@@ -60,6 +60,7 @@ def test_what_points_do_not_show_is_claimed():
     assert trial.scaled(np.linspace(0, 1, 101)[:, None], np.full((101, 1), left))[1] == 0
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [

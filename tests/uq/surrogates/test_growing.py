@@ -56,6 +56,7 @@ def sampled(beam, method, monkeypatch=None):
     return method.run(inputs, watched), watched.asked[1:]
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize(
     "kind", [MonteCarlo, pytest.param(SensitivityMonteCarlo, marks=pytest.mark.slow), QuasiMonteCarlo]

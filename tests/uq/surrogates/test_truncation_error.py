@@ -57,6 +57,7 @@ def of_values(function, d, samples, seeds):
     return np.array(rows), np.array(rough)
 
 
+@pytest.mark.slow
 @pytest.mark.unit
 @pytest.mark.parametrize("rate", [1.0, 0.1])  # of their expansions 0.7 and 0.02 are left
 def test_deviations_of_many_normals_are_claimed_within_ten_errors(rate):

@@ -160,6 +160,7 @@ def _request(body):
 MOVED = b'{"loads.pressure.size": 900}\n'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("secret", [True, False])
 def test_others_move_nothing_and_use_nothing_up(small, tmp_path, secret):  # noqa: F811
     with live(small, tmp_path, *([] if secret else ["--no-token"]), files=128) as (port, page, token):
@@ -245,6 +246,7 @@ def _taken(file, port, page):
         assert found.stderr == f"--{taken} {number}: cannot be used on 127.0.0.1: Address already in use\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(executable() is None, reason="no Chromium is installed (Debian: chromium)")
 def test_the_page_moves_in_a_browser(small, tmp_path):  # noqa: F811
     """No fault on its console, nothing from elsewhere; a slider moves the body and its numbers."""

@@ -58,6 +58,7 @@ def reports(tmp_path_factory, expanded):
     return Reports()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["chaos", "sampled", pytest.param("local", marks=pytest.mark.slow)])
 def test_reports_open_without_a_fault(page, reports, name):
     """Those of other kinds of studies are looked at where these are tested."""

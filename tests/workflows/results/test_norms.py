@@ -109,6 +109,7 @@ kind = "sobol"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.parametrize("design", ["samples = 8", 'samples = 16\ndesign = "saltelli"\nscrambles = 4'])
 def test_indices_of_fields_do_not_depend_on_the_mesh(tmp_path, design):

@@ -178,6 +178,7 @@ def test_same_bits_on_any_number_of_groups(finished, tmp_path):
     assert_same_bits(finished, tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_a_model_on_two_ranks_agrees(finished, tmp_path):

@@ -179,6 +179,7 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
             assert_said_plainly(code, said, (name, done))
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(

@@ -194,6 +194,7 @@ def test_check_foresees_that_memory_runs_out():
     assert "warning" not in in_process("check", *FACTORED).stdout
 
 
+@pytest.mark.few(2)
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 @pytest.mark.parametrize(
@@ -213,6 +214,7 @@ def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["failed"] == 0
 
 
+@pytest.mark.few(1)
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
@@ -266,6 +268,7 @@ class Hanging(BaseHTTPRequestHandler):
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 @pytest.mark.parametrize(("ranks", "trickles"), [(2, False), (None, True)])
 def test_a_server_that_never_ends_is_a_failed_solve(study, tmp_path, monkeypatch, ranks, trickles):
@@ -300,6 +303,7 @@ def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
     assert "the solve took longer than solve_seconds = 1e-09" in reason
 
 
+@pytest.mark.few(2)
 @pytest.mark.mpi
 @pytest.mark.parametrize(
     ("ranks", "number"),
@@ -431,6 +435,7 @@ def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
     assert (out / "results.nc").read_bytes() == whole
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "name", ["summary.json", "results.nc", "report.html", "evaluations.h5", "sources.json", "evaluations"]
 )

@@ -178,6 +178,7 @@ def test_a_comparison_of_materials_goes_on_where_it_was_killed(tmp_path):
     assert same(tmp_path)
 
 
+@pytest.mark.slow
 def test_chains_that_follow_gradients_go_on_where_they_were_killed(tmp_path, monkeypatch):
     """What is lost is what was not written yet."""
     pytest.importorskip("mici")
@@ -198,6 +199,7 @@ def test_chains_that_follow_gradients_go_on_where_they_were_killed(tmp_path, mon
     assert same(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_finer_meshes_are_not_solved_at_the_start_again(tmp_path, monkeypatch):
     """That takes most of an inversion for few parameters on a small machine."""
@@ -217,6 +219,7 @@ def test_finer_meshes_are_not_solved_at_the_start_again(tmp_path, monkeypatch):
     assert same(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_ranks_that_share_a_body_keep_its_start_too(tmp_path):

@@ -162,6 +162,7 @@ def test_a_body_without_an_answer_leaves_no_folder(study, ranks):
     assert not directory.exists()
 
 
+@pytest.mark.slow
 def test_boxes_and_finer_meshes_of_what_was_refined(study):
     directory = study.parent / "box"
     body = 'model.body={size=[1.0, 0.7, 0.25], cells=[2, 1, 1], cell="tetrahedron", degree=1}'

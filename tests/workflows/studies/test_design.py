@@ -106,6 +106,7 @@ def exact(chosen, std=(1, 2, 3)):
     return np.linalg.slogdet(P)[1] / 2, np.linalg.inv(P) * np.outer(std, std)
 
 
+@pytest.mark.slow
 def test_a_linear_model_is_the_closed_form_with_any_ranks(folder, looked_at):
     path = line(folder)
     study = load(path)
@@ -151,6 +152,7 @@ def test_a_posterior_is_a_prior(folder):
     assert float(found["information"][0]) == pytest.approx(exact([*chosen, best])[0] - now, rel=0.1)
 
 
+@pytest.mark.slow
 def test_variances_of_parameters_and_predictions(folder):
     by_parameters = load(line(folder, 'number = 2\ncriterion = "parameters"')).run()
     chosen = by_parameters["chosen"].to_numpy()
@@ -173,6 +175,7 @@ def test_variances_of_parameters_and_predictions(folder):
 UNCERTAIN = "\n".join(NORMAL.splitlines()[:2]) + "\n[uncertain]\n"
 
 
+@pytest.mark.slow
 def test_what_is_uncertain_is_an_unknown_of_which_nothing_is_asked(folder):
     """As if c had a prior, and only a and b counted; goals depend on it too."""
     found = load(line(folder, parameters=UNCERTAIN + "c = 3")).run()
@@ -272,6 +275,7 @@ def test_candidates_are_known_before_there_is_a_mesh(folder, cell, degree):
         assert len(method.candidates(before)[0].names) == len(method.candidates(made)[0].names), each
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("method", "said"),
     [
@@ -457,6 +461,7 @@ def test_models_are_told_apart_less_where_something_is_uncertain(tmp_path, monke
         assert float(found["log_bayes_factor"][k, other]) == pytest.approx(told, rel=0.02)  # moments of 256 draws
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_materials_are_told_apart_by_displacements(tmp_path):
     case = CUBE.format(more="").replace('material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 2e3 }\n', "")
@@ -535,6 +540,7 @@ def dense(study, found):
     return slopes @ root, root, prior.matern.mass, found["value_sigma"].to_numpy()
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize("criterion", ["information", "parameters", "predictions"])
 def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
@@ -570,6 +576,7 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
     assert float(found["field_variance_told"][-1]) == pytest.approx(share, rel=5e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize("criterion", ["information", "predictions"])
 def test_of_fields_what_is_uncertain_is_told_as_dense_matrices_say(tmp_path, criterion):

@@ -32,6 +32,7 @@ def block(cells, *more):
     return load(TINY, [*BLOCK, f"model.body.cells={list(cells)}", *more]).run()
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_three_estimates_predict_is_what_a_finer_mesh_changes():
     """Half the cells and one degree more see the same part of the error; calibration adds what both do not see."""
@@ -83,6 +84,7 @@ def test_fields_are_corrected_too():
         assert np.linalg.norm(found / seen - moved) < 0.2 * np.linalg.norm(moved)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_was_there_is_the_same_to_the_bit_without_estimates():
     small = ["method={kind='chaos', samples=8, max_order=2}", "model.body.cells=[2, 1, 1]"]
@@ -96,6 +98,7 @@ def test_what_was_there_is_the_same_to_the_bit_without_estimates():
     assert not any("The mesh" in one.text for one in findings(off))
 
 
+@pytest.mark.few(4)
 @pytest.mark.fem
 @pytest.mark.parametrize(
     "method",

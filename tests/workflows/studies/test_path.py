@@ -36,6 +36,7 @@ samples = 6
 """
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_curves_are_the_same_on_any_number_of_ranks(tmp_path, looked_at):

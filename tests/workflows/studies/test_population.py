@@ -124,6 +124,7 @@ def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path,
     assert any("cannot be drawn again: s0.csv is not in" in text for text in texts(tmp_path / "alone"))
 
 
+@pytest.mark.slow
 def test_walkers_go_on_where_they_were_stopped(batch, tmp_path, monkeypatch):
     """What is lost of the fit is what was not written yet; the results are the same bytes."""
     monkeypatch.setattr(kept, "SECONDS_BETWEEN_STRETCHES", 0.005)
@@ -174,6 +175,7 @@ def by_sums(truth, slope, sigma):
     return float(np.exp(np.interp(0.5, np.cumsum(w) / w.sum(), m)))
 
 
+@pytest.mark.slow
 def test_groups_of_a_comparison_are_solved_again(tmp_path):
     """Specimens that are three times as stiff as the prior expects."""
     stretch, truth = np.array([1.1, 1.2, 1.3]), {"one": 300.0, "two": 320.0, "three": 280.0, "four": 310.0}

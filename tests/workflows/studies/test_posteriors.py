@@ -103,6 +103,7 @@ def test_draws_give_the_moments_of_a_loop_over_them_with_any_ranks(folder):
     np.testing.assert_allclose(found["mean"], [np.mean(a + 2 * b + c), np.mean(a * np.exp(b))], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_study_reads_itself_without_its_source(folder, looked_at):
     path = study(folder)
     made = load(path)

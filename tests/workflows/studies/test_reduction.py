@@ -210,6 +210,7 @@ cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "re
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 
 
+@pytest.mark.slow
 def test_the_model_and_its_nested_larger_one_are_cheap_models(folder, body):
     few = [*SIZES[:2], *(part for one in ("unseen=0", "rounds=0", "modes=2") for part in ("--set", f"method.{one}"))]
     reduced = ["reduce", folder / "body.toml", *few, "--out", folder / "few", "--output", folder / "few.npz"]

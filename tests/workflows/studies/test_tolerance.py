@@ -267,6 +267,7 @@ def test_a_function_of_two_parameters(tmp_path):
     assert of["value"] == pytest.approx(0.1, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path, undrawn):
     load(TINY, [*COARSE, "accuracy.tolerance=0.05"]).run(tmp_path / "out", report=True)
@@ -389,6 +390,7 @@ def test_what_is_not_reached_is_said(tmp_path):
     assert "accuracy.memory = 16 MiB" in texts[0]
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_is_out_of_reach_is_refused_in_a_line_before_the_long_work(tmp_path, capsys):
     tiny = ("model.body.cell=tetrahedron", "model.body.degree=1", "accuracy={tolerance=1e-6, memory=100}")
