@@ -20,7 +20,7 @@ from uq.inputs.distributions import LogNormal, Normal, Uniform
 from workflows.config.study import dump, parse
 from workflows.report import bodies, plots
 from workflows.report.page import compare, write_report
-from workflows.report.plots.figure import png_of
+from workflows.report.plots.figure import ON_DEEP, png_of
 from workflows.report.sections.frame import model_in_words
 from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, write_dataset
 from workflows.results.summary import summarise
@@ -495,6 +495,18 @@ def test_figures_of_thousands_of_marks_stay_small():
     assert b"<image" in drawn
     assert len(drawn) < 100_000
     assert plots.svg(ax) == drawn
+
+
+def test_figures_are_dark_on_dark_pages():
+    """What is black or white on paper has no colour of its own, but for what is written on colours."""
+    ax = plots.axes()
+    ax.set_title("black")
+    ax.bar([1], [2], color="#0b6bb8", edgecolor="white")
+    ax.annotate("on a colour", (1, 1), color=ON_DEEP)
+    drawn = plots.svg(ax).decode()
+    assert "prefers-color-scheme: dark" in drawn
+    assert not {"#000000", "#ffffff"} & set(re.findall(r"#\w{6}", drawn))
+    assert {"#0b6bb8", ON_DEEP} <= set(re.findall(r"#\w{6}", drawn))
 
 
 @pytest.mark.filterwarnings("error")

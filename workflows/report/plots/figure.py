@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
 LOW, HIGH = "#0b6bb8", "#d1622b"
+# What is black or white on paper follows the page on a screen that is dark.
+FOLLOWING = {"#000000": "var(--ink)", DARK: "var(--ink)", "#ffffff": "var(--paper)"}
+FOLLOWS = """<style>svg { --ink: #000; --paper: #fff; fill: var(--ink); }
+@media (prefers-color-scheme: dark) { svg { --ink: #e6ebf0; --paper: #12171c; } }</style>
+<defs>"""
+ON_PALE, ON_DEEP = "#010101", "#fefefe"  # what is written on a colour stays as it is
 MANY_POINTS = 3000
 LEGEND = 0.35  # inches that a legend below all panels takes
 COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
@@ -50,7 +56,7 @@ def png_of(figure: Figure, dpi: float) -> bytes:
 
 
 def svg(ax: Axes) -> bytes:
-    """Return the whole figure of axes as an SVG file; what has thousands of points is a picture within."""
+    """Return the whole figure of axes as an SVG file, dark on dark pages; of thousands of points it holds a picture."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.collections import QuadMesh
@@ -67,7 +73,8 @@ def svg(ax: Axes) -> bytes:
     # Equal results give equal files: without a date and random names.
     with mpl.rc_context({"svg.hashsalt": "tissuq", "svg.fonttype": "path"}):
         whole.savefig(file, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
-    return file.getvalue()
+    text = re.sub("|".join(FOLLOWING), lambda found: FOLLOWING[found[0]], file.getvalue().decode())
+    return text.replace("<defs>", FOLLOWS, 1).encode()
 
 
 def _lay_out(figure: Figure, dpi: float) -> None:

@@ -16,6 +16,7 @@ from workflows.report.plots.figure import (
     DARK,
     HIGH,
     LEGEND,
+    ON_DEEP,
     PLAIN,
     axes,
     figure_of,
@@ -199,7 +200,7 @@ def pressure_map(dataset: xr.Dataset, tool: str, direction: Vector, ax: Axes | N
     pressure = here["contact_pressure"].to_numpy()
     seen = Triangulation(x, y)
     drawn = ax.tripcolor(seen, pressure, shading="gouraud", cmap="viridis", vmin=0)
-    ax.plot(x, y, ".", color="white", ms=2, alpha=0.6)
+    ax.plot(x, y, ".", color=ON_DEEP, ms=2, alpha=0.6)
     corners = seen.triangles[(pressure[seen.triangles] > 0).any(axis=1)].ravel()
     if len(corners):  # the area in contact and the cells around it
         ax.set(xlim=(x[corners].min(), x[corners].max()), ylim=(y[corners].min(), y[corners].max()))

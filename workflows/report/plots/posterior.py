@@ -14,6 +14,8 @@ from workflows.report.plots.figure import (
     CONTROLLED,
     DARK,
     HIGH,
+    ON_DEEP,
+    ON_PALE,
     PLAIN,
     axes,
     figure_of,
@@ -163,7 +165,7 @@ def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax = ax or axes(height=1.6 + 0.32 * len(parts), width=max(5.4, 1.6 + 0.85 * len(names)))
     ax.imshow(shades, cmap="Blues", vmin=0, vmax=1.1, aspect="auto")
     for (i, j), factor in np.ndenumerate(factors):
-        colour = "white" if shades[i, j] > PALE else "black"
+        colour = ON_DEEP if shades[i, j] > PALE else ON_PALE
         text = f"{number(float(factor), 2)} ×" if factor >= SAID else ""
         ax.annotate(text, (j, i), ha="center", va="center", fontsize="small", color=colour)
     ax.set_xticks(range(len(names)), [text_of(name) for name in names], rotation=25, ha="right")
