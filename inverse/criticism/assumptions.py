@@ -67,19 +67,18 @@ class Assumption(NamedTuple):
 def quantities(data: Measurements, units: Mapping[str, str]) -> list[str]:
     """Return what was measured (m,): displacements, or outputs by their names, whatever the step of a path.
 
-    Outputs in m, by their units, are displacements too: one camera or ruler has measured them.
+    Outputs in m, by their units, are displacements too: one camera or ruler has measured them. Tests have stresses.
     """
-    places = np.isfinite(data.places).all(axis=1)
     return [
-        "displacement" if place or units.get(name) == "m" else STEP_OF.sub("", name)
-        for name, place in zip(data.names.tolist(), places, strict=True)
+        "displacement" if place or units.get(name) == "m" else STEP_OF.sub("", name) or "stress"
+        for name, place in zip(data.names.tolist(), data.placed, strict=True)
     ]
 
 
 def of_data(found: Sequence[Measurements | None], units: Mapping[str, str], extent: float) -> list[Assumption]:
     """Return what data sets on a body of some extent (m) take for granted: where points are, and the scales."""
     there = [data for data in found if data is not None]
-    placed = any(np.isfinite(data.places).all(axis=1).any() for data in there)
+    placed = any(data.placed.any() for data in there)
     scales = dict.fromkeys(name for data in there for name in quantities(data, units))
     shifts = [Assumption(f"data.shift.{axis}", PART * extent, "m") for axis in AXES if placed]
     return [*shifts, *(Assumption(f"data.scale.{name}", PART, "1", PART) for name in scales)]
@@ -159,7 +158,7 @@ class Moved:
     @cached_property
     def rows(self) -> NDArray[np.intp]:
         """Which data (r,) are at places."""
-        return np.flatnonzero(np.isfinite(self.data.places).all(axis=1))
+        return np.flatnonzero(self.data.placed)
 
     @cached_property
     def places(self) -> FloatArray:

@@ -187,6 +187,12 @@ class Measurements:
         return np.where(np.isfinite(self.at), self.at, numbers)
 
     @property
+    def placed(self) -> NDArray[np.bool_]:
+        """Which data (m,) are at places of a body."""
+        somewhere = self.places.shape[1] == len(AXES)
+        return np.asarray(np.isfinite(self.places).all(axis=1) & somewhere)
+
+    @property
     def described(self) -> dict[str, FloatArray]:
         """Places and axes, by their names in results; of outputs of a model nothing."""
         if self.some:

@@ -75,7 +75,7 @@ class SharedMotion:
         registered = data.registered
         root = np.zeros((0, 6)) if registered is None or not registered.uncertain else registered.root
         root = root[np.linalg.norm(root, axis=1) > 0]
-        there = np.isfinite(data.places).all(axis=1)
+        there = data.placed
         if not there.any() or not (len(root) or any(data.between)):
             return None
         known = np.where(there[:, None], data.places, data.places[there][0])

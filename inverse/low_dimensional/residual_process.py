@@ -77,7 +77,7 @@ def process(posterior: Posterior, at: Density, data: Measurements) -> Process:
     noise, scale, d = posterior.noise, posterior.scale(at.x)[0], len(posterior.inputs.names)
     A, unit = posterior.sensitivities(at)[0], float(np.median(scale))
     start = unexplained(A, posterior.residuals(at.outputs, at.x) - A @ at.x[0, :d])[0]
-    places = np.isfinite(data.places).all(axis=1)
+    places = data.placed
     X, along = np.where(places[:, None], data.places, 0.0), np.where(places[:, None], data.along, 0.0)
     shared = (along @ along.T) * (data.cases[:, None] == data.cases)
     apart = cdist(X, X)

@@ -106,7 +106,7 @@ def beside(between: FloatArray, data: Measurements) -> FloatArray:
     errors need not be.
     """
     squares = (between / data.sigma) ** 2
-    curves = ~np.isfinite(data.places).all(axis=1)
+    curves = ~data.placed
     for axis in np.unique(data.axes[curves]):
         rows = np.flatnonzero(curves & (data.axes == axis))
         rows = rows[np.argsort(data.cases[rows], kind="stable")]
@@ -121,7 +121,7 @@ def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> Flo
     Both are patterns, of which the rest is extrapolated by one factor; in truth it is another in each load case, for
     each component, and varies slowly over the body: the data say which of these they are, and where.
     """
-    somewhere, points, groups = np.isfinite(data.places).all(axis=1), data.places, data.kinds
+    somewhere, points, groups = data.placed, data.places, data.kinds
     seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
     low, high = seen.min(axis=0), seen.max(axis=0)
     across = np.zeros((len(between), 3))

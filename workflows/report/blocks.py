@@ -185,11 +185,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class Card(Block):
-    """The question of a study in words, what forbids to believe the answers, and these side by side."""
+    """The question of a study in words, what is to be read before the answers, and these side by side."""
 
     question: str
     answers: Sequence[Answer] = ()
-    errors: Sequence[str] = ()
+    before: Sequence[Text] = ()
 
     @property
     def lines(self) -> Sequence[str]:

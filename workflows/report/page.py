@@ -26,7 +26,7 @@ from workflows.results.directory import read_dataset, read_summary
 from workflows.run import own_code
 
 HERE = Path(__file__).parent
-TOP = ("answer", "findings", "body")  # sections of the first screen
+TOP = ("answer", "findings", "body", "curves")  # sections of the first screen
 Parts = list[tuple[str, list[Block]]]  # sections by their names
 
 
@@ -161,10 +161,10 @@ def render(title: str, parts: Parts) -> str:
 
 
 def _grouped(parts: Parts) -> list[dict[str, Any]]:
-    """Put the sections of the first screen, with the body at the side if there is one, into a group of their own."""
+    """Put the sections of the first screen into a group of their own, a body or curves at the side if there are."""
     numbers = [i for i, (name, _) in enumerate(parts) if name in TOP]
     first, last = (numbers[0], numbers[-1] + 1) if numbers else (0, 0)
-    two = any(block.macro == "viewer" for name, blocks in parts if name == "body" for block in blocks)
+    two = any(name == "curves" or (name == "body" and block.macro == "viewer") for name, of in parts for block in of)
     groups = ((parts[:first], False), (parts[first:last], True), (parts[last:], False))
     return [{"sections": some, "top": top, "two": two} for some, top in groups if some]
 

@@ -251,7 +251,7 @@ class TakenForGranted:
 
     def _moved(self, data: Measurements) -> Moved | None:
         shifts = self.spec.placed and any(one.name.startswith("data.shift.") for one in self.beside)
-        if not shifts or not np.isfinite(data.places).all(axis=1).any():
+        if not shifts or not data.placed.any():
             return None
         body = self.spec.bodies[0].body
         return Moved(data, self._extent, onto(body) if data.on_surface else body.nearest, data.on_surface)
@@ -263,7 +263,7 @@ class TakenForGranted:
         )
         scales = [*(["displacement"] if self.spec.placed else []), *measured]
         shifts = [f"data.shift.{axis}" for axis in AXES] if self.spec.placed else []
-        known = [*(one.name for one in self.numbers), *(f"data.scale.{name}" for name in scales), *shifts]
+        known = [*(one.name for one in self.all), *(f"data.scale.{name}" for name in scales), *shifts]
         for name, how in self.stated.items():
             if name in self.unknown:
                 yield ("uncertain", name), "is a parameter too, expected one of both", name

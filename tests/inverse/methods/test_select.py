@@ -546,6 +546,10 @@ def test_a_study_from_the_command_line(small, looked_at, capsys):
         "data:image/svg+xml",
     ):
         assert words in page
+    # Curves are on the first screen, and stresses are no displacements of points.
+    assert page.index('id="curves"') < page.index('id="evidences"')
+    assert "measured stress is 1 % larger" in page
+    assert "farther along" not in page
     capsys.readouterr()
     assert main(["run", str(small), "--out", str(small.parent / "one")]) == 0
     assert "nothing to do" in capsys.readouterr().out

@@ -2,17 +2,21 @@
 
 import html
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 from scipy import integrate, stats
 
+from forward.findings import Finding
 from forward.readable import and_error, interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import SVG, solve, study, study_of, write
+from uq.findings import add
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
+from workflows.report.sections.frame import gravest
 from workflows.results import summary
 from workflows.run import closing
 
@@ -177,3 +181,21 @@ def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():
     lines = "\n".join(answer._unknown(xr.Dataset(posterior | known), "material.C1", "Pa").lines).replace("\u00a0", " ")
     assert "truth 450 Pa, inside" in lines
     assert "before the data 500 ± 250 Pa" in lines
+
+
+def test_what_is_to_be_read_first_stands_before_the_numbers():
+    """Errors, that a best model is a bad one, that the error of the mesh is not known; no notes."""
+    of = [
+        Finding("mesh-unknown", "warning", {"why": "too large"}),
+        Finding("mesh-unknown", "note", {"why": "it has no mesh"}),
+        Finding("best-of-bad", "warning", {"best": "a", "wrong": "follow one another"}),
+        Finding("no-mesh", "warning", {"kind": "python"}),
+    ]
+    results = SimpleNamespace(dataset=xr.Dataset())
+    add(results.dataset, *of)
+    said = gravest(results)
+    assert [one.tone for one in said] == ["warning", "warning"]
+    assert sorted(one.text.partition(":")[0] for one in said) == [
+        "Best of bad models",
+        "The error of the mesh is not known",
+    ]

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.model import FloatArray
 from forward.readable import named, percent, with_error
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, finished, stacked, text_of
+from workflows.report.plots.figure import (
+    COLOURS,
+    CONTROLLED,
+    DARK,
+    HIGH,
+    LEGEND,
+    axes,
+    figure_of,
+    finished,
+    grid,
+    stacked,
+    text_of,
+)
 from workflows.report.plots.posterior import pairs
 from workflows.results.comparison import by_probability, ranking
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
+
+WIDE = 2  # tests side by side
 
 
 def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -90,6 +104,19 @@ def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -
     chosen = (dataset["output_group"].values == group) & (dataset["output_test"].values == test)
     one = dataset.isel(output=np.flatnonzero(chosen))
     return _over(dataset, one, one["output_at"].to_numpy(), f"{test}: stretch or amount of shear", "stress (Pa)", ax)
+
+
+def fits(dataset: xr.Dataset, tests: Sequence[tuple[str, str]]) -> Axes:
+    """Draw the curves of all tests, given with their groups, side by side, with one legend below."""
+    panels = grid(len(tests), min(len(tests), WIDE), (3.7, 2.9), (0.65, 0.55, 0.15, 0.15), below=2 * LEGEND)
+    for panel, (group, test) in zip(panels, tests, strict=True):
+        legend = curves(dataset, group, test, panel).get_legend()
+        if legend is not None:
+            legend.remove()
+    last = panels[-1]
+    handles = last.get_legend_handles_labels()
+    figure_of(last).legend(*handles, loc="lower center", ncols=3, fontsize="small", frameon=False)
+    return last
 
 
 def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, ax: Axes | None = None) -> Axes:

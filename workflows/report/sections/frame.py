@@ -32,7 +32,8 @@ def header(results: Results) -> Iterator[Block]:
 
 
 NOTES = 2  # that are read at once
-FIRST = 2  # errors that stand before the answers
+FIRST = 2  # findings that stand before the answers: errors, and these
+BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
 
 
 @section(
@@ -43,7 +44,7 @@ def findings(results: Results) -> Iterator[Block]:
     if "note" in results.summary:
         yield Text(results.summary["note"], "warning")
     found = of_results.findings(results.dataset)
-    said = gravest(results)
+    said = [one.text for one in gravest(results)]
     for one in found:
         if one.severity != "note" and one.text not in said:
             yield Text(one.text, one.severity)
@@ -54,9 +55,11 @@ def findings(results: Results) -> Iterator[Block]:
         yield Folded(f"{more} more note{'s' * (more > 1)}", notes[NOTES:])
 
 
-def gravest(results: Results) -> list[str]:
-    """Return the first of what makes numbers not to be trusted, which is to be read before them."""
-    return [one.text for one in of_results.findings(results.dataset) if one.severity == "error"][:FIRST]
+def gravest(results: Results) -> list[Text]:
+    """Return the first of what is to be read before any number: that it cannot be trusted, or does not hold all."""
+    found = of_results.findings(results.dataset)
+    heard = [one for one in found if one.severity == "error" or (one.severity == "warning" and one.code in BEFORE)]
+    return [Text(one.text, one.severity) for one in heard[:FIRST] if one.severity != "note"]
 
 
 @section("nominal", heading="What was computed")

@@ -242,11 +242,9 @@ def curves(results: Results) -> Iterator[Block]:
     tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
     if dataset.attrs["quantity"] == "stress":
         yield Heading("Curves over the data")
-        several, drawn = dataset.sizes["group"] > 1, []
-        for group, test in tests:
-            caption = f"{test}{f' of {group}' if several else ''}: mean and 90 % band."
-            drawn.append((plots.curves(dataset, str(group), str(test)), caption))
-        yield Pictures.of(*drawn, small=True)
+        names = ", ".join(str(test) for _, test in tests)
+        figure = plots.fits(dataset, [(str(group), str(test)) for group, test in tests])
+        yield Pictures.of((figure, f"{names}: mean and 90 % band of each model."))
         return
     paths = dict(_paths(results, [str(test) for _, test in tests]))
     if paths:
