@@ -54,8 +54,9 @@
   const cell = (text) => (/[",\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text);
   const csv = (table) => [...table.rows].map(
     (row) => [...row.cells].map((c) => cell(c.textContent.trim())).join(",")).join("\n") + "\n";
-  for (const table of document.querySelectorAll(".scroll > table")) {
+  for (const [number, table] of document.querySelectorAll(".scroll > table").entries()) {
     const name = before(table);
+    table.parentElement.setAttribute("aria-label", `table ${number + 1}: ${name}`);
     [...table.tHead.rows[0].cells].forEach((head, column) => {
       if (table.tBodies[0].rows.length < 2) return;
       const words = document.createElement("button");
@@ -69,7 +70,7 @@
       save(`${study}-${slug(name)}.csv`, url);
       setTimeout(() => URL.revokeObjectURL(url), 1000);
     };
-    table.parentElement.before(tools(button("CSV", `save the table of ${name} as CSV`, file)));
+    table.parentElement.before(tools(button("CSV", `CSV: save the table of ${name}`, file)));
     table.csv = () => csv(table);
     // What lies beyond the window fades out, so that one sees that there is more.
     const box = table.parentElement;
@@ -86,7 +87,7 @@
   addEventListener("afterprint", () => { for (const folded of closed) folded.open = false; });
   for (const image of document.querySelectorAll("figure > img[src^='data:image/']")) {
     const kind = image.src.startsWith("data:image/svg") ? "svg" : "png";
-    const words = `save the picture: ${image.alt}`;
-    image.after(tools(button(kind.toUpperCase(), words, () => save(`${study}-${slug(image.alt)}.${kind}`, image.src))));
+    const name = kind.toUpperCase(), words = `${name}: save the picture: ${image.alt}`;
+    image.after(tools(button(name, words, () => save(`${study}-${slug(image.alt)}.${kind}`, image.src))));
   }
 })();

@@ -657,7 +657,7 @@ class Viewer {
     if (this.insides.length) {
       const skin = range(0, 1, this.opacity, (x) => { this.opacity = x; this.draw(); });
       skin.className = "skin"; bar.append(label("skin", skin));
-      this.insides.forEach((s) => { const c = check(s.name, s.shown, (on) => { s.shown = on; }); c.style.color = `rgb(${s.paint.map((x) => 255 * x * 0.85)})`; bar.append(c); });
+      this.insides.forEach((s) => { const c = check(s.name, s.shown, (on) => { s.shown = on; }); c.style.borderBottom = `2px solid rgb(${s.paint.map((x) => 255 * x)})`; bar.append(c); });
     }
     this.arrows.forEach((a) => bar.append(check(`residuals, ${a.name}`, a.shown, (on) => {
       a.shown = on;
@@ -678,7 +678,7 @@ class Viewer {
     bar.append(note);
     const push = (words, title, act) => { const b = make("button", { type: "button", textContent: words, title }); b.setAttribute("aria-label", title); b.addEventListener("click", act); return b; };
     this.element.querySelector(".buttons").append(push("+", "nearer", () => this.nearer(1.25)), push("−", "farther", () => this.nearer(0.8)), push("⌂", "the first view", () => this.home()),
-      push("PNG", "save the picture", () => { this.paint(); const link = document.createElement("a"); link.href = this.canvas.toDataURL("image/png"); link.download = "body.png"; link.click(); }));
+      push("PNG", "PNG: save the picture", () => { this.paint(); const link = document.createElement("a"); link.href = this.canvas.toDataURL("image/png"); link.download = "body.png"; link.click(); }));
     if (this.expansion) this.sliders();
   }
   nearer(by) { this.zoom = Math.min(Math.max(this.zoom * by, 0.3), 40); this.draw(); }
