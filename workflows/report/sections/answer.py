@@ -47,6 +47,7 @@ SAID = 0.02  # share of the variance that is worth a word
 NAMED = 4  # names in a question
 MODES = 2  # of a field, from which on they are named together
 GOALS = 4  # predictions on the card
+SEVERAL = 3  # candidates of which evidences are told beside their probabilities
 LAPLACE = 0  # value of `source`, see docs/results.md
 
 
@@ -313,13 +314,13 @@ def selection(results: Results) -> Card:
     for rank, model in enumerate(order):
         one = of.sel(model=model)
         error = float(one["log_evidence_error"])
-        lines = [f"ln Z {with_error(float(one['log_evidence']), error)}"]
+        lines = [f"ln Z {with_error(float(one['log_evidence']), error)}"] if rank < SEVERAL else []
         if rank == 0 and len(order) > 1:
             ln_B, _ = bayes_factor(of, model, order[1])
             lines.append(f"{_odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
         elif rank:
             lines.append(f"{_odds(bayes_factor(of, order[0], model)[0])} against it")
-        if "stacking" in one:
+        if "stacking" in one and rank < SEVERAL:
             lines.append(f"stacking {percent(float(one['stacking']))}")
         if "mesh_checked" in one and not bool(one["mesh_checked"].all()):
             lines.append(NOT_KNOWN)

@@ -31,7 +31,7 @@ def header(results: Results) -> Iterator[Block]:
         yield Text(f"{summary['stopped']}; {counted(solves(results.summary))}, {failed}")
 
 
-NOTES = 2  # that are read at once
+NOTES = 1  # that are read at once, unless there is something graver
 FIRST = 2  # findings that stand before the answers: errors, and these
 BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
 
@@ -45,14 +45,14 @@ def findings(results: Results) -> Iterator[Block]:
         yield Text(results.summary["note"], "warning")
     found = of_results.findings(results.dataset)
     said = [one.text for one in gravest(results)]
-    for one in found:
-        if one.severity != "note" and one.text not in said:
-            yield Text(one.text, one.severity)
+    grave = [Text(one.text, one.severity) for one in found if one.severity != "note"]
+    yield from (one for one in grave if one.text not in said)
     notes = [Text(one.text) for one in found if one.severity == "note"]
-    yield from notes[:NOTES]
-    if len(notes) > NOTES:
-        more = len(notes) - NOTES
-        yield Folded(f"{more} more note{'s' * (more > 1)}", notes[NOTES:])
+    first = 0 if grave else NOTES
+    yield from notes[:first]
+    if len(notes) > first:
+        more = len(notes) - first
+        yield Folded(f"{more} {'more ' * bool(first)}note{'s' * (more > 1)}", notes[first:])
 
 
 def gravest(results: Results) -> list[Text]:
