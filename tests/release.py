@@ -49,6 +49,7 @@ def do(*command, place=ROOT, **more):
     )
     said = f"{time.monotonic() - begin:4.0f} s  {Path(command[0]).name} {' '.join(map(str, command[1:]))}"
     sys.stdout.write(f"{said[:120]}\n")
+    sys.stdout.flush()
     return done.stdout.strip()
 
 
@@ -76,11 +77,11 @@ def main():
         assert do(inside / "tissuq", "--version", place=place) == f"tissuq {version}"
         do(inside / "tissuq", "run", ROOT / "configs" / "tiny.toml", "--out", Path(place) / "tiny", place=place)
         assert (Path(place) / "tiny" / "report.html").exists()
-    tool = shutil.which("docker") or shutil.which("podman")
-    if tool:
-        do(tool, "build", "--tag", f"tissuq:{version}", "--file", "packaging/Dockerfile", ".")
+    docker = shutil.which("docker")
+    if docker and subprocess.run([docker, "info"], capture_output=True, check=False).returncode == 0:
+        do(docker, "build", "--tag", f"tissuq:{version}", "--file", "packaging/Dockerfile", ".")
     else:
-        sys.stdout.write("packaging/Dockerfile is not built: there is no docker and no podman here\n")
+        sys.stdout.write("packaging/Dockerfile is not built: no daemon of docker answers here\n")
     for path in sorted(DIST.iterdir()):
         sys.stdout.write(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1e6:.1f} MB\n")
 

@@ -25,7 +25,8 @@ from workflows.starter import starter
 from workflows.studies.study import STUDIES, UNNAMED
 
 ROOT = Path(__file__).parent.parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+ON_SITE = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md")), *ON_SITE]
 FENCE = re.compile(r"(?P<runs><!-- runs -->\n)?^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^    .*\n)+", re.MULTILINE)
 PLACE = re.compile(r"(?<![\w/])((?:benchmarks|configs|docs|notebooks|tests)/[\w./-]+\.\w+)")
@@ -289,7 +290,7 @@ def test_generated_pages_tell_what_is_there(pages):
 
 
 def test_quotations_are_found(reference):
-    for page in PAGES[1:]:
+    for page in ON_SITE:
         text = reference.quoted(page.read_text(encoding="utf-8"))
         assert not re.search(r"^\{\{", text, re.MULTILINE), page
     text = reference.written(
@@ -300,7 +301,7 @@ def test_quotations_are_found(reference):
 
 def test_pages_are_in_the_menu_or_linked(pages):
     named = set(re.findall(r"[\w/.-]+\.md", (ROOT / "mkdocs.yml").read_text()))
-    written = {str(page.relative_to(ROOT / "docs")) for page in PAGES[1:]}
+    written = {str(page.relative_to(ROOT / "docs")) for page in ON_SITE}
     linked = set(re.findall(r"\]\((?:\.\./)?([\w/.-]+\.md)", "".join([*pages.values(), *map(Path.read_text, PAGES)])))
     assert named <= set(pages) | written
     assert written <= named | linked
