@@ -87,7 +87,7 @@ release: docs ## build the source archive and the wheel into dist/, install the 
 	@$(PYTHON) -m tests.release
 
 clean: ## remove .venv and caches; results stay
-	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .grimp_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Reports are tested in a browser; without one these tests are skipped, with the reason.

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 import zipfile
@@ -30,6 +31,11 @@ def stated(places):
     return {name: re.search(pattern, (ROOT / name).read_text(), re.M)[1] for name, pattern in places.items()}
 
 
+def git(*words):
+    """What git says of this tree."""
+    return subprocess.check_output(["git", *words], cwd=ROOT, text=True)
+
+
 def refused():
     """Why there is nothing to release, if so."""
     for said in map(stated, (VERSION, DATE)):
@@ -37,7 +43,7 @@ def refused():
             return f"files do not agree: {said}"
     if re.search(r"^## \[Unreleased\]", (ROOT / "CHANGELOG.md").read_text(), re.M):
         return "CHANGELOG.md has changes without a version"
-    changed = subprocess.check_output(["git", "status", "--porcelain"], cwd=ROOT, text=True)
+    changed = git("status", "--porcelain")
     return f"what is not committed would be published:\n{changed}" if changed else ""
 
 
@@ -62,6 +68,10 @@ def main():
     shutil.rmtree(DIST, ignore_errors=True)
     do(Path(sys.executable).parent / "hatchling", "build", "--target", "sdist")
     (archive,) = DIST.glob("*.tar.gz")
+    with tarfile.open(archive) as files:
+        held = {Path(*Path(one.name).parts[1:]).as_posix() for one in files if one.isfile()}
+    extra = held - {"PKG-INFO", *git("ls-files").splitlines()}
+    assert not extra, extra
     offline = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation")
     do(sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", DIST, archive)  # from what is published
     (wheel,) = DIST.glob("*.whl")
