@@ -33,7 +33,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-faults test-flags test-all test-wheel lint house notebooks bench docs clean system graphics browser
+.PHONY: help setup setup-wheel demo test test-unit test-faults test-flags test-all test-wheel lint house notebooks bench docs release clean system graphics browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -83,8 +83,11 @@ docs: $(READY) ## build the documentation into site/, without network
 	@NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
 	@echo site/index.html
 
+release: docs ## build the source archive and the wheel into dist/, install the wheel elsewhere and run a study with it
+	@$(PYTHON) -m tests.release
+
 clean: ## remove .venv and caches; results stay
-	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .grimp_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Reports are tested in a browser; without one these tests are skipped, with the reason.

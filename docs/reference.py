@@ -60,6 +60,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def pages() -> Iterator[tuple[str, str]]:
     """Return the generated pages: where each goes, and its text."""
     yield "overview.md", overview((ROOT / "README.md").read_text(encoding="utf-8"))
+    for name in ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md"):
+        yield name, overview((ROOT / name).read_text(encoding="utf-8"))
     yield "studies.md", shipped()
     yield "decisions.md", decisions()
     yield "reference/settings.md", settings()
@@ -77,7 +79,7 @@ def pages() -> Iterator[tuple[str, str]]:
 
 
 def overview(readme: str) -> str:
-    """Return the README with its links as of the site."""
+    """Return the README, or a page beside it, with its links as of the site."""
     text = readme.replace("](docs/", "](")
     text = re.sub(r"\]\(configs/([\w-]+)\.toml\)", r"](studies.md#\1)", text)
     return re.sub(r"\[(`[^`]+`)\]\((?:configs|notebooks)\b[^)]*\)", r"\1", text)  # other files are not on the site

@@ -5,11 +5,12 @@ import io
 import itertools
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,24 @@ def in_process(*arguments):
         except SystemExit as end:
             code = end.code
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+def killed(ranks, blocks, *command):
+    """Kill a run, whose directory comes last, once so many more blocks are finished; whether it was at work."""
+    nothing = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+    process = subprocess.Popen(on_ranks(ranks, *command), env=environment(), cwd=ROOT, **nothing)
+    kept, begin = Path(command[-1]) / "evaluations", time.monotonic()
+    until = len(list(kept.glob("*.h5"))) + blocks
+    while process.poll() is None and time.monotonic() - begin < HANGS and len(list(kept.glob("*.h5"))) < until:
+        time.sleep(0.02)
+    at_work = process.poll() is None
+    if at_work:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        for one in (process.pid, *map(int, children)):  # mpirun first, or it would end the others in good order
+            with suppress(ProcessLookupError):
+                os.kill(one, signal.SIGKILL)
+    process.wait()
+    return at_work
 
 
 def run_script(ranks, script, *arguments, timeout=HANGS):

@@ -12,6 +12,7 @@ import yaml
 from packaging.requirements import Requirement
 
 from tests.launch import ROOT, environment, run_script
+from tests.release import DATE, VERSION, stated
 
 
 @pytest.fixture(scope="module")
@@ -170,3 +171,56 @@ def test_the_recipe_of_conda_needs_what_the_wheel_needs():
 def test_the_extras_of_the_page_are_those_that_there_are():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(extras) - {"benchmarks", "dev"}
+
+
+def test_version_and_date_stand_in_all_places_alike():
+    assert len(set(stated(VERSION).values())) == len(set(stated(DATE).values())) == 1
+
+
+def test_authors_and_classifiers_are_those_that_there_are():
+    classifiers = pytest.importorskip("trove_classifiers").classifiers
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert set(project["classifiers"]) <= classifiers
+    assert project["authors"] == yaml.safe_load((ROOT / "CITATION.cff").read_text())["authors"]
+
+
+def test_forges_run_the_targets_that_a_change_must_pass():
+    (job,) = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"].values()
+    assert job["steps"][-1]["run"] == "make ${{ matrix.target }}"
+    taken, makefile = job["strategy"]["matrix"]["target"], (ROOT / "Makefile").read_text()
+    assert set(taken) <= set(re.findall(r"^([\w-]+):", makefile, re.M))
+    everything = set(re.findall(r"make ([\w-]+)", (ROOT / ".ci" / "run").read_text()))
+    assert set(taken) == everything - {"setup", "setup-wheel"}  # which the others make
+
+
+# What can execute what it is given, or reach other programs. SECURITY.md says of each what that means.
+REACH = re.compile(
+    r"pickle\.(?:loads?|Unpickler)|(?<![.\w])(?:eval|exec)\(|CDLL\(|import_module\(|allow_pickle=True"
+    r"|subprocess\.|urlopen\(|create_server\("
+)
+REACHING = {
+    "forward/external/models.py": "servers of UM-Bridge",
+    "forward/external/own_modules.py": "modules that a study names",
+    "forward/fem/dolfinx/lanes.py": "compiled forms",
+    "forward/files/vtk.py": "a process that reads a file",
+    "forward/native.py": "compiled kernels",
+    "forward/registry.py": "kinds: the program's own, and of installed packages",
+    "inverse/optional.py": "packages that may be missing",
+    "tissuq/__init__.py": "the program's own modules",
+    "uq/evaluation/ensemble.py": "errors, to other ranks",
+    "uq/evaluation/kept.py": "kept steps, by a reader of plain data",
+    "workflows/http.py": "who is answered",
+    "workflows/live/mail.py": "the processes of tissuq live",
+    "workflows/run/progress.py": "a process that says a line a minute",
+    "workflows/run/version.py": "git",
+}
+
+
+def test_what_can_execute_code_is_known():
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("forward", "uq", "inverse", "workflows", "tissuq")
+        for path in (ROOT / package).rglob("*.py")
+        if REACH.search(path.read_text())
+    }
+    assert found == set(REACHING)

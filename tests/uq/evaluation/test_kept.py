@@ -1,5 +1,8 @@
 """Solves and blocks that a rank group has stored are not computed again."""
 
+import io
+import os
+import pickle
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +15,7 @@ from forward.pointwise import FunctionModel, OneByOne
 from tests.states import WithState
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.kept import Kept, KeptSolves
+from uq.evaluation.kept import Kept, KeptSolves, _Reader
 from uq.evaluation.request import Request
 
 NAMES = ("a", "b")
@@ -171,3 +174,17 @@ def test_failures_are_kept(tmp_path, at, kind):
         assert len(model.record.log[0].failures) == 1
         told.append((raised.value.reason, raised.value.history))
     assert told[0] == told[1]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("harm", [os.system, print, np.load, eval, io.FileIO, pickle.loads])
+def test_kept_steps_are_plain_data(harm):
+    """A file that would call something is refused before it does."""
+
+    class Harm:
+        def __reduce__(self):
+            return harm, ("x",)
+
+    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+        with pytest.raises(pickle.UnpicklingError, match="is no plain data"):
+            _Reader(io.BytesIO(pickle.dumps([1.0, Harm()], protocol))).load()

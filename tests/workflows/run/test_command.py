@@ -2,12 +2,8 @@
 
 import importlib.metadata
 import json
-import os
 import random
 import shutil
-import signal
-import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -17,9 +13,8 @@ from tests.launch import (
     ROOT,
     TISSUQ,
     assert_same_bits,
-    environment,
     in_process,
-    on_ranks,
+    killed,
     run,
     run_script,
     tissuq_on_two_ranks,
@@ -230,27 +225,40 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     assert in_process(*arguments, whole).returncode == 0
     broken = tmp_path / "broken"
     chance = random.Random(1)
-    kills = 0
     for ranks in (1, 3):
-        process = subprocess.Popen(
-            on_ranks(ranks, TISSUQ, *arguments, broken),
-            env=environment(),
-            start_new_session=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        # Wait until blocks are being finished, so that the kill falls into the work.
-        begin, before = time.monotonic(), len(list(broken.glob("evaluations/*.h5")))
-        while process.poll() is None and time.monotonic() - begin < 60:
-            if len(list(broken.glob("evaluations/*.h5"))) > before + chance.randint(1, 6):
-                break
-            time.sleep(0.02)
-        kills += process.poll() is None
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        # The ranks are children of mpirun in sessions of their own.
-        subprocess.run(["pkill", "-9", "-f", str(broken)], check=False)
-    assert kills == 2
+        assert killed(ranks, chance.randint(2, 7), TISSUQ, *arguments, broken)
+    done = tissuq_on_two_ranks(*arguments, broken)
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(whole, broken)
+
+
+CHEAP = """
+[model]
+kind = "python"
+function = "tests.functions.cube"
+parameters = { a = 1 }
+outputs = ["y"]
+
+[parameters]
+a = { kind = "normal", mean = 1, std = 0.5 }
+"""
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "samples"), [(CHEAP, 100_000), (TINY.read_text(), 1000)], ids=["python", "body"])
+def test_same_bits_of_many_samples_after_two_kills_on_two_ranks(tmp_path, model, samples):
+    """A cheap model at 10⁵ points and a body at 10³: what a laptop does in a minute."""
+    (tmp_path / "study.toml").write_text(model)
+    method = f"method={{kind='monte-carlo', samples={samples}, seed=1}}"
+    arguments = ("run", tmp_path / "study.toml", "--set", method, "--no-report", "--out")
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    done = tissuq_on_two_ranks(*arguments, whole)
+    assert done.returncode == 0, done.stderr
+    chance = random.Random(samples)
+    for _ in range(2):
+        assert killed(2, chance.randint(1, 60), TISSUQ, *arguments, broken)
     done = tissuq_on_two_ranks(*arguments, broken)
     assert done.returncode == 0, done.stderr
     assert_same_bits(whole, broken)
