@@ -23,7 +23,7 @@ PACKAGES = {
     "forward": "Bodies and other models",
 }
 SECTIONS = ("Parameters", "Attributes", "Returns", "Yields", "Raises", "Notes", "References")
-COMMANDS = ("check", "run", "report", "serve", "init", "schema", "completion")
+COMMANDS = ("check", "run", "solve", "report", "reduce", "live", "serve", "init", "schema", "completion")
 # In formulas, letters (ω, or an x that ends no word) with what stands low and high beside them.
 SUBSCRIPT = re.compile(r"((?<![A-Za-z0-9_])[A-Za-z][\u0300-\u036f]?|[^\x00-\x7f])_(\{[^}]*\}|[A-Za-z0-9~]+)")
 SUPERSCRIPT = re.compile(r"(\S)\^(\{[^}]*\}|\([^)]*\)|[A-Za-z0-9]+)")
