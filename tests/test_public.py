@@ -1,5 +1,6 @@
 """The public namespace: studies and models from Python, in a few lines."""
 
+import re
 import sys
 from importlib.metadata import version
 
@@ -8,6 +9,7 @@ import pytest
 
 import tissuq
 from tests.launch import ROOT, on_kept_ranks, run_script
+from uq.methods.chaos import Chaos
 
 TINY = ROOT / "configs" / "tiny.toml"
 
@@ -95,3 +97,58 @@ def test_a_python_function_is_a_model_too(monkeypatch):
     assert found.mesh_error == {}
     with pytest.raises(ValueError, match="no body"):
         _ = found.displacement
+
+
+BODY = {
+    "body": {"kind": "box", "size": np.array([0.1, 0.02, 0.02]), "cells": [6, 2, 2]},
+    "clamp": ["x-min"],
+    "material": {"kind": "neo-hookean", "C1": 1e4, "D1": 2e5},
+    "loads": [{"kind": "gravity", "density": 1000.0}],
+    "outputs": [{"name": "sag", "kind": "max-displacement", "component": "z"}],
+}
+GIVEN = {"material.C1": {"kind": "log-normal", "mean": 1e4, "std": 2e3}}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda: tissuq.Study(modle=BODY), "method: missing\nmodle: unknown key; did you mean 'model'?"),
+        (lambda: tissuq.Study(model=BODY, method={"kind": "inwert"}), "did you mean 'invert'?; given 'inwert'"),
+        (lambda: tissuq.Study(model=BODY, method={"kind": "invert", "samples": 0.5}), "data: missing"),
+        (lambda: tissuq.Hyperelastic(**BODY | {"clamp": "x-min"}), "clamp: expected a list; given 'x-min'"),
+        (lambda: tissuq.Specimen(**BODY), "clamp: unknown key"),
+        (lambda: tissuq.Model(BODY | {"kind": "hyperelastc"}), "did you mean 'hyperelastic'"),
+        (lambda: tissuq.Model(BODY, ["material.C2"]), "did you mean 'material.C1'"),
+        (lambda: tissuq.load("nothing.toml"), "nothing.toml: cannot be read: No such file"),
+        (lambda: tissuq.read("nothing"), "nothing: holds no results.nc"),
+        (lambda: tissuq.load(TINY, ["method.kind='chaos'", "method.smaples=3"]), "did you mean 'samples'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_lines_by_one_kind_of_exception(wrong, said):
+    with pytest.raises(tissuq.Error) as caught:
+        wrong()
+    assert said in str(caught.value)
+
+
+def test_every_exception_of_the_program_is_one():
+    apart = {"Error", "Diverged", "TimeLimitError", "RefusalError"}  # of control flow, and of requests to a server
+    for file in (
+        one for package in ("forward", "uq", "inverse", "workflows", "tissuq") for one in (ROOT / package).rglob("*.py")
+    ):
+        for name, bases in re.findall(r"^class (\w+)\(([^)]*(?:Error|Exception))\):", file.read_text(), re.MULTILINE):
+            assert name in apart or not {"Exception", "ValueError", "OSError"} & {bases}, (file, name)
+
+
+def test_a_study_takes_functions_of_the_session_and_blocks_as_objects(tmp_path, monkeypatch):
+    def twice(p):
+        return 2 * p
+
+    monkeypatch.setattr(sys.modules["__main__"], "twice", twice, raising=False)
+    twice.__module__, twice.__qualname__ = "__main__", "twice"
+    model = tissuq.Model({"kind": "python", "function": twice, "parameters": {"a": 1.0}, "outputs": ["y"]})
+    study = tissuq.Study(
+        model=model.spec, parameters={"a": {"kind": "normal", "mean": 1, "std": 0.1}}, method=Chaos(samples=8)
+    )
+    assert study.run()["mean"].item() == pytest.approx(2.0)
+    with pytest.raises(tissuq.Error, match="is a function of this session"):
+        study.run(tmp_path / "kept")

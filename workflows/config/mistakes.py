@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.errors import Error
 from forward.scalars import Mistake
 from forward.settings import UNKNOWN_KIND, cut, nearest, one_line, shown
 from uq.inputs.distributions import Distribution
@@ -18,7 +19,7 @@ from uq.inputs.distributions import Distribution
 LISTED = 50  # mistakes that are shown
 
 
-class StudyError(Exception):
+class StudyError(Error):
     """A study that cannot be run; each argument is one line: the place, what was given and what was expected."""
 
     def __init__(self, *mistakes: str) -> None:

@@ -22,7 +22,7 @@ from workflows.config.study import parse
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.section import SECTIONS, Results, sections
-from workflows.results.directory import read_dataset, read_summary
+from workflows.results.directory import NoResultsError, read_dataset, read_summary
 from workflows.run import own_code
 
 HERE = Path(__file__).parent
@@ -125,7 +125,7 @@ def _read(directory: Path, refusals: list[str]) -> Results:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
-        raise FileNotFoundError(f"{directory}: holds no summary.json, expected the directory of a finished study")
+        raise NoResultsError(f"{directory}: holds no summary.json, expected the directory of a finished study")
     own_code.make_visible(directory)
     try:
         return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"]), folder=directory), directory)

@@ -382,6 +382,8 @@ def results_of(
     from mpi4py import MPI
 
     if directory is not None:
+        if "__main__" in own_code.modules(study):  # its text is not known, and so not whether it has changed
+            raise StudyError("model: is a function of this session, expected one of a module, or no directory")
         run(study, Path(directory).name, Path(directory), quiet=quiet, silent=quiet, report=report)
         return _on_first_rank(Path(directory))
     world = MPI.COMM_WORLD
