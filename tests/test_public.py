@@ -139,12 +139,10 @@ def test_every_exception_of_the_program_is_one():
             assert name in apart or not {"Exception", "ValueError", "OSError"} & {bases}, (file, name)
 
 
-def test_a_study_takes_functions_of_the_session_and_blocks_as_objects(tmp_path, monkeypatch):
+def test_a_study_takes_functions_of_the_session_and_blocks_as_objects(tmp_path):
     def twice(p):
         return 2 * p
 
-    monkeypatch.setattr(sys.modules["__main__"], "twice", twice, raising=False)
-    twice.__module__, twice.__qualname__ = "__main__", "twice"
     model = tissuq.Model({"kind": "python", "function": twice, "parameters": {"a": 1.0}, "outputs": ["y"]})
     study = tissuq.Study(
         model=model.spec, parameters={"a": {"kind": "normal", "mean": 1, "std": 0.1}}, method=Chaos(samples=8)

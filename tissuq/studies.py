@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from forward.external.own_modules import path_of
 from forward.hyperelastic import Hyperelastic as _Hyperelastic
 from forward.settings import Settings
 from forward.spec import MEASURED
@@ -58,8 +59,8 @@ def _written(value: Any) -> Any:
             return str(value)
         case _ if hasattr(value, "tolist"):  # arrays, columns, and their numbers
             return value.tolist()
-        case _ if callable(value) and hasattr(value, "__qualname__"):
-            return f"{value.__module__}.{value.__qualname__}"
+        case _ if callable(value) and hasattr(value, "__name__"):
+            return path_of(value)
         case _:
             return value
 

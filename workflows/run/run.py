@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from forward.external.own_modules import Loaded
+from forward.external.own_modules import SESSION, Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from forward.phases import phase
@@ -382,7 +382,7 @@ def results_of(
     from mpi4py import MPI
 
     if directory is not None:
-        if "__main__" in own_code.modules(study):  # its text is not known, and so not whether it has changed
+        if SESSION in own_code.modules(study):  # its text is not known, and so not whether it has changed
             raise StudyError("model: is a function of this session, expected one of a module, or no directory")
         run(study, Path(directory).name, Path(directory), quiet=quiet, silent=quiet, report=report)
         return _on_first_rank(Path(directory))
