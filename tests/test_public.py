@@ -1,5 +1,6 @@
 """The public namespace: studies and models from Python, in a few lines."""
 
+import html
 import re
 import sys
 from importlib.metadata import version
@@ -43,6 +44,23 @@ def test_a_study_in_memory_is_that_of_the_command(tmp_path):
     ]  # fmt: skip
     assert tissuq.plots.histogram(found, "uy_max").get_xlabel()
     assert tissuq.findings(found) == tissuq.findings(kept)
+    for one in (found, kept):
+        shown = one.tissuq.show()
+        assert "uy_max: " in repr(shown)
+        assert "<canvas" in html.unescape(shown._repr_html_())
+        assert "image/svg+xml" in one.tissuq.plot()._repr_mimebundle_()
+        assert one.tissuq.to_pandas().loc["uy_max", "mean_error"] == float(found["mean_error"].sel(output="uy_max"))
+        grid = one.tissuq.to_pyvista()
+        assert grid.n_cells == found.sizes["cell"]
+        np.testing.assert_array_equal(grid["mean (m)"], found["field_mean"].to_numpy())
+    assert "9 solves, 0 failed" in repr(kept.tissuq.show("header"))
+    for name in ("answr", "header"):  # the second only of a directory
+        with pytest.raises(tissuq.Error, match=f"'{name}' is no section of the report; did you mean 'answer'"):
+            found.tissuq.show(name)
+    with pytest.raises(tissuq.Error, match="no posterior in results of 'sensitivity-monte-carlo'"):
+        found.tissuq.to_arviz()
+    with pytest.raises(tissuq.Error, match="no whole results"):
+        found[["mean"]].drop_attrs().tissuq.show()
 
 
 @pytest.mark.fem
@@ -150,3 +168,34 @@ def test_a_study_takes_functions_of_the_session_and_blocks_as_objects(tmp_path):
     assert study.run()["mean"].item() == pytest.approx(2.0)
     with pytest.raises(tissuq.Error, match="is a function of this session"):
         study.run(tmp_path / "kept")
+
+
+def test_a_posterior_for_arviz_is_that_of_the_file(tmp_path, monkeypatch):
+    import arviz
+
+    monkeypatch.setattr(sys, "path", [str(ROOT / "configs"), *sys.path])
+    study = tissuq.Study(
+        model=tissuq.load(ROOT / "configs" / "own-model.toml").model,
+        parameters={"E": {"kind": "log-normal", "mean": 1e6, "std": 2e5}},
+        data={"outputs": {"tip": 7.5e-3}, "sigma": {"tip": 1e-4}},
+        method={"kind": "invert", "samples": 32},
+    )
+    found = study.run(tmp_path / "inverted")
+    kept, made = arviz.from_netcdf(tmp_path / "inverted" / "results.nc"), found.tissuq.to_arviz()
+    for group in ("posterior", "prior", "log_likelihood", "observed_data"):
+        assert made[group].equals(kept[group]), group
+    assert found.tissuq.to_pandas().index.names == ["data_set", "parameter"]
+
+
+def test_studies_and_models_are_shown_in_few_words(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "configs"), *sys.path])
+    names = [f"x{i}" for i in range(100)]
+    model = {"kind": "python", "function": "own_model.beam", "parameters": dict.fromkeys(names, 1.0), "outputs": names}
+    given = {name: {"kind": "normal", "mean": 0, "std": 1} for name in names}
+    study = tissuq.Study(model=model, parameters=given, method={"kind": "monte-carlo", "samples": 8})
+    assert repr(study).startswith("Study(model: python; parameters: x0, x1, x2, x3 and 96 others; method: monte-carlo")
+    assert len(repr(study)) < 300
+    assert "[parameters.x99]" in study._repr_html_()
+    made = tissuq.Model(study.model)
+    assert repr(made) == "Model(python: 100 numbers that can change; x0, x1, x2, x3, x4, x5, x6, x7 and 92 more)"
+    assert "<td>x99</td>" in made._repr_html_()

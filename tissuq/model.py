@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from forward import model as contract
+
+SHOWN = 8  # outputs that are written
 
 
 class Model:
@@ -69,6 +72,18 @@ class Model:
         self.units = {output.name: output.unit for output in spec.returned}
         self.nodes = None if self._model.space is None else self._model.space.coordinates
 
+    def __repr__(self) -> str:
+        """Its kind, how many numbers can change, and its outputs."""
+        return f"Model({self.spec.kind}: {len(self.parameters)} numbers that can change; {_first(self.units)})"
+
+    def _repr_html_(self) -> str:
+        """The same, with its numbers and their units."""
+        rows = (
+            f"<tr><td>{escape(path)}</td><td>{value:.6g}</td><td>{escape(self.spec.scalars[path].unit)}</td></tr>"
+            for path, value in self.parameters.items()
+        )
+        return f"<details><summary>{escape(repr(self))}</summary><table>{''.join(rows)}</table></details>"
+
     def solve(self, values: Mapping[str, float] | None = None, near: Solution | None = None) -> Solution:
         """Solve with some numbers changed; collective over the ranks that share the model.
 
@@ -102,6 +117,12 @@ class Model:
         return self._model
 
 
+def _first(words: Iterable[str]) -> str:
+    """Write words one after another; of many the first."""
+    listed = [*words]
+    return ", ".join(listed) if len(listed) <= SHOWN else f"{', '.join(listed[:SHOWN])} and {len(listed) - SHOWN} more"
+
+
 class Solution(Mapping[str, float]):
     """A solution of a model: its outputs by name, its displacements, and derivatives of the outputs.
 
@@ -127,8 +148,7 @@ class Solution(Mapping[str, float]):
         return len(self._outputs)
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{name} = {value:.6g} {self._of.units[name]}" for name, value in self.items())
-        return f"Solution({shown})"
+        return f"Solution({_first(f'{name} = {value:.6g} {self._of.units[name]}' for name, value in self.items())})"
 
     def gradient(self, output: str) -> dict[str, float]:
         """Return the derivatives of an output with respect to all numbers that can change, by path.

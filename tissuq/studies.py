@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+import tissuq.accessor  # noqa: F401 - `data.tissuq`
 from forward.external.own_modules import path_of
 from forward.hyperelastic import Hyperelastic as _Hyperelastic
 from forward.settings import Settings

@@ -69,6 +69,7 @@ def read_dataset(directory: Path) -> xr.Dataset:
         raise NoResultsError(f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}") from None
     if "config" not in found.attrs:
         raise NoResultsError(f"{path}: holds no results of a study, expected a file that `tissuq run` has written")
+    found.encoding["source"] = str(path)  # as xarray keeps it
     return found
 
 
