@@ -199,3 +199,49 @@ def test_studies_and_models_are_shown_in_few_words(monkeypatch):
     made = tissuq.Model(study.model)
     assert repr(made) == "Model(python: 100 numbers that can change; x0, x1, x2, x3, x4, x5, x6, x7 and 92 more)"
     assert "<td>x99</td>" in made._repr_html_()
+
+
+def test_vectors_are_written_as_such():
+    weights = np.random.default_rng(1).standard_normal((30, 20)) / 4
+    model = {
+        "kind": "python",
+        "function": lambda_free(weights.__matmul__),
+        "jacobian": lambda_free(lambda p: weights, "slopes"),
+        "parameters": {"x": {"size": 20}},
+        "outputs": [{"name": "y", "size": 30, "unit": "m"}],
+    }
+    given = {"x": {"size": 20, "kind": "normal", "mean": np.arange(20.0), "std": 1}}
+    study = tissuq.Study(model=model, parameters=given, method={"kind": "local-sensitivity"})
+    found = study.run()
+    assert found["parameter"].values.tolist() == [f"x.{i}" for i in range(20)]
+    np.testing.assert_allclose(found["nominal"].sel(output="y.29"), weights[29] @ np.arange(20.0))
+    truth = np.arange(20.0) + 0.5
+    stated = {"outputs": {"y": weights @ truth}, "sigma": {"y": 1e-3}}
+    study = tissuq.Study(model=model, parameters=given, data=stated, method={"kind": "invert"})
+    np.testing.assert_allclose(study.run()["mode"][0], truth, atol=0.01)
+
+
+def lambda_free(function, name="map_of_x"):
+    """A function with a name, as a session has them."""
+
+    def found(p):
+        return function(p)
+
+    found.__name__ = name
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"parameters": {"x": {"size": 64, "kind": "normal", "mean": 0}}}, "x.0.std: missing (63 more like it)"),
+        ({"parameters": {"x": {"size": 0, "kind": "normal"}}}, "x.size is 0, expected a whole number from 1"),
+        ({"parameters": {"x": {"size": 65, "kind": "normal", "mean": 0, "std": 1}}}, "x.64"),
+    ],
+)
+def test_what_is_wrong_with_a_vector_is_said_once(change, said):
+    model = {"kind": "python", "function": len, "parameters": {"x": [0.0] * 64}, "outputs": ["y"]}
+    with pytest.raises(tissuq.Error) as caught:
+        tissuq.Study(**{"model": model, "method": {"kind": "monte-carlo", "samples": 8}} | change)
+    assert said in str(caught.value)
+    assert len(str(caught.value)) < 400
