@@ -208,7 +208,9 @@ def search(folders: Iterable[Path]) -> None:
 def path_of(function: Any) -> str:
     """Return the dotted path of a function or class; one that no module holds under its name is kept in `SESSION`."""
     module, name = function.__module__, function.__name__
-    if module == "__main__" or getattr(sys.modules.get(module), name, None) is not function:
+    held = sys.modules.get(module)
+    scripted = module == "__main__" or getattr(held, "__spec__", None) is None
+    if scripted or getattr(held, name, None) is not function:
         module = SESSION
         setattr(sys.modules.setdefault(SESSION, ModuleType(SESSION)), name, function)
     return f"{module}.{name}"

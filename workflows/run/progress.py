@@ -107,6 +107,7 @@ class Progress:
             self._marks.popleft()
         if self._bar is not None:
             self._bar.set_postfix_str(watch.pace(self.state, now), refresh=False)
+            self._bar.total = max(self._bar.total, self._done)
             self._bar.update(done)
         elif marked:  # not of each solve, which may take less than this
             self._write()
