@@ -31,7 +31,7 @@ def test_every_name_is_there():
 
 
 @pytest.mark.fem
-def test_a_study_in_memory_is_that_of_the_command(tmp_path):
+def test_a_study_in_memory_is_that_of_the_command(tmp_path, monkeypatch):
     study = tissuq.load(TINY, ["method.samples=8"])
     found = study.run()
     kept = tissuq.run(study, tmp_path / "study")
@@ -57,6 +57,11 @@ def test_a_study_in_memory_is_that_of_the_command(tmp_path):
     for name in ("answr", "header"):  # the second only of a directory
         with pytest.raises(tissuq.Error, match=f"'{name}' is no section of the report; did you mean 'answer'"):
             found.tissuq.show(name)
+    alone = found.copy()  # beside results of another study
+    alone.encoding.clear()
+    monkeypatch.chdir(tmp_path / "study")
+    with pytest.raises(tissuq.Error, match="'header' is no section"):
+        alone.tissuq.show("header")
     with pytest.raises(tissuq.Error, match="no posterior in results of 'sensitivity-monte-carlo'"):
         found.tissuq.to_arviz()
     with pytest.raises(tissuq.Error, match="no whole results"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Iterator
 from functools import cached_property
@@ -40,23 +39,6 @@ class Shown:
         return f'<iframe srcdoc="{page}" style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
 
 
-class Drawn:
-    """A picture of a report, with its caption."""
-
-    def __init__(self, picture: Picture) -> None:
-        self.caption, self._picture = picture.caption, picture
-        self.data = base64.b64decode(picture.data)
-
-    def __repr__(self) -> str:
-        """Its caption."""
-        return self.caption
-
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
-        """The picture itself."""
-        svg = self._picture.kind == "svg+xml"
-        return {"image/svg+xml": self.data.decode()} if svg else {"image/png": self._picture.data}
-
-
 @xr.register_dataset_accessor("tissuq")  # type: ignore[no-untyped-call]
 class Accessor:
     """Results of a study: what they say, and the same for other libraries."""
@@ -87,7 +69,7 @@ class Accessor:
         """
         return Shown(str(self._results.summary["study"]), list(self._parts(names or TOP)))
 
-    def plot(self, name: str = "") -> Drawn:
+    def plot(self, name: str = "") -> Picture:
         """Return the first picture of a section of the report, by default of the first that has one.
 
         `tissuq.plots` has each as a function, which returns axes.
@@ -100,7 +82,7 @@ class Accessor:
         for _, blocks in self._parts((name,) if name else ()):
             for block in (inner for outer in blocks for inner in outer.whole()):
                 if isinstance(block, Pictures) and block.items:
-                    return Drawn(block.items[0])
+                    return block.items[0]
         raise UnknownError(f"no picture in {f'the section {name!r}' if name else 'the report'} of these results")
 
     def to_pandas(self) -> Any:

@@ -151,9 +151,10 @@ def results_in(dataset: xr.Dataset) -> Results:
     """
     if "config" not in dataset.attrs:
         raise StudyError("these are no whole results, expected what tissuq.read or study.run has returned")
-    directory = Path(dataset.encoding.get("source", "")).parent
-    summary = read_summary(directory) or {**dataset.attrs, **summarise(dataset)}
-    with _running(dataset.encoding.get("ran", False)) as refusals:
+    file, ran = dataset.encoding.get("source"), dataset.encoding.get("ran", False)
+    directory = Path(file).parent if file else Path()
+    summary = (read_summary(directory) if file else None) or {**dataset.attrs, **summarise(dataset)}
+    with _running(ran) as refusals:
         return Results(dataset, summary, _study_of(dataset, directory, refusals), directory)
 
 
