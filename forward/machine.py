@@ -1,6 +1,6 @@
 """What the machine has left, memory and disk space, and the exceptions that say that it ran out.
 
-Nothing is imported at the top, not even NumPy, so that this can be asked before anything else is imported.
+Nothing large is imported at the top, not even NumPy, so that this can be asked before anything else is imported.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from forward.errors import Error
 
 MIB = 2**20
 INTERRUPTED = "interrupted; the same command continues"
@@ -41,7 +43,7 @@ HOW_TO_INSTALL = (
 NO_ROOM = ("no space left on device", "disk quota exceeded", "file too large")
 
 
-class StopError(Exception):
+class StopError(Error):
     """The run cannot go on here and now: no memory, no room on disk, a model that ends its process.
 
     Nothing is wrong with the study. Finished work is kept, work in progress is lost, and the same command continues

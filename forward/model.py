@@ -15,6 +15,8 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from forward.errors import Error
+
 FloatArray = NDArray[np.float64]
 
 
@@ -82,7 +84,7 @@ class Stability(IntEnum):
         return max(known) if cls.MISSED in known else min(known)
 
 
-class SolveError(Exception):
+class SolveError(Error):
     """The model has no answer at these parameters; the message says where the solver stopped and why.
 
     Parameters
@@ -127,11 +129,11 @@ class InadmissibleError(SolveError):
     inadmissible = True
 
 
-class ModelError(ValueError):
+class ModelError(Error, ValueError):
     """A model cannot be made or used at all, whatever its parameters; the message is one line for the user."""
 
 
-class DerivativeError(Exception):
+class DerivativeError(Error):
     """A derivative was requested that the model or the output does not have."""
 
 

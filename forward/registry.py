@@ -20,13 +20,14 @@ from typing import Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
+from forward.errors import Error
 from forward.machine import modified
 from forward.settings import UNKNOWN_KIND, Settings, nearest
 
 ENTRY_POINTS = "tissuq"
 
 
-class KindError(ValueError):
+class KindError(Error, ValueError):
     """There is no such kind, or it cannot be used; the message is one line for the user."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -88,6 +88,37 @@ def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
         return f"did you mean '{cut(close[0], LONGEST)}'?"
     more = f" and {len(known) - LISTED} others" if len(known) > LISTED else ""
     return f"expected one of: {', '.join(cut(one, LONGEST) for one in known[:LISTED])}{more}"
+
+
+LARGEST = 100_000  # size of a vector
+
+
+class Sized(BaseModel, extra="allow"):
+    """A vector: blocks NAME.0, NAME.1, ... in one; of a list of this size, each takes its own element."""
+
+    size: Annotated[int, Field(ge=1, le=LARGEST)]
+
+
+def written_out(blocks: Any) -> Any:
+    """Write out vectors (`Sized`) in a table of blocks, or in a list of blocks with names."""
+
+    def each(name: Any, block: Any) -> dict[Any, Any]:
+        if not (isinstance(block, dict) and "size" in block):
+            return {name: block}
+        size, rest = block["size"], {key: value for key, value in block.items() if key != "size"}
+        if type(size) is not int or not 1 <= size <= LARGEST:
+            raise ValueError(f"{name}.size is {shown(size)}, expected a whole number from 1 to {LARGEST}")
+        own = {key for key, value in rest.items() if isinstance(value, list | tuple) and len(value) == size}
+        return {f"{name}.{i}": {key: v[i] if key in own else v for key, v in rest.items()} for i in range(size)}
+
+    match blocks:
+        case {**table}:
+            return {name: one for key, block in table.items() for name, one in each(key, block).items()}
+        case [*listed]:
+            several = (each(one.get("name"), one) if isinstance(one, dict) else {None: one} for one in listed)
+            return tuple({**one, "name": name} if name else one for many in several for name, one in many.items())
+        case _:
+            return blocks
 
 
 def usually(kind: str) -> BeforeValidator:

@@ -22,18 +22,23 @@ import os
 import tempfile
 from pathlib import Path
 
-from workflows.config.study import load
-from workflows.report import bodies, plots
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
+import tissuq
 
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
 directory = Path(os.environ.get("TISSUQ_RESULTS") or tempfile.mkdtemp())
 if not (directory / "results.nc").exists():
     method = "method={kind='sobol', design='chaos', samples=15, second_order=true}"
-    run(load(CONFIGS / "tiny.toml", [method]), "beam", directory, quiet=True)
-data = read_dataset(directory)
+    tissuq.load(CONFIGS / "tiny.toml", [method]).run(directory)
+data = tissuq.read(directory)
 data
+
+# %% [markdown]
+# ## What it says
+#
+# The answers with their errors, what is doubtful about them, and the body, which turns.
+
+# %%
+data.tissuq.show()
 
 # %% [markdown]
 # ## What it contains
@@ -54,16 +59,16 @@ data["sobol_total"].to_pandas().round(4)
 
 # %%
 output = str(data["output"].values[0])
-plots.index_bars(data, output).figure
+tissuq.plots.index_bars(data, output).figure
 
 # %%
-plots.index_shares(data).figure
+tissuq.plots.index_shares(data).figure
 
 # %% [markdown]
 # To first order, derivatives at the mean parameters show the same, at the cost of one solve:
 
 # %%
-plots.tornado(data, output).figure
+tissuq.plots.tornado(data, output).figure
 
 # %% [markdown]
 # ## Where on the body
@@ -72,7 +77,7 @@ plots.tornado(data, output).figure
 
 # %%
 strongest = str(data["parameter"].values[data["field_sobol_total"].argmax().item()])
-bodies.body(data, f"Total index of the displacement for {strongest}")
+tissuq.bodies.body(data, f"Total index of the displacement for {strongest}")
 
 # %% [markdown]
 # The data behind the picture are plain arrays, one row for each node:

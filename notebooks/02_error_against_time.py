@@ -24,11 +24,8 @@ import tempfile
 import tomllib
 from pathlib import Path
 
+import tissuq
 from uq.estimators.scores import gains
-from workflows.config.study import parse
-from workflows.report import plots
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
 
 METHOD = """
 kind = "compare"
@@ -48,8 +45,8 @@ CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.ex
 directory = Path(os.environ.get("TISSUQ_COMPARISON") or tempfile.mkdtemp())
 if not (directory / "results.nc").exists():
     study = tomllib.loads((CONFIGS / "tiny.toml").read_text()) | {"method": tomllib.loads(METHOD)}
-    run(parse(study), "beam", directory, quiet=True)
-data = read_dataset(directory)
+    tissuq.Study(**study).run(directory)
+data = tissuq.read(directory)
 
 # %% [markdown]
 # ## Errors of the mean
@@ -58,10 +55,10 @@ data = read_dataset(directory)
 
 # %%
 output = str(data["output"].values[0])
-plots.errors(data, output, "mean", "solves").figure
+tissuq.plots.errors(data, output, "mean", "solves").figure
 
 # %%
-plots.errors(data, output, "mean", "cpu_seconds").figure
+tissuq.plots.errors(data, output, "mean", "cpu_seconds").figure
 
 # %% [markdown]
 # ## Are claimed errors honest?

@@ -29,21 +29,17 @@ from pathlib import Path
 
 import numpy as np
 
-from uq.findings import findings
-from workflows.config.study import load
-from workflows.report import plots
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
+import tissuq
 
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
 directory = Path(os.environ.get("TISSUQ_INVERSION") or tempfile.mkdtemp())
 if not (directory / "results.nc").exists():
     coarse = ["model.body.cells=[4, 4, 4]", "method.mesh_error=false"]
     noise = "method.noise={kind='log-uniform', lower=0.5, upper=20}"
-    run(load(CONFIGS / "stiffness-field.toml", [*coarse, noise]), "field", directory, quiet=True)
-data = read_dataset(directory)
+    tissuq.load(CONFIGS / "stiffness-field.toml", [*coarse, noise]).run(directory)
+data = tissuq.read(directory)
 one = data.isel(data_set=0)
-print(*(f"{one.severity}: {one.text}" for one in findings(data)), sep="\n")
+print(*(f"{one.severity}: {one.text}" for one in tissuq.findings(data)), sep="\n")
 
 # %% [markdown]
 # ## What was found
@@ -52,8 +48,8 @@ print(*(f"{one.severity}: {one.text}" for one in findings(data)), sep="\n")
 # posterior, and its standard deviation beside that of the prior.
 
 # %%
-cut = plots.inversion.Cut.of(one)
-plots.inversion.slices(one, cut).figure
+cut = tissuq.plots.inversion.Cut.of(one)
+tissuq.plots.inversion.slices(one, cut).figure
 
 # %% [markdown]
 # ## How much is from the data: the spectrum
@@ -62,7 +58,7 @@ plots.inversion.slices(one, cut).figure
 # the prior. The posterior width of a direction is that of the prior over √(1 + λ).
 
 # %%
-plots.inversion.spectrum(one).figure
+tissuq.plots.inversion.spectrum(one).figure
 
 # %%
 eigenvalues = one["eigenvalue"].values
@@ -77,13 +73,13 @@ print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all:
 # that were measured.
 
 # %%
-plots.inversion.direction_slices(one, cut).figure
+tissuq.plots.inversion.direction_slices(one, cut).figure
 
 # %% [markdown]
 # Each load case alone determines less:
 
 # %%
-plots.inversion.alone_slices(one, cut).figure
+tissuq.plots.inversion.alone_slices(one, cut).figure
 
 # %% [markdown]
 # ## Draws, and what they predict
@@ -94,7 +90,7 @@ plots.inversion.alone_slices(one, cut).figure
 # %%
 draws = np.exp(one["stiffness_draw"].values)  # ln of the factor: (sample, node)
 upper = one["node_position"].sel(axis="z").values > 0.5 * float(one["node_position"].sel(axis="z").max())
-ax = plots.axes()
+ax = tissuq.plots.axes()
 for name, nodes in (("upper half", upper), ("lower half", ~upper)):
     ax.hist(draws[:, nodes].mean(axis=1), bins=12, alpha=0.6, label=name)
 ax.set_xlabel("mean stiffness factor of the nodes")
@@ -112,4 +108,4 @@ ax.figure
 # more. Do not interpret a posterior that has not passed this test.
 
 # %%
-plots.inversion.misfits(one).figure
+tissuq.plots.inversion.misfits(one).figure

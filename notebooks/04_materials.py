@@ -23,11 +23,10 @@ import tempfile
 import tomllib
 from pathlib import Path
 
+import tissuq
+from tissuq import plots
 from workflows.config.study import parse
-from workflows.report import plots
 from workflows.results.comparison import findings
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
 
 STUDY = """
 [data]
@@ -61,8 +60,8 @@ subsets = { "uniaxial tension alone" = ["uniaxial"] }
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
 directory = Path(os.environ.get("TISSUQ_SELECTION") or tempfile.mkdtemp())
 if not (directory / "results.nc").exists():
-    run(parse(tomllib.loads(STUDY), folder=CONFIGS), "treloar", directory, quiet=True)
-data = read_dataset(directory)
+    tissuq.run(parse(tomllib.loads(STUDY), folder=CONFIGS), directory)
+data = tissuq.read(directory)
 print(*findings(data), sep="\n")
 
 # %% [markdown]

@@ -75,50 +75,35 @@ L4 = (0.11**5 - 0.09**5) / (5 * 0.02)
 print(f"{'exact':18} {L4 / (8 * 0.02 * 0.01**3 / 12) * 1.01 / 1e6:.6e} m")
 
 # %% [markdown]
-# ## As a study, for `tissuq run` and many processors
+# ## As a study
 #
-# Put the same function in a module and name it in a study: that adds a report, restarts and parallel runs.
+# The same function as the model of a study: that adds findings, reports and all methods. In a module of its own, which
+# a study names as `function = "own_beam.deflection"`, it runs by `tissuq run` too, on many processors, and can be
+# interrupted and continued.
 
 # %%
-import sys
-import tempfile
-from pathlib import Path
+import tissuq
 
-from workflows.config.study import load
-from workflows.report import plots
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
-
-STUDY = """
-[model]
-kind = "python"
-function = "own_beam.deflection"
-parameters = { E = 1e6, q = 1, L = 0.1 }
-outputs = [{ name = "tip", unit = "m" }]
-
-[parameters]
-E = { kind = "log-normal", mean = 1e6, std = 1e5 }
-q = { kind = "uniform", lower = 0.8, upper = 1.2 }
-L = { kind = "uniform", lower = 0.09, upper = 0.11 }
-
-[method]
-kind = "chaos"
-samples = 40
-seed = 1
-"""
-SOURCE = """
-def deflection(p):
-    E, q, L = p
-    return [q * L**4 / (8 * E * 0.02 * 0.01**3 / 12)]
-"""
-
-folder = Path(tempfile.mkdtemp())
-(folder / "own_beam.py").write_text(SOURCE)
-(folder / "beam.toml").write_text(STUDY)
-sys.path.insert(0, str(folder))  # `tissuq run` finds modules beside the study by itself
-run(load(folder / "beam.toml"), "beam", folder / "results", quiet=True)
-data = read_dataset(folder / "results")
-plots.histogram(data, "tip").figure
+study = tissuq.Study(
+    model={
+        "kind": "python",
+        "function": deflection,
+        "jacobian": slopes,
+        "parameters": {"E": 1e6, "q": 1.0, "L": 0.1},
+        "outputs": [{"name": "tip", "unit": "m"}],
+    },
+    parameters={
+        "E": {"kind": "log-normal", "mean": 1e6, "std": 1e5},
+        "q": {"kind": "uniform", "lower": 0.8, "upper": 1.2},
+        "L": {"kind": "uniform", "lower": 0.09, "upper": 0.11},
+    },
+    method={"kind": "chaos", "samples": 40, "seed": 1},
+)
+data = study.run()
+data.tissuq.show()
 
 # %%
-plots.index_bars(data, "tip").figure
+tissuq.plots.histogram(data, "tip").figure
+
+# %%
+tissuq.plots.index_bars(data, "tip").figure

@@ -22,10 +22,7 @@
 import tempfile
 from pathlib import Path
 
-from workflows.config.study import load
-from workflows.report import plots
-from workflows.results.directory import read_dataset
-from workflows.run.run import run
+import tissuq
 
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists()).resolve()
 results = Path(tempfile.mkdtemp())
@@ -33,9 +30,7 @@ results = Path(tempfile.mkdtemp())
 
 def done(name, *changes):
     """Run a study of `configs`, with changes, and return its results."""
-    directory = results / Path(name).stem
-    run(load(CONFIGS / f"{name}.toml", changes), name, directory, quiet=True)
-    return read_dataset(directory)
+    return tissuq.load(CONFIGS / f"{name}.toml", changes).run(results / Path(name).stem)
 
 
 # %% [markdown]
@@ -48,7 +43,7 @@ brain = done("brain", "method.samples=32", "method.starts=1", "method.other_nois
 brain[["probability", "stacking"]].to_dataframe().round(3)
 
 # %%
-plots.selection.probability_bars(brain).figure
+tissuq.plots.selection.probability_bars(brain).figure
 
 # %% [markdown]
 # ## What is a region like that was not tested?
@@ -76,7 +71,7 @@ body = done(
 body[["mean", "std", "within", "between"]].to_dataframe()
 
 # %%
-plots.selection.parts_of_variance(body).figure
+tissuq.plots.selection.parts_of_variance(body).figure
 
 # %% [markdown]
 # ## Which test next?

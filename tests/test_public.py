@@ -1,5 +1,7 @@
 """The public namespace: studies and models from Python, in a few lines."""
 
+import html
+import re
 import sys
 from importlib.metadata import version
 
@@ -8,6 +10,7 @@ import pytest
 
 import tissuq
 from tests.launch import ROOT, on_kept_ranks, run_script
+from uq.methods.chaos import Chaos
 
 TINY = ROOT / "configs" / "tiny.toml"
 
@@ -28,7 +31,7 @@ def test_every_name_is_there():
 
 
 @pytest.mark.fem
-def test_a_study_in_memory_is_that_of_the_command(tmp_path):
+def test_a_study_in_memory_is_that_of_the_command(tmp_path, monkeypatch):
     study = tissuq.load(TINY, ["method.samples=8"])
     found = study.run()
     kept = tissuq.run(study, tmp_path / "study")
@@ -41,6 +44,28 @@ def test_a_study_in_memory_is_that_of_the_command(tmp_path):
     ]  # fmt: skip
     assert tissuq.plots.histogram(found, "uy_max").get_xlabel()
     assert tissuq.findings(found) == tissuq.findings(kept)
+    for one in (found, kept):
+        shown = one.tissuq.show()
+        assert "uy_max: " in repr(shown)
+        assert "<canvas" in html.unescape(shown._repr_html_())
+        assert "image/svg+xml" in one.tissuq.plot()._repr_mimebundle_()
+        assert one.tissuq.to_pandas().loc["uy_max", "mean_error"] == float(found["mean_error"].sel(output="uy_max"))
+        grid = one.tissuq.to_pyvista()
+        assert grid.n_cells == found.sizes["cell"]
+        np.testing.assert_array_equal(grid["mean (m)"], found["field_mean"].to_numpy())
+    assert "9 solves, 0 failed" in repr(kept.tissuq.show("header"))
+    for name in ("answr", "header"):  # the second only of a directory
+        with pytest.raises(tissuq.Error, match=f"'{name}' is no section of the report; did you mean 'answer'"):
+            found.tissuq.show(name)
+    alone = found.copy()  # beside results of another study
+    alone.encoding.clear()
+    monkeypatch.chdir(tmp_path / "study")
+    with pytest.raises(tissuq.Error, match="'header' is no section"):
+        alone.tissuq.show("header")
+    with pytest.raises(tissuq.Error, match="no posterior in results of 'sensitivity-monte-carlo'"):
+        found.tissuq.to_arviz()
+    with pytest.raises(tissuq.Error, match="no whole results"):
+        found[["mean"]].drop_attrs().tissuq.show()
 
 
 @pytest.mark.fem
@@ -95,3 +120,133 @@ def test_a_python_function_is_a_model_too(monkeypatch):
     assert found.mesh_error == {}
     with pytest.raises(ValueError, match="no body"):
         _ = found.displacement
+
+
+BODY = {
+    "body": {"kind": "box", "size": np.array([0.1, 0.02, 0.02]), "cells": [6, 2, 2]},
+    "clamp": ["x-min"],
+    "material": {"kind": "neo-hookean", "C1": 1e4, "D1": 2e5},
+    "loads": [{"kind": "gravity", "density": 1000.0}],
+    "outputs": [{"name": "sag", "kind": "max-displacement", "component": "z"}],
+}
+GIVEN = {"material.C1": {"kind": "log-normal", "mean": 1e4, "std": 2e3}}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda: tissuq.Study(modle=BODY), "method: missing\nmodle: unknown key; did you mean 'model'?"),
+        (lambda: tissuq.Study(model=BODY, method={"kind": "inwert"}), "did you mean 'invert'?; given 'inwert'"),
+        (lambda: tissuq.Study(model=BODY, method={"kind": "invert", "samples": 0.5}), "data: missing"),
+        (lambda: tissuq.Hyperelastic(**BODY | {"clamp": "x-min"}), "clamp: expected a list; given 'x-min'"),
+        (lambda: tissuq.Specimen(**BODY), "clamp: unknown key"),
+        (lambda: tissuq.Model(BODY | {"kind": "hyperelastc"}), "did you mean 'hyperelastic'"),
+        (lambda: tissuq.Model(BODY, ["material.C2"]), "did you mean 'material.C1'"),
+        (lambda: tissuq.load("nothing.toml"), "nothing.toml: cannot be read: No such file"),
+        (lambda: tissuq.read("nothing"), "nothing: holds no results.nc"),
+        (lambda: tissuq.load(TINY, ["method.kind='chaos'", "method.smaples=3"]), "did you mean 'samples'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_lines_by_one_kind_of_exception(wrong, said):
+    with pytest.raises(tissuq.Error) as caught:
+        wrong()
+    assert said in str(caught.value)
+
+
+def test_every_exception_of_the_program_is_one():
+    apart = {"Error", "Diverged", "TimeLimitError", "RefusalError"}  # of control flow, and of requests to a server
+    for file in (
+        one for package in ("forward", "uq", "inverse", "workflows", "tissuq") for one in (ROOT / package).rglob("*.py")
+    ):
+        for name, bases in re.findall(r"^class (\w+)\(([^)]*(?:Error|Exception))\):", file.read_text(), re.MULTILINE):
+            assert name in apart or not {"Exception", "ValueError", "OSError"} & {bases}, (file, name)
+
+
+def test_a_study_takes_functions_of_the_session_and_blocks_as_objects(tmp_path):
+    def twice(p):
+        return 2 * p
+
+    model = tissuq.Model({"kind": "python", "function": twice, "parameters": {"a": 1.0}, "outputs": ["y"]})
+    study = tissuq.Study(
+        model=model.spec, parameters={"a": {"kind": "normal", "mean": 1, "std": 0.1}}, method=Chaos(samples=8)
+    )
+    assert study.run()["mean"].item() == pytest.approx(2.0)
+    with pytest.raises(tissuq.Error, match="is a function of this session"):
+        study.run(tmp_path / "kept")
+
+
+def test_a_posterior_for_arviz_is_that_of_the_file(tmp_path, monkeypatch):
+    import arviz
+
+    monkeypatch.setattr(sys, "path", [str(ROOT / "configs"), *sys.path])
+    study = tissuq.Study(
+        model=tissuq.load(ROOT / "configs" / "own-model.toml").model,
+        parameters={"E": {"kind": "log-normal", "mean": 1e6, "std": 2e5}},
+        data={"outputs": {"tip": 7.5e-3}, "sigma": {"tip": 1e-4}},
+        method={"kind": "invert", "samples": 32},
+    )
+    found = study.run(tmp_path / "inverted")
+    kept, made = arviz.from_netcdf(tmp_path / "inverted" / "results.nc"), found.tissuq.to_arviz()
+    for group in ("posterior", "prior", "log_likelihood", "observed_data"):
+        assert made[group].equals(kept[group]), group
+    assert found.tissuq.to_pandas().index.names == ["data_set", "parameter"]
+
+
+def test_studies_and_models_are_shown_in_few_words(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "configs"), *sys.path])
+    names = [f"x{i}" for i in range(100)]
+    model = {"kind": "python", "function": "own_model.beam", "parameters": dict.fromkeys(names, 1.0), "outputs": names}
+    given = {name: {"kind": "normal", "mean": 0, "std": 1} for name in names}
+    study = tissuq.Study(model=model, parameters=given, method={"kind": "monte-carlo", "samples": 8})
+    assert repr(study).startswith("Study(model: python; parameters: x0, x1, x2, x3 and 96 others; method: monte-carlo")
+    assert len(repr(study)) < 300
+    assert "[parameters.x99]" in study._repr_html_()
+    made = tissuq.Model(study.model)
+    assert repr(made) == "Model(python: 100 numbers that can change; x0, x1, x2, x3, x4, x5, x6, x7 and 92 more)"
+    assert "<td>x99</td>" in made._repr_html_()
+
+
+def test_vectors_are_written_as_such():
+    weights = np.random.default_rng(1).standard_normal((30, 20)) / 4
+    model = {
+        "kind": "python",
+        "function": lambda_free(weights.__matmul__),
+        "jacobian": lambda_free(lambda p: weights, "slopes"),
+        "parameters": {"x": {"size": 20}},
+        "outputs": [{"name": "y", "size": 30, "unit": "m"}],
+    }
+    given = {"x": {"size": 20, "kind": "normal", "mean": np.arange(20.0), "std": 1}}
+    study = tissuq.Study(model=model, parameters=given, method={"kind": "local-sensitivity"})
+    found = study.run()
+    assert found["parameter"].values.tolist() == [f"x.{i}" for i in range(20)]
+    np.testing.assert_allclose(found["nominal"].sel(output="y.29"), weights[29] @ np.arange(20.0))
+    truth = np.arange(20.0) + 0.5
+    stated = {"outputs": {"y": weights @ truth}, "sigma": {"y": 1e-3}}
+    study = tissuq.Study(model=model, parameters=given, data=stated, method={"kind": "invert"})
+    np.testing.assert_allclose(study.run()["mode"][0], truth, atol=0.01)
+
+
+def lambda_free(function, name="map_of_x"):
+    """A function with a name, as a session has them."""
+
+    def found(p):
+        return function(p)
+
+    found.__name__ = name
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"parameters": {"x": {"size": 64, "kind": "normal", "mean": 0}}}, "x.0.std: missing (63 more like it)"),
+        ({"parameters": {"x": {"size": 0, "kind": "normal"}}}, "x.size is 0, expected a whole number from 1"),
+        ({"parameters": {"x": {"size": 65, "kind": "normal", "mean": 0, "std": 1}}}, "x.64"),
+    ],
+)
+def test_what_is_wrong_with_a_vector_is_said_once(change, said):
+    model = {"kind": "python", "function": len, "parameters": {"x": [0.0] * 64}, "outputs": ["y"]}
+    with pytest.raises(tissuq.Error) as caught:
+        tissuq.Study(**{"model": model, "method": {"kind": "monte-carlo", "samples": 8}} | change)
+    assert said in str(caught.value)
+    assert len(str(caught.value)) < 400

@@ -57,11 +57,12 @@ _PUBLIC = {  # MODULE:NAME of each public name, or a module
     "run": "workflows.run.run:results_of",
     "read": "tissuq.studies:read",
     "findings": "uq.findings:findings",
-    "Study": "workflows.studies.sampling:Study",
+    "Study": "tissuq.studies:Study",
+    "Error": "forward.errors:Error",
     "StudyError": "workflows.config.study:StudyError",
     "Model": "tissuq.model:Model",
-    "Hyperelastic": "forward.hyperelastic:Hyperelastic",
-    "Specimen": "forward.specimen:Specimen",
+    "Hyperelastic": "tissuq.studies:Hyperelastic",
+    "Specimen": "tissuq.studies:Specimen",
     "SolveError": "forward.model:SolveError",
     "DerivativeError": "forward.model:DerivativeError",
     "plots": "workflows.report.plots",
@@ -70,11 +71,13 @@ _PUBLIC = {  # MODULE:NAME of each public name, or a module
 __all__ = [*_PUBLIC]  # noqa: PLE0604 - names
 
 if TYPE_CHECKING:
-    from forward.hyperelastic import Hyperelastic as Hyperelastic
+    from forward.errors import Error as Error
     from forward.model import DerivativeError as DerivativeError
     from forward.model import SolveError as SolveError
-    from forward.specimen import Specimen as Specimen
     from tissuq.model import Model as Model
+    from tissuq.studies import Hyperelastic as Hyperelastic
+    from tissuq.studies import Specimen as Specimen
+    from tissuq.studies import Study as Study
     from tissuq.studies import load as load
     from tissuq.studies import read as read
     from uq.findings import findings as findings
@@ -82,7 +85,6 @@ if TYPE_CHECKING:
     from workflows.report import bodies as bodies
     from workflows.report import plots as plots
     from workflows.run.run import results_of as run  # noqa: F401
-    from workflows.studies.sampling import Study as Study
 
 
 def __getattr__(name: str) -> Any:

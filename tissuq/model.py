@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, Guess, ReferenceSolution, SolveError, gathered
+from forward.errors import UnknownError
+from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, SolveError, gathered
 from forward.settings import nearest
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from forward import model as contract
+
+SHOWN = 8  # outputs that are written
 
 
 class Model:
@@ -23,11 +27,20 @@ class Model:
     Parameters
     ----------
     spec
-        Its specification: `study.model`, or a block made in Python.
+        Its specification: `study.model`, or a block as in study files.
     parameters
         Paths of the numbers that can change, such as "material.C1"; by default all.
     comm
         mpi4py communicator of the ranks that share it; by default each process has its own model.
+
+    Raises
+    ------
+    StudyError
+        Lists every mistake in the block.
+    UnknownError
+        If a parameter is not a number of the model.
+    ModelError
+        If the model cannot be made.
 
     Attributes
     ----------
@@ -45,12 +58,31 @@ class Model:
             from mpi4py import MPI
 
             comm = MPI.COMM_SELF
+        if isinstance(spec, Mapping):
+            from tissuq.studies import checked, model_of
+
+            spec = checked(model_of, spec, place="model")
         self.spec = spec
         names = tuple(spec.scalars if parameters is None else parameters)
+        for path in names:
+            if path not in spec.scalars:
+                raise UnknownError(f"'{path}' is not a number of the model; {nearest(path, tuple(spec.scalars))}")
         self._model: contract.ForwardModel = spec.build(comm, names)
         self.parameters = {name: spec.scalars[name].value for name in names}
         self.units = {output.name: output.unit for output in spec.returned}
         self.nodes = None if self._model.space is None else self._model.space.coordinates
+
+    def __repr__(self) -> str:
+        """Its kind, how many numbers can change, and its outputs."""
+        return f"Model({self.spec.kind}: {len(self.parameters)} numbers that can change; {_first(self.units)})"
+
+    def _repr_html_(self) -> str:
+        """The same, with its numbers and their units."""
+        rows = (
+            f"<tr><td>{escape(path)}</td><td>{value:.6g}</td><td>{escape(self.spec.scalars[path].unit)}</td></tr>"
+            for path, value in self.parameters.items()
+        )
+        return f"<details><summary>{escape(repr(self))}</summary><table>{''.join(rows)}</table></details>"
 
     def solve(self, values: Mapping[str, float] | None = None, near: Solution | None = None) -> Solution:
         """Solve with some numbers changed; collective over the ranks that share the model.
@@ -65,7 +97,7 @@ class Model:
 
         Raises
         ------
-        KeyError
+        UnknownError
             For a number that the model does not have.
         SolveError
             If there is no answer.
@@ -74,7 +106,7 @@ class Model:
         for path in values:
             if path not in self.parameters:
                 message = f"'{path}' is not among the numbers that change; {nearest(path, tuple(self.parameters))}"
-                raise KeyError(message)
+                raise UnknownError(message)
         point = np.array([values.get(path, value) for path, value in self.parameters.items()])
         guess = None if near is None else Guess(near.solved.state, ReferenceSolution(near.point, near.solved.state))
         return Solution(self, point, self._model.solve(point, guess))
@@ -83,6 +115,12 @@ class Model:
     def model(self) -> contract.ForwardModel:
         """The model as methods see it: vectors in, vectors out."""
         return self._model
+
+
+def _first(words: Iterable[str]) -> str:
+    """Write words one after another; of many the first."""
+    listed = [*words]
+    return ", ".join(listed) if len(listed) <= SHOWN else f"{', '.join(listed[:SHOWN])} and {len(listed) - SHOWN} more"
 
 
 class Solution(Mapping[str, float]):
@@ -110,8 +148,7 @@ class Solution(Mapping[str, float]):
         return len(self._outputs)
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{name} = {value:.6g} {self._of.units[name]}" for name, value in self.items())
-        return f"Solution({shown})"
+        return f"Solution({_first(f'{name} = {value:.6g} {self._of.units[name]}' for name, value in self.items())})"
 
     def gradient(self, output: str) -> dict[str, float]:
         """Return the derivatives of an output with respect to all numbers that can change, by path.
@@ -123,7 +160,7 @@ class Solution(Mapping[str, float]):
         """
         weights = np.array([float(name == output) for name in self])
         if not weights.any():
-            raise KeyError(f"'{output}' is not an output; {nearest(output, tuple(self))}")
+            raise UnknownError(f"'{output}' is not an output; {nearest(output, tuple(self))}")
         return dict(zip(self._of.parameters, map(float, self.solved.adjoint(weights)), strict=True))
 
     @cached_property
@@ -151,7 +188,7 @@ class Solution(Mapping[str, float]):
     def displacement(self) -> FloatArray:
         """Displacements (N, 3) of the nodes (m), in the order of `Model.nodes`; on the first rank only."""
         if self._of.nodes is None:
-            raise ValueError("this model has no body")
+            raise ModelError("this model has no body")
         whole = gathered(self._of.model, self.solved.state[None, :])
         return np.zeros((0, 3)) if whole is None else whole[0, : self._of.nodes.size].reshape(-1, 3)
 
@@ -160,7 +197,7 @@ class Solution(Mapping[str, float]):
 
         Raises
         ------
-        ValueError
+        ModelError
             If a point is not in the body.
         """
         from forward.fem.space import interpolation

@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _load(options: argparse.Namespace) -> StudyKind:
-    """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
+    """Read the study."""
     from forward.machine import reserve_for_linear_algebra
     from workflows.config.mistakes import StudyError
     from workflows.config.study import load
@@ -174,10 +174,6 @@ def _load(options: argparse.Namespace) -> StudyKind:
             "then, with the same --out, goes on with it"
         )
         raise StudyError(message)
-    if study.modules:
-        from forward.external.own_modules import make_visible
-
-        make_visible(study.modules, [options.study.resolve().parent, Path.cwd()])
     if study.report is not None:  # a section that is missing is said before the study runs
         from workflows.report.section import of_study
 

@@ -24,7 +24,7 @@ from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_s
 from forward.model import FloatArray, ModelError, SolveError
 from forward.pointwise import FunctionModel, real
 from forward.scalars import Scalar
-from forward.settings import Settings, nearest
+from forward.settings import Settings, Sized, nearest, written_out
 from forward.spec import ModelSpec
 
 if TYPE_CHECKING:
@@ -56,6 +56,18 @@ def _named(given: Any) -> Any:
     return {"name": given} if isinstance(given, str) else given
 
 
+def _values(given: Any) -> Any:
+    """Write out vectors among values: x = [0.1, 0.2], or x = { size = 64, value = 0.1 }."""
+    if not isinstance(given, dict):
+        return given
+    lists = {name: {"size": len(one), "value": one} for name, one in given.items() if isinstance(one, list | tuple)}
+    found = written_out({**given, **lists})
+    return {
+        name: one.get("value", 0.0) if isinstance(one, dict) and one.keys() <= {"value"} else one
+        for name, one in found.items()
+    }
+
+
 Output = Annotated[Value, BeforeValidator(_named, json_schema_input_type=Value | str)]
 
 
@@ -72,17 +84,25 @@ class _External(ModelSpec):
     ----------
     parameters
         Values of all d parameters by name, in the order in which the model takes them; the random parameters of a
-        study replace them.
+        study replace them. A vector is x = [0, 0, 0] or x = { size = 3, value = 0 }: x.0, x.1, x.2.
     outputs
-        The m outputs in order: names, or blocks with `name` and `unit`.
+        The m outputs in order: names, or blocks with `name`, `unit`, and `size` if it is a vector.
     solve_seconds
         Time limit (s, wall clock) for one evaluation, after which it counts as failed; None by default.
     """
 
     kind: str
     solve_seconds: Annotated[float, Field(gt=0)] | None = None
-    parameters: dict[Annotated[str, Field(pattern=r"^\S+$")], float] = Field(min_length=1)
-    outputs: tuple[Output, ...] = Field(min_length=1)
+    parameters: Annotated[
+        dict[Annotated[str, Field(pattern=r"^\S+$")], float],
+        Field(min_length=1),
+        BeforeValidator(_values, json_schema_input_type=dict[str, float | tuple[float, ...] | Sized]),
+    ]
+    outputs: Annotated[
+        tuple[Output, ...],
+        Field(min_length=1),
+        BeforeValidator(written_out, json_schema_input_type=tuple[Value | str | Sized, ...]),
+    ]
 
     @property
     def scalars(self) -> dict[str, Scalar]:

@@ -28,6 +28,7 @@ from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
 _walked: dict[str, tuple[tuple[object, ...], dict[str, tuple[str, str]]]] = {}  # folders and files of modules, as found
+SESSION = "__session__"  # a module of functions that were given themselves, in scripts and notebooks
 _TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
 _refused: ContextVar[list[str] | None] = ContextVar("refused", default=None)  # where not all may be imported
 
@@ -202,6 +203,17 @@ def search(folders: Iterable[Path]) -> None:
     """Let Python look for modules in some folders too, after all other places, unless only what is installed runs."""
     if _refused.get() is None:
         sys.path += [name for name in dict.fromkeys(map(str, folders)) if name not in sys.path]
+
+
+def path_of(function: Any) -> str:
+    """Return the dotted path of a function or class; one that no module holds under its name is kept in `SESSION`."""
+    module, name = function.__module__, function.__name__
+    held = sys.modules.get(module)
+    scripted = module == "__main__" or getattr(held, "__spec__", None) is None
+    if scripted or getattr(held, name, None) is not function:
+        module = SESSION
+        setattr(sys.modules.setdefault(SESSION, ModuleType(SESSION)), name, function)
+    return f"{module}.{name}"
 
 
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from forward.bodies.geometry import tolerance
 from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
-from forward.model import FloatArray, NodalSpace
+from forward.model import FloatArray, ModelError, NodalSpace
 
 
 class BodySpace:
@@ -143,7 +143,7 @@ def interpolation(equations: Discretisation, places: FloatArray, directions: Flo
 
     Raises
     ------
-    ValueError
+    ModelError
         If a place is farther (m) from the mesh than the mesh can be from the body.
     """
     layout, body, moving = equations.layout, equations.spec.body, np.flatnonzero(directions.any(axis=1))
@@ -154,7 +154,7 @@ def interpolation(equations: Discretisation, places: FloatArray, directions: Flo
     far = np.flatnonzero(distances > max(tolerance(body), body.longest_edge))
     if len(far):
         where = ", ".join(f"{x:g}" for x in points[far[0]])
-        raise ValueError(f"({where}) lies {distances[far[0]]:.3g} m outside the mesh")
+        raise ModelError(f"({where}) lies {distances[far[0]]:.3g} m outside the mesh")
     at, w = np.empty(nodes.shape, dtype=np.int64), np.empty(weights.shape)
     for theirs, canonical, some in equations.comm.allgather((mine, layout.nodes()[nodes[mine]], weights[mine])):
         at[theirs], w[theirs] = canonical, some

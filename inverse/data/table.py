@@ -8,12 +8,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from forward.errors import Error
 from inverse.data.units import split_head
 
 TRUTH = "truth."  # begins remarks that state true values behind synthetic data
 
 
-class DataError(ValueError):
+class DataError(Error, ValueError):
     """Data that cannot be used; each argument is one line: the place, what was found and what was expected."""
 
     def __str__(self) -> str:

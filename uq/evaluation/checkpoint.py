@@ -20,6 +20,7 @@ from typing import Any, Protocol, TypeVar
 import h5py
 import numpy as np
 
+from forward.errors import Error
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
 from uq.evaluation.hdf5 import creation, image, in_memory
@@ -29,7 +30,7 @@ T = TypeVar("T")
 HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
 
 
-class DamagedError(OSError):
+class DamagedError(Error, OSError):
     """A file of evaluations that is not as it was written."""
 
     def __init__(self, path: Path) -> None:

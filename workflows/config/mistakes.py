@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.errors import Error
 from forward.scalars import Mistake
 from forward.settings import UNKNOWN_KIND, cut, nearest, one_line, shown
 from uq.inputs.distributions import Distribution
 
 LISTED = 50  # mistakes that are shown
+MANY = 3  # alike, of elements of a vector
 
 
-class StudyError(Exception):
+class StudyError(Error):
     """A study that cannot be run; each argument is one line: the place, what was given and what was expected."""
 
     def __init__(self, *mistakes: str) -> None:
@@ -59,6 +61,7 @@ _MEMBERS = {
     "list": "a list",
     "dict": "a table",
 }
+_ELEMENT = re.compile(r"\.\d+\b(?=[.:])")  # of a vector
 _MEMBER = re.compile(rf"({'|'.join(_MEMBERS)})(\[.*\])?$")
 _INNER = re.compile(
     r"\[key\]$|(function-|tagged-union|literal|constrained|lax-or|nullable|is-instance|model|chain|json)\S*\["
@@ -83,7 +86,16 @@ def lines(error: ValidationError, place: str = "", apart: Sequence[str] = ()) ->
         elif where not in deeper:
             words = list(dict.fromkeys(members[where]))
             found.append(f"{where}: expected {' or '.join(words)}; given {shown(item['input'])}")
-    return list(dict.fromkeys(map(one_line, found)))
+    return _once_for_elements(dict.fromkeys(map(one_line, found)))
+
+
+def _once_for_elements(found: Iterable[str]) -> list[str]:
+    """Say once what is said of several elements of a vector, x.0 to x.63, or of a list."""
+    alike: dict[str, list[str]] = {}
+    for line in found:
+        alike.setdefault(_ELEMENT.sub(".", line), []).append(line)
+    short = ([f"{of[0]} ({len(of) - 1} more like it)"] if len(of) > MANY else of for of in alike.values())
+    return [line for several in short for line in several]
 
 
 def _around_member(steps: Sequence[str | int], place: str) -> tuple[str, str | None, bool]:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, field_validator, model_serializer, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_serializer, model_validator
 
 from forward.findings import Finding
-from forward.settings import Settings, nearest
+from forward.settings import Settings, Sized, nearest, written_out
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import AVERAGED, BESIDE, KEPT, STACKED, Correlation
@@ -23,6 +23,13 @@ if TYPE_CHECKING:
     from forward.scalars import Mistake, Scalar
     from forward.spec import ModelSpec
     from uq.inputs.draws import Draws
+
+
+Priors = Annotated[
+    dict[str, Distribution],
+    BeforeValidator(written_out, json_schema_input_type=dict[str, Distribution | Sized]),
+]
+"""Distributions by path; x = { size = 64, kind = "normal", ... } are those of x.0 to x.63."""
 
 
 class OneModel(Settings):
@@ -37,7 +44,7 @@ class OneModel(Settings):
     restricted: ClassVar[bool] = False
 
     model: Any
-    parameters: dict[str, Distribution] = Field(default={})
+    parameters: Priors = Field(default={})
     correlations: tuple[Correlation, ...] = ()
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
@@ -45,7 +45,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     StudyError
         With every mistake found.
     ModelError
-        If a kind is a dotted path to a module that exists twice.
+        If a kind or a function is in a module that exists twice.
     """
     blocks = dict(document)
     for assignment in overrides:
@@ -55,11 +55,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     beyond = [f"{place}: {why}" for place, value in leaves(blocks) for why in _beyond(place, value)]
     if beyond:
         raise StudyError(*beyond[:MOST_LINES])
-    modules = list(dict.fromkeys(dotted(blocks)))
-    if modules:
-        from forward.external.own_modules import make_visible
-
-        make_visible(modules, [folder.resolve(), Path.cwd()], "kind")
+    _visible(dotted(blocks), folder, "kind")
     try:
         blocks = located(_located(blocks, folder), folder)
         kind, usual = str(at(blocks, "method", "kind")), AVERAGED if averages(blocks) else SAMPLING
@@ -68,7 +64,17 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     except ValidationError as error:
         apart = [kind for kind in STUDIES.own if kind not in UNNAMED]
         raise StudyError(*lines(error, apart=apart)) from None
+    _visible(found.modules, folder, "model.function")
     return found
+
+
+def _visible(modules: Iterable[str], folder: Path, place: str) -> None:
+    """Let modules be found beside the study and in the working directory, after all others."""
+    names = list(dict.fromkeys(modules))
+    if names:
+        from forward.external.own_modules import make_visible
+
+        make_visible(names, [folder.resolve(), Path.cwd()], place)
 
 
 def _beyond(place: str, value: Any) -> Iterator[str]:

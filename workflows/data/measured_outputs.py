@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -80,12 +80,13 @@ class OutputFile(Settings):
         """Read the table, or what the study itself states, of a model; a DataError if it cannot be used."""
         names = tuple(output.name for output in model.returned)
         found = (
-            stated(self.outputs, names)
+            stated(by_element(self.outputs, names), names)
             if self.file is None
             else read_outputs(folder / self.file, names, steps_of(model), self.reader)
         )
         check_signs(found, model)
-        return found.with_sigma(np.array([self.sigma.get(name, np.nan) for name in found.names]))
+        sigma = by_element(self.sigma, names)
+        return found.with_sigma(np.array([sigma.get(name, np.nan) for name in found.names]))
 
 
 class MeasuredOutputs(Settings):
@@ -101,7 +102,8 @@ class MeasuredOutputs(Settings):
         Instead of files, of joined models: the table of each model by its name, which together are one data set. A
         table of one has the names of its own outputs, or is a curve.
     outputs
-        Instead of files: measurements by output, a number or a list of repeated measurements.
+        Instead of files: measurements by output, a number or a list of repeated measurements; of a vector, a number
+        for each element.
     sigma
         Standard deviations of the errors by output, if a table does not state them.
     noise
@@ -149,7 +151,7 @@ class MeasuredOutputs(Settings):
         else:
             try:
                 if self.tables is None:
-                    one, values = DataSet(name=STATED, file=""), stated(self.outputs, names)
+                    one, values = DataSet(name=STATED, file=""), stated(by_element(self.outputs, names), names)
                 else:
                     one, values = _of_tables(self.tables, folder, model)
                 sets, found = (one,), (known(values),)
@@ -161,7 +163,8 @@ class MeasuredOutputs(Settings):
     def with_errors(self, found: Measurements) -> Measurements:
         """Return data with standard deviations and what is true; a DataError if one is unknown."""
         general = np.maximum(self.noise.relative * np.abs(found.values), self.noise.absolute)
-        usual = [self.sigma.get(name, one) for name, one in zip(found.names, general, strict=True)]
+        sigma = by_element(self.sigma, found.names)
+        usual = [sigma.get(name, one) for name, one in zip(found.names, general, strict=True)]
         found = found.with_sigma(np.array(usual))
         lost = found.labels[~(found.sigma > 0)]
         if lost.size:
@@ -175,7 +178,7 @@ class MeasuredOutputs(Settings):
         """Find names that are no outputs of a model."""
         names = tuple(output.name for output in model.returned)
         for block, given in (("outputs", self.outputs), ("sigma", self.sigma)):
-            for name in given:
+            for name in by_element(given, names):
                 if name not in names:
                     yield ("data", block, name), f"not an output of the model; {nearest(name, names)}", name
 
@@ -206,6 +209,17 @@ def _of_tables(tables: Mapping[str, str], folder: Path, model: ModelSpec) -> tup
         raise StudyError(*wrong)
     digest = sha256("".join(map(digest_of, paths)).encode()).hexdigest()[:16]
     return DataSet(name=TABLES, file=", ".join(tables.values()), digest=digest), reduce(Measurements.with_rows, parts)
+
+
+def by_element(given: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Give what is stated of vectors by their elements: y = [1, 2] is y.0 = 1 and y.1 = 2, and y = 3 is so for all."""
+    known, found = list(dict.fromkeys(map(str, names))), dict[str, Any]()
+    for name, value in given.items():
+        own = [one for one in known if one.startswith(f"{name}.") and one.rpartition(".")[2].isdigit()]
+        each = value if isinstance(value, tuple) else (value,) * len(own)
+        vector = own and len(own) == len(each) and name not in known
+        found |= dict(zip(own, each, strict=True)) if vector else {name: value}
+    return found
 
 
 def check_signs(found: Measurements, model: ModelSpec) -> None:

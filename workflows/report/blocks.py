@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
@@ -106,10 +106,15 @@ class Table(Block):
 class Picture:
     """A picture in base64 with a caption; a `wide` one has many panels and needs the whole width of the page."""
 
-    data: str
+    data: str = field(repr=False)
     caption: str
     wide: bool = False
     kind: Literal["png", "svg+xml"] = "png"
+
+    def _repr_mimebundle_(self, **_: object) -> dict[str, str]:
+        """Show itself in a notebook."""
+        data = self.data if self.kind == "png" else base64.b64decode(self.data).decode()
+        return {f"image/{self.kind}": data}
 
     @classmethod
     def of(cls, png: bytes, caption: str) -> Picture:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.errors import UnknownError
 from forward.model import FloatArray
 from forward.readable import scale
 from workflows.report.plots.figure import DARK
@@ -40,14 +41,15 @@ def body(dataset: xr.Dataset, shown: str = "") -> Figure:
 
     Raises
     ------
-    KeyError
+    UnknownError
         If there is no such quantity; the message lists those that there are.
     """
     scene = forward_scene(dataset, every=True)
     for quantity in scene.quantities:
         if quantity.name.startswith(shown):
             return still(scene, quantity)
-    raise KeyError(f"no quantity begins with {shown!r}, expected one of: {', '.join(q.name for q in scene.quantities)}")
+    known = ", ".join(quantity.name for quantity in scene.quantities)
+    raise UnknownError(f"no quantity begins with {shown!r}, expected one of: {known}")
 
 
 def still(scene: Scene, quantity: Quantity) -> Figure:

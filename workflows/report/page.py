@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from pydantic import ValidationError
 
@@ -21,9 +21,13 @@ from workflows.config.mistakes import StudyError, lines
 from workflows.config.study import parse
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
-from workflows.report.section import SECTIONS, Results, sections
-from workflows.results.directory import read_dataset, read_summary
+from workflows.report.section import SECTIONS, Results, Section, sections
+from workflows.results.directory import NoResultsError, read_dataset, read_summary
+from workflows.results.summary import summarise
 from workflows.run import own_code
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 HERE = Path(__file__).parent
 TOP = ("answer", "findings", "body", "curves")  # sections of the first screen
@@ -46,20 +50,8 @@ def write_report(directory: Path, *, code: bool = False) -> Path:
     path = directory / "report.html"
     with _running(code) as refusals:
         results, asked = _read(directory, refusals), _asked(directory)
-        left_out = [] if asked is None else [name for name in asked.sections if refused(name.rpartition(".")[0])]
-        parts: Parts = []
-        for name, section in sections(asked):
-            try:
-                found = list(section.content(results)) if section.applies(results) else None
-            except OwnCodeError:
-                left_out.append(name)
-                continue
-            except Exception as error:  # the rest of the report survives a failing one from outside
-                if name in SECTIONS.own:
-                    raise
-                said = f"This section could not be made: {type(error).__name__}: {error}"
-                found = [Heading(name), Text(said, "error")]
-            parts += [] if found is None else [(name, found)]
+        parts, left_out = parts_of(results, sections(asked))
+        left_out += [] if asked is None else [name for name in asked.sections if refused(name.rpartition(".")[0])]
     if left_out:
         asked_for = f" ({', '.join(dict.fromkeys(refusals))})" if refusals else ""
         said = f"left out, since they need code that is not installed{asked_for}: {', '.join(left_out)}; --code runs it"
@@ -67,6 +59,25 @@ def write_report(directory: Path, *, code: bool = False) -> Path:
         sys.stderr.write(f"{one_line(f'{directory}: {said}')}\n")
     write_text(path, render(f"Study {results.summary['study']}", parts))
     return path
+
+
+def parts_of(results: Results, asked: Iterable[tuple[str, Section]]) -> tuple[Parts, list[str]]:
+    """Return the sections that apply to results, and the names of those that need code that may not run."""
+    parts: Parts = []
+    left_out: list[str] = []
+    for name, section in asked:
+        try:
+            found = list(section.content(results)) if section.applies(results) else None
+        except OwnCodeError:
+            left_out.append(name)
+            continue
+        except Exception as error:  # the rest of the report survives a failing one from outside
+            if name in SECTIONS.own:
+                raise
+            said = f"This section could not be made: {type(error).__name__}: {error}"
+            found = [Heading(name), Text(said, "error")]
+        parts += [] if found is None else [(name, found)]
+    return parts, left_out
 
 
 def _running(code: bool) -> AbstractContextManager[list[str]]:
@@ -125,13 +136,34 @@ def _read(directory: Path, refusals: list[str]) -> Results:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
-        raise FileNotFoundError(f"{directory}: holds no summary.json, expected the directory of a finished study")
+        raise NoResultsError(f"{directory}: holds no summary.json, expected the directory of a finished study")
     own_code.make_visible(directory)
+    return Results(dataset, summary, _study_of(dataset, directory, refusals), directory)
+
+
+def results_in(dataset: xr.Dataset) -> Results:
+    """Return what a report is of: results that were read, or made in this process, whose code alone runs.
+
+    Raises
+    ------
+    StudyError
+        If they are not whole, or not of this version.
+    """
+    if "config" not in dataset.attrs:
+        raise StudyError("these are no whole results, expected what tissuq.read or study.run has returned")
+    file, ran = dataset.encoding.get("source"), dataset.encoding.get("ran", False)
+    directory = Path(file).parent if file else Path()
+    summary = (read_summary(directory) if file else None) or {**dataset.attrs, **summarise(dataset)}
+    with _running(ran) as refusals:
+        return Results(dataset, summary, _study_of(dataset, directory, refusals), directory)
+
+
+def _study_of(dataset: xr.Dataset, directory: Path, refusals: list[str]) -> Any:
     try:
-        return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"]), folder=directory), directory)
+        return parse(tomllib.loads(dataset.attrs["config"]), folder=directory)
     except StudyError as error:
         if refusals:
-            return Results(dataset, summary, _Withheld(), directory)
+            return _Withheld()
         made = dataset.attrs.get("tissuq", "unknown")
         message = f"{directory}: not a study of this version of tissuq, it was made by version {made} ({error.args[0]})"
         raise StudyError(message) from None

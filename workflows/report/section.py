@@ -24,6 +24,7 @@ from uq.estimators.estimate import PARTS, holds, part, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown
 from workflows.config.mistakes import StudyError
 from workflows.report.blocks import Block, Heading, Level, Table
+from workflows.results.summary import leading
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from workflows.config.blocks import Report
 
 Content = Callable[["Results"], Iterator[Block]]
+DRAWN = 24  # outputs with pictures
 ROWS = 40  # parameters from which on a table is in the order of their effects
 
 
@@ -61,12 +63,17 @@ class Results:
         return [str(name) for name in self.dataset["output"].values]
 
     @property
-    def drawn(self) -> list[str]:
-        """Names of the outputs with pictures of their own: along a path, those of the last step."""
+    def asked(self) -> list[str]:
+        """Names of the outputs that are asked for: along a path, those of the last step."""
         dataset = self.dataset
         if "step" not in dataset.coords:
             return self.outputs
         return [str(name) for name in dataset["output"].values[dataset["step"] == dataset["step"].max()]]
+
+    @property
+    def drawn(self) -> list[str]:
+        """Names of those with pictures of their own: of many, those that vary most."""
+        return leading(self.dataset, self.asked, DRAWN)
 
     @property
     def parameters(self) -> list[str]:

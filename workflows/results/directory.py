@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.errors import Error
 from forward.machine import write_whole
 from forward.readable import per
 from workflows.results.norms import squares
@@ -29,6 +30,10 @@ AXES = 3
 # Of arrays that are not numbers, other than displacements and their derivatives.
 UNITS = {"stress": "Pa", "von_mises": "Pa", "moved": "m", "indicator by volume": "1/m³"}
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
+
+
+class NoResultsError(Error, FileNotFoundError):
+    """A directory without results of a finished study."""
 
 
 def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
@@ -55,15 +60,16 @@ def read_dataset(directory: Path) -> xr.Dataset:
         message = f"{directory}: holds no results.nc, expected the directory of a finished study{begun}"
         if read_summary(directory) is not None:
             message = f"{directory}: results.nc is missing, although the study is finished; {again}"
-        raise FileNotFoundError(message)
+        raise NoResultsError(message)
     try:
         found = stored_dataset(path)
     except (MemoryError, PermissionError):
         raise
     except Exception as error:  # HDF5 says in many ways that a file is damaged
-        raise FileNotFoundError(f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}") from None
+        raise NoResultsError(f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}") from None
     if "config" not in found.attrs:
-        raise FileNotFoundError(f"{path}: holds no results of a study, expected a file that `tissuq run` has written")
+        raise NoResultsError(f"{path}: holds no results of a study, expected a file that `tissuq run` has written")
+    found.encoding["source"] = str(path)  # as xarray keeps it
     return found
 
 

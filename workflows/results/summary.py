@@ -43,6 +43,18 @@ def summarise(dataset: xr.Dataset) -> Part:
     return summary
 
 
+def leading(dataset: xr.Dataset, names: Collection[str], most: int) -> list[str]:
+    """Return the names of outputs; of more than `most`, those that vary most beside others of the same unit."""
+    listed = list(names)
+    if len(listed) <= most or "std" not in dataset:
+        return listed[:most]
+    of = dataset.sel(output=listed)
+    std, units = np.nan_to_num(of["std"].to_numpy()), of["unit"].to_numpy()
+    largest = np.array([std[units == unit].max() for unit in units])
+    first = np.argsort(-std / np.where(largest > 0, largest, 1.0), kind="stable")[:most]
+    return [listed[i] for i in np.sort(first)]
+
+
 def _inversion(dataset: xr.Dataset) -> Part:
     """Return what is known of each data set; of a single one at the top level too."""
     sets = {str(name): _data_set(dataset.sel(data_set=name)) for name in dataset.data_set.values}

@@ -12,6 +12,7 @@ from forward.readable import NONE, duration, margin, named, number, scale, with_
 from uq.estimators.estimate import ESTIMATED, Estimate, single
 from uq.findings import DIGITS, NOT_KNOWN, meshes_unknown, only_rounding
 from workflows.report import words
+from workflows.results.summary import leading
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
 
 WIDTH = 24  # letters of a bar
+MANY = 12  # outputs that are told
 Row = Sequence[str]
 
 
@@ -64,8 +66,11 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
     units = {output: str(dataset.unit.sel(output=output).item()) for output in outputs}
     unknown, rounding = meshes_unknown(dataset), only_rounding(dataset, units).tolist()
     meshed = any(np.isfinite(single(values, "mean").mesh) for values in outputs.values())
+    told = leading(dataset, outputs, MANY)
     rows: list[Row] = [("", "value ± sampling", *(("mesh", "in all", "corrected") if meshed else ()))]
     for (output, values), nothing in zip(outputs.items(), rounding, strict=True):
+        if output not in told:
+            continue
         found = {name: single(values, name) for name in ESTIMATED}
         size, unit = scale(max(abs(found["mean"].value), found["std"].value), units[output])
         rows.append((named(output, unit) + (": zero but for rounding" if nothing else ""),))
@@ -75,6 +80,8 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
             value = write if unknown.get(output) else with_error(one.value, one.error)
             rows.append((f"  {name}", value, *_of_mesh(one, known=output not in unknown)))
     yield from _table(rows)
+    if len(told) < len(outputs):
+        yield f"and {len(outputs) - len(told)} outputs that vary less, in results.nc and report.html"
 
 
 def _of_mesh(one: Estimate[float], *, known: bool) -> list[str]:

@@ -1,4 +1,4 @@
-"""Progress on rank 0: a bar in a terminal, elsewhere a plain line a minute, whatever the run is doing.
+"""Progress on rank 0: a bar in a terminal or a notebook, elsewhere a plain line a minute, whatever the run is doing.
 
 The line comes from a process beside it (`workflows.run.watch`), which reads what is written here.
 """
@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections import deque
 from contextlib import ExitStack, suppress
 from typing import Any, Self
@@ -19,8 +20,15 @@ from forward.phases import Phases, listeners
 from workflows.run import watch
 
 SECONDS_BETWEEN_LINES = 60.0
+SECONDS_BETWEEN_BARS = 1.0  # in a notebook, which keeps each
 SECONDS_BETWEEN_MARKS = 1.0  # that the rate is computed between
 BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} solves [{elapsed}{postfix}]"
+
+
+def in_notebook() -> bool:
+    """Whether this process is what runs a notebook."""
+    python = sys.modules.get("IPython")
+    return python is not None and "IPKernelApp" in getattr(python.get_ipython(), "config", {})
 
 
 class Progress:
@@ -29,7 +37,7 @@ class Progress:
     Parameters
     ----------
     quiet
-        Show only a line a minute, and on a terminal not even that.
+        Show only a line a minute, on a terminal not even that, and in a notebook the bar.
     silent
         Show nothing at all.
     failures
@@ -52,7 +60,10 @@ class Progress:
         self._bar: Any = None
         self._file = -1  # that the watch reads, if there is one
         self._held = ExitStack()
-        self._quiet, self._terminal = quiet or silent, sys.stderr.isatty()
+        notebook = in_notebook()
+        self._quiet, self._terminal = quiet or silent, sys.stderr.isatty() or notebook
+        self._interval = SECONDS_BETWEEN_BARS if notebook else 0.1
+        self._bars = not silent and (notebook or (self._terminal and not quiet))
         self._lines = not silent and not self._terminal
 
     def __enter__(self) -> Self:
@@ -74,10 +85,11 @@ class Progress:
     def expect(self, planned: int) -> None:
         """Count towards so many solves; they grow when a method asks for more."""
         self._planned = planned
-        if self._terminal and not self._quiet:
-            from tqdm import tqdm
+        if self._bars:
+            with warnings.catch_warnings(action="ignore"):  # of a notebook without widgets, which has a bar of letters
+                from tqdm.auto import tqdm
 
-            self._bar = tqdm(total=planned, dynamic_ncols=True, bar_format=BAR)
+            self._bar = tqdm(total=planned, dynamic_ncols=True, bar_format=BAR, mininterval=self._interval)
         self._write()
 
     def __call__(self, done: int, failed: int) -> None:
@@ -95,6 +107,7 @@ class Progress:
             self._marks.popleft()
         if self._bar is not None:
             self._bar.set_postfix_str(watch.pace(self.state, now), refresh=False)
+            self._bar.total = max(self._bar.total, self._done)
             self._bar.update(done)
         elif marked:  # not of each solve, which may take less than this
             self._write()

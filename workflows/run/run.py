@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from forward.external.own_modules import Loaded
+from forward.external.own_modules import SESSION, Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from forward.phases import phase
@@ -36,7 +36,7 @@ from workflows.results.directory import (
 from workflows.run import own_code
 from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
-from workflows.run.progress import Progress
+from workflows.run.progress import Progress, in_notebook
 from workflows.run.summary import summarised
 from workflows.run.version import version
 from workflows.studies.job import Job
@@ -205,7 +205,7 @@ def _leave(
     job: Job,
 ) -> None:
     """Write all results, in an order that is safe against a kill."""
-    write_dataset(directory / "results.nc", dataset, job.arviz_groups(dataset))
+    write_dataset(directory / "results.nc", dataset, study.arviz_groups(dataset))
     write_fields(directory / "fields", dataset, study.units_of)
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
@@ -353,7 +353,7 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
 
 
 def results_of(
-    study: StudyKind, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False
+    study: StudyKind, directory: str | Path | None = None, *, quiet: bool | None = None, report: bool = False
 ) -> xr.Dataset:
     """Run a study and return its results; under mpirun collective, and the results are those of the first rank.
 
@@ -365,7 +365,7 @@ def results_of(
         Where results go; an interrupted study there is continued, a finished one is read. By default nothing is written
         to disk.
     quiet
-        Print no progress.
+        Print no progress; by default, only a bar in a notebook.
     report
         Write report.html too, if there is a directory.
 
@@ -381,13 +381,16 @@ def results_of(
     """
     from mpi4py import MPI
 
+    printing = {"quiet": quiet is not False, "silent": not in_notebook() if quiet is None else quiet}
     if directory is not None:
-        run(study, Path(directory).name, Path(directory), quiet=quiet, silent=quiet, report=report)
+        if SESSION in own_code.modules(study):  # its text is not known, and so not whether it has changed
+            raise StudyError("model: is a function of this session, expected one of a module, or no directory")
+        run(study, Path(directory).name, Path(directory), **printing, report=report)
         return _on_first_rank(Path(directory))
     world = MPI.COMM_WORLD
     with tempfile.TemporaryDirectory(prefix="tissuq-") as own:
         scratch = Path(world.bcast(own)) / "study"
-        run(study, "study", scratch, quiet=quiet, silent=quiet, report=False)
+        run(study, "study", scratch, **printing, report=False)
         found = _on_first_rank(scratch)
         world.barrier()  # the folder of the first rank goes with it
     return found
@@ -397,4 +400,8 @@ def _on_first_rank(directory: Path) -> xr.Dataset:
     import xarray as xr
     from mpi4py import MPI
 
-    return read_dataset(directory) if MPI.COMM_WORLD.rank == 0 else xr.Dataset()
+    if MPI.COMM_WORLD.rank > 0:
+        return xr.Dataset()
+    found = read_dataset(directory)
+    found.encoding["ran"] = True  # here: what shows it may run its code again
+    return found

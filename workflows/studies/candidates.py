@@ -13,9 +13,9 @@ from forward.material_tests import Constants
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MEASURED, ModelSpec
-from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
+from workflows.config.one_model import Priors
 from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_of_parameters, ranges
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class CandidateModel(Settings):
         Its probability before the data, up to a common factor.
     """
 
-    parameters: dict[str, Distribution] = Field(min_length=1)
+    parameters: Priors = Field(min_length=1)
     correlations: tuple[Correlation, ...] = ()
     weight: float = Field(default=1.0, gt=0)
     model: dict[str, Any] = Field(default={})

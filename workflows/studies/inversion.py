@@ -26,6 +26,8 @@ from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -115,6 +117,12 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         from workflows.studies.inversion_job import job
 
         return job(self, ensemble, directory, checkpoint)
+
+    def arviz_groups(self, found: xr.Dataset) -> Mapping[str, xr.Dataset]:
+        """Return prior and posterior, the likelihood of each datum, and the data."""
+        from workflows.studies.inversion_results import arviz_groups
+
+        return arviz_groups(self, found)
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the unknown parameters, of those that act in what is predicted with what is uncertain there."""

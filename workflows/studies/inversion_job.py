@@ -36,7 +36,6 @@ from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import (
     BATCH,
     Vertices,
-    arviz_groups,
     batch_table,
     dataset,
     judged,
@@ -226,7 +225,7 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
     def texts(found: xr.Dataset) -> dict[str, str]:
         return {BATCH: batch_table(found)}
 
-    return {"labelled": labelled, "arviz_groups": partial(arviz_groups, study), "texts": texts}
+    return {"labelled": labelled, "texts": texts}
 
 
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name

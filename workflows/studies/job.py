@@ -44,8 +44,6 @@ class Job:
         Adds to the results what the method does not know.
     finished
         Adds at last what all evaluations say.
-    arviz_groups
-        Groups of results.nc besides its own variables.
     texts
         Further files of the directory, by name.
     told
@@ -58,7 +56,6 @@ class Job:
 
     labelled: Callable[[xr.Dataset], xr.Dataset] = field(default=lambda found: found)
     finished: Callable[[xr.Dataset, Mapping[str, Evaluations]], xr.Dataset] = field(default=lambda found, _: found)
-    arviz_groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
     texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
     told: dict[str, Any] = field(default_factory=dict)
     own: list[float] = field(default_factory=list)

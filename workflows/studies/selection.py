@@ -31,6 +31,8 @@ from workflows.studies.selection_blocks import SelectionBlocks
 from workflows.studies.study import StudyKind, bytes_of
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import MethodJob
@@ -181,6 +183,12 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
             f"solves      about {self.planned:,}",
             f"time        about {duration(seconds)} on 1 core (rough)",
         ]
+
+    def arviz_groups(self, found: xr.Dataset) -> Mapping[str, xr.Dataset]:
+        """Return prior and posterior of each model, the likelihood of each datum, and the data."""
+        from workflows.results.comparison import arviz_groups
+
+        return arviz_groups(self.models, self.method.noise.factor, self.method.seed, found)
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
         """Make the candidates, each for each group of data; collective."""

@@ -123,7 +123,6 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         task,
         recorders,
         labelled=labelled,
-        arviz_groups=partial(comparison.arviz_groups, study.models, method.noise.factor, method.seed),
         costly=study.model is not None or method.chains in {"pcn", "emcee"},  # whose one step may take minutes
         passing=frozenset({*finer_ones, *held_ones, *true_ones}),
     )

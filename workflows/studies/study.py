@@ -15,6 +15,8 @@ from workflows.config.blocks import AVERAGED, Parallel, Report
 from workflows.config.mistakes import refused
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from forward.findings import Finding
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
@@ -157,6 +159,10 @@ class StudyKind(Settings):
     @abstractmethod
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make what the ranks work on; collective."""
+
+    def arviz_groups(self, found: xr.Dataset) -> Mapping[str, xr.Dataset]:
+        """Return the groups of results besides their own variables: those of ArviZ, where there is a posterior."""
+        return {}
 
     @property
     def inputs(self) -> Inputs:

@@ -193,3 +193,12 @@ def test_the_command_shows_life_though_quiet(tmp_path, ranks):
     assert all(shown.fullmatch(line) for line in lines), done.stderr
     within = re.compile(r"\d/4\d solves, time left not known yet; monte-carlo \(0:0\d\): solving \(0:0[01]\)")
     assert len([line for line in lines if within.fullmatch(line)]) >= 3, done.stderr
+
+
+@pytest.mark.parametrize(("settings", "shown"), [({"quiet": True}, True), ({}, True), ({"silent": True}, False)])
+def test_a_notebook_has_a_bar_unless_nothing_is_asked_for(settings, shown, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "in_notebook", lambda: True)
+    with expecting(4, **settings) as found:
+        found(4, 0)
+        found.close()
+    assert ("4/4 solves" in capsys.readouterr().err) == shown

@@ -31,7 +31,7 @@ from workflows.report.sections.frame import gravest
 from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
 from workflows.results.comparison import bayes_factor, by_probability, grade
-from workflows.results.summary import NEITHER
+from workflows.results.summary import NEITHER, leading
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,8 +69,10 @@ def forward(results: Results) -> Card:
     sampled = "mean" in of
     names = gathered(results.parameters) if "parameter" in of.coords else []
     path = " at the last step of the path" if "step" in of.coords else ""
-    asked = listed([called(results, output) for output in results.drawn])
-    be = "is" if len(results.drawn) == 1 else "are"
+    first = leading(of, results.asked, TILES)
+    outputs = sorted(results.asked, key=lambda output: output not in first)
+    asked = listed([called(results, output) for output in outputs])
+    be = "is" if len(outputs) == 1 else "are"
     uncertain = f"{listed(names)} {'is' if len(names) == 1 and ' modes of ' not in names[0] else 'are'} uncertain"
     if sampled:
         question = f"How large {be} {asked}{path}, {f'if {uncertain}' if names else 'by all candidates'}?"
@@ -81,7 +83,7 @@ def forward(results: Results) -> Card:
     own = getattr(spec, "errors", {})  # of a reduced model itself: what a mean may be off by at most
     name, answers = "mean" if sampled else "nominal", []
     sources = parts_of(results, name)
-    for output in results.drawn:
+    for output in outputs:
         k, one, unit = results.outputs.index(output), results.of(output), results.unit(output)
         if not counts[k]:
             answers.append(Answer(called(results, output), "0", ("zero but for rounding",)))
