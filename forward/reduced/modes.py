@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -320,13 +321,14 @@ class AtRest:
         from scipy.sparse import diags
         from scipy.sparse.linalg import cg
 
+        close: dict[str, Any] = {"rtol" if "rtol" in signature(cg).parameters else "tol": CLOSE}  # SciPy renamed it
         A, B, _ = self._parts
         free = np.setdiff1d(np.arange(self._displacements), self.equations.fixed)
         inside = A[free][:, free]
         scaling = diags(1 / inside.diagonal())
         found = np.zeros_like(pressures)
         for row, pressure in zip(found, pressures, strict=True):
-            row[free] = cg(inside, (B.T @ pressure[self._displacements :])[free], tol=CLOSE, M=scaling)[0]
+            row[free] = cg(inside, (B.T @ pressure[self._displacements :])[free], M=scaling, **close)[0]
         return found
 
     def of_blocks(

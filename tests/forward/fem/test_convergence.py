@@ -9,7 +9,7 @@ import sympy as sp
 import ufl
 from mpi4py import MPI
 
-from forward.fem.dolfinx import spaces
+from forward.fem.dolfinx import spaces, version
 from forward.fem.equations import Discretisation
 from forward.hyperelastic import Hyperelastic
 from forward.solvers.newton import newton
@@ -64,20 +64,20 @@ class Forced(Discretisation):
         force = manufactured()[2](places.reshape(-1, 3))
         densities = [spaces.function(spaces.quadrature_space(self.mesh, spec.body.quadrature)) for _ in range(3)]
         for density, column in zip(densities, force.T, strict=True):
-            density.x.array[density.function_space.dofmap.list.array] = column
+            density.x.array[version.nodes_of_cells(density.function_space, 1).ravel()] = column
         load = self.vector(ufl.inner(ufl.as_vector(densities), self.test) * self.dx)()
         internal = self._residual
         self._residual = lambda: internal() - float(self._load.value) * load
 
     def interpolation(self, degree):
         """Nodes of the cells, and at quadrature points: places, shape functions, their gradients, and weights."""
-        cell = basix.cell.string_to_type(self.spec.body.cell)
+        cell = getattr(basix.CellType, self.spec.body.cell)
         points, weights = basix.make_quadrature(cell, degree)
         element = basix.create_element(
             basix.ElementFamily.P, cell, self.spec.body.degree, basix.LagrangeVariant.gll_warped
         )
         table = element.tabulate(1, points)[..., 0]  # (value and derivatives, points, nodes)
-        nodes = self.space.dofmap.list.array.reshape(-1, table.shape[2])
+        nodes = version.nodes_of_cells(self.space, table.shape[2])
         X = np.asarray(self.space.tabulate_dof_coordinates())[nodes]
         jacobian = np.einsum("dqa,cai->cqid", table[1:], X)
         gradients = np.einsum("dqa,cqdi->cqai", table[1:], np.linalg.inv(jacobian))
