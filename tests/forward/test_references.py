@@ -7,7 +7,7 @@ import pytest
 
 from tests.references import BODIES, KEPT, computed
 
-pytestmark = [pytest.mark.fem, pytest.mark.wheel, pytest.mark.flags]
+pytestmark = [pytest.mark.fem, pytest.mark.flags]
 
 
 @pytest.mark.parametrize("name", BODIES)

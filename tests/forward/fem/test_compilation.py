@@ -54,7 +54,6 @@ def found(process):
 
 
 @pytest.mark.slow
-@pytest.mark.wheel
 def test_forms_are_compiled_once_by_many_processes(tmp_path):
     lines = [line for process in [start(tmp_path, ranks) for ranks in (None, 2)] for line in found(process)]
     assert [volume for volume, _ in lines] == ["6.0"] * 3

@@ -16,7 +16,7 @@ from tests.bodies import loaded_body
 from tests.forward.fem.test_lockstep import field
 from tests.forward.fem.test_mixed import cantilever
 
-pytestmark = [pytest.mark.fem, pytest.mark.wheel, pytest.mark.flags]
+pytestmark = [pytest.mark.fem, pytest.mark.flags]
 
 
 def cell_by_cell(assembler):
