@@ -108,8 +108,10 @@ def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -
 
 def fits(dataset: xr.Dataset, tests: Sequence[tuple[str, str]]) -> Axes:
     """Draw the curves of all tests, given with their groups, side by side, with one legend below."""
-    panels = grid(len(tests), min(len(tests), WIDE), (3.7, 2.9), (0.65, 0.55, 0.15, 0.15), below=2 * LEGEND)
+    several = len({group for group, _ in tests}) > 1
+    panels = grid(len(tests), min(len(tests), WIDE + several), (3.7, 2.9), (0.75, 0.55, 0.1, 0.3), below=2 * LEGEND)
     for panel, (group, test) in zip(panels, tests, strict=True):
+        panel.set_title(text_of(group) if several else "", fontsize="medium")
         legend = curves(dataset, group, test, panel).get_legend()
         if legend is not None:
             legend.remove()
