@@ -49,7 +49,7 @@ test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
 	@$(KEPT) $(PYTHON) -m pytest $(WORKERS) $(ARGS)
 
 test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
-	@$(KEPT) $(PYTHON) -m pytest -m unit -p no:hypothesispytest $(ARGS)
+	@$(KEPT) $(PYTHON) -m pytest -m "unit and not slow" -p no:hypothesispytest $(ARGS)
 
 test-faults: $(READY) ## plant faults in formulas in turn, and say which of them the unit tests see (ARGS="bias" plants one)
 	@$(PYTHON) -m tests.faults $(ARGS)

@@ -100,6 +100,6 @@ def same_numbers(first_numbers):
 
 
 def pytest_ignore_collect(collection_path, config):
-    """With `-m unit`, read only the files that have such tests: importing all others takes longer than these run."""
-    only = config.option.markexpr == "unit" and collection_path.name.startswith("test_")
+    """With `make test-unit`, read only the files that have such tests: to import all others takes longer than these."""
+    only = config.option.markexpr == "unit and not slow" and collection_path.name.startswith("test_")
     return True if only and "mark.unit" not in collection_path.read_text() else None

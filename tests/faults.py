@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parent.parent
 COPIED = ("forward", "uq", "inverse", "workflows", "tissuq", "tests", "configs", "docs", "pyproject.toml")
-TESTS = ("-m", "pytest", "-m", "unit", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "--tb=no")
+TESTS = ("-m", "pytest", "-m", "unit and not slow", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "--tb=no")
 
 
 class Fault(NamedTuple):

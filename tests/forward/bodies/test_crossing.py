@@ -31,7 +31,6 @@ def ring(turn, cell):
     return points, np.column_stack([far * np.sin(angle), radius - far * np.cos(angle), points[:, 2]]), cells
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
 def test_ends_that_meet_are_seen(cell):
     points, bent, cells = ring(6.0, cell)

@@ -23,7 +23,6 @@ def volume(points, cells):
     return np.mean([volume(points, way[:, TETRAHEDRA["hexahedron"]].reshape(-1, 4)) for way in (cells, turned)])
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("along", [3, 6])
 def test_the_volume_of_a_hollow_ball_is_found(cell, along):

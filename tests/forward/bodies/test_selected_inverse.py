@@ -21,7 +21,6 @@ def problem(n, density, seed=0):
     return A, M, rng.uniform(size=(n, 3))
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("n", "density"), [(1, 1.0), (SMALLEST, 0.1), (150, 0.02), (400, 0.004), (300, 0.0)])
 @pytest.mark.parametrize("order", [0, 1, 3])
 def test_coefficients_are_those_of_dense_algebra(n, density, order):

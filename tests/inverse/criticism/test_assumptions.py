@@ -237,7 +237,6 @@ def test_what_is_too_uncertain_for_first_order_is_said():
     )
 
 
-@pytest.mark.unit
 def test_what_is_uncertain_is_as_stated_whatever_the_size_of_the_errors():
     """Errors that are a fifth of what is stated, by a factor that is inferred: a stated deviation is no fifth of it."""
     rng, m = np.random.default_rng(1), 200

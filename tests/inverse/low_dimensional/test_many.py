@@ -184,7 +184,6 @@ def test_what_is_tried_first_follows_from_what_its_points_would_be_worth():
     assert not affordable(31)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("short", [0.03, 0.3, 0.9])
 def test_the_mode_is_found_where_gauss_newton_crawls(short):
     """Data inside the circle that the outputs run on: each Gauss–Newton step leaves 1 − `short` of the distance."""

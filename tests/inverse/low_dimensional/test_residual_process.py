@@ -40,7 +40,6 @@ def posterior(values, sigma=SIGMA):
     return Posterior(INPUTS, SerialEvaluate(MODEL), values, Noise(np.full(M, sigma)))
 
 
-@pytest.mark.unit
 def test_size_length_and_evidence_in_closed_form():
     y = A @ [0.5, -1.0] + 0.3 * np.sin(5 * np.repeat(X[:, 2], 3)) + SIGMA * np.random.default_rng(1).standard_normal(M)
     one = posterior(y)

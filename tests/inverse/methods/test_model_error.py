@@ -69,7 +69,6 @@ def test_a_single_datum_has_the_variance_of_students_distribution(N):
     assert found.apart[0] == pytest.approx(0.0, abs=1e-12)  # others span what there is
 
 
-@pytest.mark.unit
 def test_the_next_error_is_as_large_as_is_said():
     """Over draws of nine pairs of 30 data: squares of the next error over its variance, of errors of falling size."""
     root, squares = RNG.standard_normal((30, 30)) * 2 * 0.5 ** np.arange(30), []
@@ -109,7 +108,6 @@ def test_posterior_and_evidence_are_those_of_data_with_these_errors():
     assert one.assessment.log_evidence[0] == pytest.approx(law.logpdf(data), rel=1e-6)
 
 
-@pytest.mark.unit
 def test_many_pairs_find_the_known_gaussian_error():
     known = inferred(cheap(MEAN), truth(solves=600)).posterior.noise.model
     covariance = np.diag(known.apart**2) + known.root.T @ known.root

@@ -92,7 +92,6 @@ def test_a_kink_takes_quasi_monte_carlo(seed):
     assert f"{solves:,} solves" in last
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("method", [Automatic(seed=4), Chaos(samples=300, seed=4)], ids=["automatic", "chaos"])
 def test_first_samples_that_are_explained_are_not_believed(method):
     """The first of them may all lie on one side of a jump, where the function is linear."""

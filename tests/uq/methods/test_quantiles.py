@@ -92,7 +92,6 @@ def test_errors_of_predictions_are_those_of_samples_near_the_quantile():
     np.testing.assert_allclose(missing.upper - missing.central, [[0.588], [0.0588 * 2**0.5]], rtol=1e-2)
 
 
-@pytest.mark.unit
 def test_replicates_do_not_agree_on_what_none_of_them_has_met():
     """Sets of four points: the share above the largest value but one is the same in nearly all of them."""
     p = 0.98

@@ -53,7 +53,6 @@ def moments_along():
 
 
 @pytest.mark.slow
-@pytest.mark.unit
 def test_claims_hold_at_limit_points():
     """At most 7 % of intervals miss, of mean or standard deviation: by what samples show alone 10 to 17 % did."""
     one = fits(lambda u: 1 - np.sqrt(1 - u), lambda u: 0.5 / np.sqrt(1 - u), 1)
@@ -63,7 +62,6 @@ def test_claims_hold_at_limit_points():
     assert np.mean([missed(found, *truth) for found in two]) <= 0.07
 
 
-@pytest.mark.unit
 def test_errors_are_those_of_the_function_that_residuals_allow():
     """A root, or the next polynomials: by another solver of the least squares, and integrals by the midpoint rule."""
     found = next(fits(np.exp, np.exp, 1))
@@ -90,7 +88,6 @@ def test_errors_are_those_of_the_function_that_residuals_allow():
     np.testing.assert_allclose(found.edges()[:, 0], [max(means), max(stds)], rtol=2e-2)
 
 
-@pytest.mark.unit
 def test_what_is_next_to_a_basis():
     """One or two powers more, of which less are in the basis in each parameter; parameters with tails stay out."""
     even = np.array([[0, 0], [2, 0], [0, 2], [2, 2], [4, 0]])
@@ -101,7 +98,6 @@ def test_what_is_next_to_a_basis():
 
 
 @pytest.mark.slow
-@pytest.mark.unit
 def test_claims_hold_where_few_samples_are_next_to_corners():
     """A hill, in at most 7 % of cases: without the functions next to those of a fit, 18 % miss mean or deviation."""
 
@@ -115,7 +111,6 @@ def test_claims_hold_where_few_samples_are_next_to_corners():
 
 
 @pytest.mark.few(1)
-@pytest.mark.unit
 @pytest.mark.parametrize("name", ["exp", "1/(1 + u)"])
 def test_claims_of_smooth_functions_stay_of_their_size(name, monkeypatch):
     found = list(fits(*SMOOTH[name], seeds=20))
@@ -127,13 +122,11 @@ def test_claims_of_smooth_functions_stay_of_their_size(name, monkeypatch):
     assert (np.median(claims / without, axis=0) < 2).all()
 
 
-@pytest.mark.unit
 def test_an_expansion_that_lacks_nothing_claims_nothing_of_edges():
     found = next(fits(lambda u, v: u**2 * v - v, lambda u, v: np.hstack([2 * u * v, u**2 - 1])))
     assert (found.edges() < 1e-12).all()
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("slope", [0.0, 1.0])
 def test_gradients_that_are_not_of_a_staircase_are_said(slope):
     """None at all, or those of what it is the steps of."""
@@ -144,7 +137,6 @@ def test_gradients_that_are_not_of_a_staircase_are_said(slope):
 
 
 @pytest.mark.few(2)
-@pytest.mark.unit
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_of_functions_are_not_accused(name):
     """Of smooth ones at most once in twenty, nor of a kink, whose gradients vary as its values do."""

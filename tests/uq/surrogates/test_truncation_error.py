@@ -23,7 +23,6 @@ def fitted(seed):
     return Regression.of(INPUTS, points, values[:, None], slopes[:, None, :], 2)
 
 
-@pytest.mark.unit
 def test_what_a_missing_function_does_to_the_standard_deviation_is_claimed_and_not_its_norm():
     found = [fitted(seed) for seed in range(8)]
     missing = np.array([one.missing()[0] for one in found])
@@ -71,7 +70,6 @@ def test_deviations_of_many_normals_are_claimed_within_ten_errors(rate):
     assert np.median(error) < 10 * np.sqrt((off**2).mean())
 
 
-@pytest.mark.unit
 def test_a_fit_that_goes_wrong_beyond_its_samples_gives_way_to_these():
     found, rough = of_values(lambda z: z[:, 0] * np.sin(3 * z[:, 0]), 1, 32, 16)
     mean, mean_error, std, std_error = found[rough].T

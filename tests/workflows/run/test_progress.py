@@ -143,7 +143,6 @@ def test_what_is_done_is_named_with_its_time():
     assert watch.line(state | {"phases": []}, 100.0) == "at work"
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     ("terminal", "settings", "lines"),
     [(False, {}, True), (False, {"quiet": True}, True), (False, {"silent": True}, False), (True, {}, False)],

@@ -43,7 +43,6 @@ def test_a_tolerance_stands_in_place_of_a_method():
         parse({name: block for name, block in document(load(OWN)).items() if name != "method"})
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     ("method", "samples"),
     [
