@@ -112,11 +112,8 @@ class SolveError(Error):
         reached: FloatArray | None = None,
     ) -> None:
         super().__init__(reason)
-        self.reason = reason
-        self.history = tuple(history)
-        self.work = work or Work()
-        self.stability = stability
-        self.reached = reached
+        self.reason, self.history, self.work = reason, tuple(history), work or Work()
+        self.stability, self.reached = stability, reached
 
     def within(self, place: str) -> Self:
         """Return the same with the name of a part of the model in front."""
