@@ -16,9 +16,8 @@ WHEEL_TESTS := tests/forward tests/uq/methods/test_chaos.py tests/uq/methods/tes
     tests/uq/inputs/test_inputs.py tests/inverse/fields/test_low_rank.py tests/inverse/low_dimensional/test_posterior.py \
     tests/workflows/config/test_config.py
 DEMO := beam
-# Files of tests go to one worker more than there are cores, since programs that tests start, and browsers, are waited
-# for; a file stays together, since its tests share what is built.
-WORKERS := --numprocesses $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1) --dist loadfile
+# Files of tests go to one worker for each core; a file stays together, since its tests share what is built.
+WORKERS := --numprocesses $(shell env -u OMP_NUM_THREADS nproc) --dist loadfile
 ARGS :=
 # To compile all modules anew takes as long as the unit tests, in every worker: kept here, whatever the environment says.
 KEPT := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/.venv/compiled

@@ -300,6 +300,7 @@ def test_linear_cells_of_a_file_are_looked_at_as_quadratic_ones(tmp_path):
     assert share(two) == HALVED
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_the_finer_mesh_is_nearer_to_the_truth():
     """And the same as a specimen that has this mesh from the start."""

@@ -67,6 +67,7 @@ def test_what_samples_do_not_tell_has_no_end_and_is_said():
     assert not [one for one in findings(usual) if one.code == "quantiles-endless"]
 
 
+@pytest.mark.slow
 def test_an_expansion_as_control_tells_quantiles_that_samples_do_not():
     """A smooth function: intervals a tenth as wide, and beyond the samples there are some."""
     rows = [

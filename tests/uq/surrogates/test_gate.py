@@ -78,6 +78,7 @@ def test_what_is_said_to_be_kept_is(name, seed):
     assert found.right or not found.kept
 
 
+@pytest.mark.slow
 def test_few_samples_with_gradients_do_not_see_a_corner():
     """An expansion of order 9 and 64 samples miss a pole: the error was 6.9 times the tolerance, and "kept"."""
     case = next(case for case in promises.ONES if case.name == "1/(1.03 - abc)")

@@ -177,7 +177,7 @@ def test_the_watch_ends_with_the_run_however_that_ends(tmp_path):
         assert begun.wait(HANGS) == 0
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_the_command_shows_life_though_quiet(tmp_path, ranks):

@@ -54,6 +54,7 @@ def test_what_three_estimates_predict_is_what_a_finer_mesh_changes():
     np.testing.assert_allclose(coarse["derivative_mesh_error"] / factor, local, rtol=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_a_finer_mesh_gives_lies_within_the_stated_uncertainty():
     """The same study on cells half as large, of which the error is a third to a quarter: within it too."""

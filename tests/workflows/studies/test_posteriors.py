@@ -558,6 +558,7 @@ def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch, undrawn):
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch, undrawn):
     """Five specimens, whose grade moves one of their numbers; mistakes in covariates are one line each."""
     monkeypatch.syspath_prepend(tmp_path)
