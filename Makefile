@@ -131,6 +131,6 @@ $(WHEEL_READY): pyproject.toml constraints.txt
 	@echo "installing Python packages into $(WHEEL_VENV)"
 	@$(WHEEL_PYTHON) -m venv $(WHEEL_VENV)
 	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(WHEEL_VENV)/bin/python -m pip install --quiet --no-compile \
-	    --editable '.[fenicsx,vtk]' dynesty hatchling hypothesis jsonschema pytest pytest-xdist SALib sympy umbridge
+	    --editable '.[fenicsx,vtk]' dynesty hatchling hypothesis jsonschema pytest pytest-xdist pyyaml SALib sympy umbridge
 	@$(WHEEL_VENV)/bin/python -c 'import dolfinx_solver, dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
 	@touch $@
