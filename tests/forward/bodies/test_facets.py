@@ -70,6 +70,7 @@ def test_a_pipe_is_lifted_between_its_creases():
     np.testing.assert_allclose(outwards, np.linalg.norm(moved, axis=1), rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_facets_hide_of_a_thick_sphere(tmp_path):
     """Of its energy and of displacements, against the radial equation; a mesh that is divided hides as much."""

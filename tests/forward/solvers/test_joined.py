@@ -120,7 +120,7 @@ def small_steps(model, point, count=32):
     return state
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.fem
 @pytest.mark.parametrize(
     ("body", "form"),

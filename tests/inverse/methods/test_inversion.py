@@ -636,6 +636,7 @@ def test_it_is_asked_what_the_body_could_have(single):
     assert f"the data call for {called.values['question']}" in verdict
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_all_groups_share_one_data_set(folder, single):
     """The same bytes as of one rank, the solve on the finer mesh among them."""

@@ -504,6 +504,7 @@ def test_a_load_that_is_uncertain_in_what_was_measured_and_predicted(specimens, 
     np.testing.assert_allclose(found["uncertain_std"][0] * 15, right["std"][1], rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_a_field_predicts_by_adjoints(specimens, monkeypatch):
     """Against draws of the stored posterior, through the model."""

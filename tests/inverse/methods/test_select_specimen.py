@@ -303,6 +303,7 @@ def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatc
     assert not any("moves the data by" in text for text in texts)
 
 
+@pytest.mark.slow
 def test_a_study_says_what_its_meshes_do(study, monkeypatch, capsys):
     """Coarse meshes are found out: exit code 3, evidences that are not trusted; and nothing is where no one looked."""
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)

@@ -126,6 +126,7 @@ def test_same_numbers_as_in_one_process(ranks):
     assert done.stdout.split() == [*CASES]
 
 
+@pytest.mark.slow
 def test_one_process_is_a_group_of_its_own(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["script", *CASES])
     exec(compile(STUDY, "script", "exec"), {"__name__": "__main__"})

@@ -135,6 +135,7 @@ def test_understated_errors_are_found_out(monkeypatch):
     assert (found["mean_coverage"] < 0.7).all()
 
 
+@pytest.mark.slow
 def test_errors_that_are_rounding_are_not_resolved(compared):
     exact = of(compared, "sensitivity-monte-carlo", "g")
     assert not exact["mean_resolved"].any()

@@ -137,6 +137,7 @@ def test_what_is_not_fixed_stays_random(page, reports, expanded):
     np.testing.assert_allclose(deviations, np.linalg.norm(field.std(axis=0), axis=1), rtol=0.02, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_slider_moves_the_body_and_says_where_it_extrapolates(page, reports, tmp_path):
     page.open(reports["chaos"])
     before = page.screenshot(tmp_path / "a.png", "canvas")

@@ -374,6 +374,7 @@ def test_memory_for_refined_meshes_is_looked_at_before(monkeypatch):
     assert not any("as far as" in line for line in plan(asked(1e-2, "accuracy.memory=500")))
 
 
+@pytest.mark.slow
 @pytest.mark.fem
 def test_what_is_not_reached_is_said(tmp_path):
     settings = [*COARSE, "accuracy={tolerance=1e-4, solves=16, memory=16}", "model.body.degree=1"]
