@@ -88,7 +88,7 @@ def test_the_subset_that_is_counted_depends_on_the_parameters_only():
 # --- bodies ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.few(1)
 @pytest.mark.fem
 @pytest.mark.parametrize("name", ["column", "clamped block", "sideways cantilever", "mixed form", "follower pressure"])
 def test_no_unstable_equilibrium_is_returned(name):

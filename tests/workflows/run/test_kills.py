@@ -166,7 +166,6 @@ def same(folder):
     return (folder / "whole" / "results.nc").read_bytes() == (folder / "parts" / "results.nc").read_bytes()
 
 
-@pytest.mark.slow
 def test_a_comparison_of_materials_goes_on_where_it_was_killed(tmp_path):
     """A step, of which there are two for each evidence, is lost at most: of 64 solves, and of the search for a mode."""
     (tmp_path / "study.toml").write_text(TESTS)
