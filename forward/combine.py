@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -111,6 +111,21 @@ class Mapped(OfOne):
         """Solve at q (d,)."""
         there = self.by.values(parameters[None])[0]
         return CombinedSolution((self.model.solve(there, mapped(guess, self.by)),), len(there), self.by)
+
+
+def along_columns(
+    model: ForwardModel, names: Sequence[str], columns: Mapping[str, FloatArray], behind: FloatArray
+) -> Mapped:
+    """Return a model of parameters of some names: its first ones, and others along columns (k,) of the k behind these.
+
+    The values (k,) of those are `behind` where the others are zero.
+    """
+    own = model.parameters[: len(model.parameters) - len(behind)]
+    by = np.zeros((len(model.parameters), len(names)))
+    by[range(len(own)), [names.index(name) for name in own]] = 1.0
+    for name, column in columns.items():
+        by[len(own) :, names.index(name)] = column
+    return Mapped(model, Sparse(csr_matrix(by), np.append(np.zeros(len(own)), behind)), tuple(names))
 
 
 def mapped(guess: Guess | None, by: Affine) -> Guess | None:

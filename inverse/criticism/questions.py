@@ -151,8 +151,8 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
             wider, end = _with(posterior, gaussian, questions, answer.name, patterns, means, strengths)
         except SolveError:
             return found
-        strengths = wider.posterior.physical(end.mode[None])[0, wider.new]
-        move = (wider.posterior.physical(end.mode[None])[0, wider.own] - before) / deviations(posterior, gaussian)
+        best = wider.posterior.physical(end.mode[None])[0]
+        strengths, move = best[wider.new], (best[wider.own] - before) / deviations(posterior, gaussian)
         found = answer._replace(form=form, log_evidence=end.log_evidence - own + searched, move=move)
         moved = questions.fitted(form, strengths)
         if moved is None or (len(strengths) > 1 and np.abs(strengths[1:]).max() < SETTLED):

@@ -198,9 +198,9 @@ def infer(
     places, recorder = None, None
     if sampled is not None and assumed is not None:
         recorder = Recorder(sampled.evaluate)
-        with suppress(SolveError):  # or else it stays at first order, which is said
+        with suppress(SolveError):  # there is no answer to any of them at the mode
             wider, parts = _sampling(first, assumed, sampled, recorder), replace(steps.of("sampled"), recorder=recorder)
-            if (np.abs(missed(wider)) > BENT).any():
+            if not (np.abs(missed(wider)) <= BENT).all():  # or it is not known
                 gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
                 say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
                 found, places = AtMode(wider.posterior, gaussian), (wider.own, wider.new)

@@ -21,14 +21,13 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.phases import phase
 from forward.settings import Settings
 from inverse.criticism.assessment import Kind, When, solves_of
-from inverse.criticism.assumptions import Assumptions, Moves, moved_by
+from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.comparison import Candidate, Compared, comparison
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST, nested
-from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
 from inverse.methods.mesh_correction import MeshTreatment
@@ -215,6 +214,7 @@ class Select(MeshTreatment, Settings):
         found: dict[tuple[str, str], Inferred] = {}
         starts: dict[tuple[str, str], Starts] = {}
         truths = {pair: truth(*pair) for pair in pairs}
+        takes = {pair: None if assumed is None else assumed(*pair) for pair in pairs}
         for name, group in pairs:
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
             starts[name, group] = by_tangents(one.inputs, one.evaluate)
@@ -232,6 +232,7 @@ class Select(MeshTreatment, Settings):
                     chains=self.chains,
                     when=self.chains_when,
                     model=None if model is None else model(name, group),
+                    assumed=takes[name, group],
                     say=lambda line, name=name: say(f"{name}: {line}"),  # type: ignore[misc]
                     steps=steps(name, group).of(STATED),
                 )
@@ -292,7 +293,7 @@ class Select(MeshTreatment, Settings):
                 data_groups[group],
                 one.assessment,
                 one.mesh,
-                None if assumed is None else _taken(one.posterior, one.assessment.gaussian, assumed(name, group)),
+                (taken, one.moves) if (taken := takes[name, group]) and one.moves else None,
             )
             for (name, group), one in found.items()
         }
@@ -300,7 +301,7 @@ class Select(MeshTreatment, Settings):
         result = result.assign(_learnt(posteriors, truths, data_groups))
         if any(one.noise.shared is None for one in posteriors.values()):
             return result
-        seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
+        seen = [_motions(found[pair]) for pair in pairs]
         return result.assign(motion_eigenvalue=(("model", "motion"), np.array(seen)))
 
 
@@ -337,18 +338,12 @@ def _learnt(
     }
 
 
-def _taken(posterior: Posterior, gaussian: Laplace, assumed: Assumptions) -> tuple[Assumptions, Moves]:
-    """What is taken for granted, and how far it moves a posterior."""
-    at = posterior.at(gaussian.mode[None], derivatives=True)
-    return assumed, moved_by(posterior, gaussian, at, assumed)
-
-
-def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
+def _motions(one: Inferred) -> FloatArray:
     """What the data say about rigid motions that are uncertain, at the mode, as `determined`."""
     from inverse.criticism.predictive import spectrum_of
 
-    at = posterior.at(gaussian.mode[None], derivatives=True)
-    return determined(spectrum_of(posterior, at), posterior.noise, np.ones(posterior.data.size))
+    posterior = one.posterior
+    return determined(spectrum_of(posterior, one.found.at), posterior.noise, np.ones(posterior.data.size))
 
 
 def _only(posterior: Posterior, data: Measurements, tests: Collection[str]) -> Posterior:

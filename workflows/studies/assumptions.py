@@ -196,17 +196,10 @@ class TakenForGranted:
 
     def _by(self, model: ForwardModel, groups: Sequence[str], names: tuple[str, ...]) -> ForwardModel:
         """Return a model with all of these numbers, of parameters of some names: the unknown, and groups."""
-        from scipy.sparse import csr_matrix
+        from forward.combine import along_columns
 
-        from forward.affine import Sparse
-        from forward.combine import Mapped
-
-        d, columns = len(self.unknown), list(self.groups)
-        by = np.zeros((d + len(self.numbers), len(names)))
-        by[range(d), [names.index(name) for name in self.unknown]] = 1.0
-        for name in groups:
-            by[d:, names.index(name)] = self.loadings[:, columns.index(name)]
-        return Mapped(model, Sparse(csr_matrix(by), np.append(np.zeros(d), self.values)), names)
+        columns = {name: self.loadings[:, k] for k, name in enumerate(self.groups) if name in groups}
+        return along_columns(model, names, columns, self.values)
 
     @property
     def sampled(self) -> tuple[str, ...]:

@@ -7,10 +7,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
-from forward.affine import Sparse
-from forward.combine import Mapped
+from forward.combine import along_columns
 from forward.enlargements import enlarged, enlargements, fitted
 from forward.fem.layout import vertex_matrices
 from forward.model import FloatArray
@@ -31,10 +29,8 @@ def asking(spec: Any, names: tuple[str, ...], comm: Any) -> Callable[[Measuremen
         own = observing(model, data)
 
         def having(wanted: Sequence[str], patterns: FloatArray) -> SerialEvaluate:
-            by = np.zeros((len(own.parameters), len(wanted)))
-            by[range(len(names)), [wanted.index(name) for name in names]] = 1.0
-            by[len(names) :, [i for i, name in enumerate(wanted) if name not in names]] = patterns.T
-            return SerialEvaluate(Mapped(own, Sparse(csr_matrix(by), np.zeros(len(by))), tuple(wanted)))
+            columns = dict(zip((name for name in wanted if name not in names), patterns, strict=True))
+            return SerialEvaluate(along_columns(own, wanted, columns, np.zeros(len(paths))))
 
         return Questions(own, forms, having, partial(fitted, spec, places=places))
 
