@@ -11,20 +11,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import named, number, size
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    LEGEND,
-    PLAIN,
-    axes,
-    figure_of,
-    finished,
-    grid,
-    span,
-    text_of,
-)
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, grid, span, text_of
 from workflows.report.plots.posterior import density as density_of
 from workflows.report.plots.posterior import holding, pairs
 
@@ -200,7 +187,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
     names = [str(one.parameter.values[i]) for i in chosen]
-    found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, LEGEND)
+    found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, legend=1)
     for close, whole, name in zip(found[::2], found[1::2], names, strict=True):
         of = one.sel(parameter=name)
         draws = of["draw"].to_numpy()
@@ -222,8 +209,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
         _beside(whole, values, density, x, posterior)
         _finish(whole, label, np.array(whole.get_xlim()))
     found[1].set_title("the whole prior", fontsize="small")
-    _legend(found)
-    return found[0]
+    return finished(found[0], below=4 if len(names) > 1 else 2)
 
 
 def _beside(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
@@ -288,20 +274,13 @@ def _finish(ax: Axes, label: str, x: FloatArray) -> None:
     ax.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _legend(found: list[Axes]) -> None:
-    handles, labels = found[0].get_legend_handles_labels()
-    figure = figure_of(found[0])
-    columns = 4 if figure.get_figwidth() > 5 else 2
-    figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize="small", frameon=False)
-
-
 def node_marginals(one: xr.Dataset) -> Axes:
     """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, the least certain."""
     mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
     before = one["stiffness_prior_std"].to_numpy()
     centre = float(one["prior_mean"][0])
     nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
-    found = grid(len(nodes), len(nodes), (2.2, 2.2), AROUND_DENSITY, LEGEND)
+    found = grid(len(nodes), len(nodes), (2.2, 2.2), AROUND_DENSITY, legend=1)
     for ax, node in zip(found, nodes, strict=True):
         x = np.linspace(*_span(np.zeros(0), mean[node], std[node], float(one["stiffness_true"][node])), 300)
         ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)
@@ -311,8 +290,7 @@ def node_marginals(one: xr.Dataset) -> Axes:
         place = ", ".join(f"{x + 0.0:.3g}" for x in one["node_position"].to_numpy()[node].round(9))
         _finish(ax, f"ln stiffness at\n({place}) m", x)
         ax.xaxis.label.set_fontsize("x-small")
-    _legend(found)
-    return found[0]
+    return finished(found[0], below=4 if len(nodes) > 2 else 2)
 
 
 def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:

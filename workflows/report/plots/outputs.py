@@ -16,7 +16,6 @@ from workflows.report.plots.figure import (
     CONTROLLED,
     DARK,
     HIGH,
-    LOW,
     PLAIN,
     axes,
     banded,
@@ -233,7 +232,7 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     order = np.argsort(-np.abs(effects))[:BARS]
     ax = ax or axes(height=1.3 + 0.42 * len(order))
     places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
-    for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
+    for sign, colour, label in ((-1, CONTROLLED, "one standard deviation below its mean"), (1, HIGH, "above")):
         ax.barh(places, sign * effects[order], height=0.6, color=colour, label=label)
     ax.axvline(0, color=DARK, linewidth=0.8)
     ax.locator_params(axis="x", nbins=6)

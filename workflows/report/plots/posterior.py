@@ -227,6 +227,4 @@ def specimens(of: xr.Dataset, name: str, unit: str, ax: Axes | None = None) -> A
         wide = upper - lower
         ax.set_xlim(max(left, min(lower, float(ends[1].min())) - 0.3 * wide), right)
         ax.locator_params(axis="x", nbins=5)
-    ax.set_xlabel(named(text_of(name), unit))
-    ax.figure.legend(loc="outside lower center", ncols=2, fontsize="small", frameon=False)
-    return ax
+    return finished(ax, named(text_of(name), unit), below=2)
