@@ -25,7 +25,7 @@ from forward.reduced.data import ReducedData, load
 from workflows.http import Listening, foreign
 from workflows.live.mail import Mail
 from workflows.live.token import same
-from workflows.report.scene.skin import flat, outer
+from workflows.results.surfaces import flat, outer
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import NONE, and_error, margin, quantity, size
+from forward.readable import NONE, and_error, margin, named, quantity, scale, size, spoken
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from uq.estimators.estimate import PARTS, holds, part, single
@@ -141,6 +141,12 @@ class Results:
     def parameter_unit(self, path: str, label: str = "/") -> str:
         """SI unit of a number of the model of some evaluations, by its path; "1" for other names."""
         return str(self.study.units_of(label).get(path, "1"))
+
+    def columns(self, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
+        """Return by parameter what one of the unit of its column is in the SI unit, and its head, for usual values."""
+        each = {str(path): float(usual.sel(parameter=path)) for path in usual["parameter"].values}
+        found = {path: scale(value, self.parameter_unit(path)) for path, value in each.items()}
+        return {path: (one, named(spoken(path), unit)) for path, (one, unit) in found.items()}
 
 
 def written(of: Mapping[Any, Any], name: str, unit: str = "1") -> str:

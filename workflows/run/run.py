@@ -24,16 +24,7 @@ from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
-from workflows.results.directory import (
-    above_rounding,
-    blank_where_still,
-    digest,
-    read_dataset,
-    read_summary,
-    with_norms,
-    write_dataset,
-    write_fields,
-)
+from workflows.results.directory import completed, digest, read_dataset, read_summary, write_dataset, write_fields
 from workflows.run import own_code
 from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
@@ -143,7 +134,7 @@ def _run(
             return DONE
         progress.close()
         evaluations = job.evaluations
-        dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+        dataset = completed(job.labelled(dataset))
         add(dataset, *study.findings)
         dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
         add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))

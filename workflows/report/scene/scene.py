@@ -16,10 +16,9 @@ from forward.model import FloatArray
 from forward.readable import spoken
 from uq.estimators.estimate import estimate_of, holds
 from workflows.report.scene.pack import Packer
-from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
 from workflows.results.points import measured_points
-from workflows.results.surfaces import IntArray, level, surface, tetrahedra, tools_of
+from workflows.results.surfaces import IntArray, Skin, level, skin, split, surface, tetrahedra, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
