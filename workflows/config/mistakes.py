@@ -143,11 +143,7 @@ def _kinds() -> set[str]:
     """Return what pydantic includes in the locations of errors: kinds, and a field whose keys are in its own block."""
     from forward.bodies import geometry, inclusions
 
-    unions = [geometry.Body, inclusions.Inclusion, Distribution]
     scans = sys.modules.get("inverse.data.registration")  # others do not import inversion
-    members = [
-        member
-        for union in [*unions, *([scans.Registration] if scans else [])]
-        for member in get_args(get_args(union)[0])
-    ]
+    unions = [geometry.Body, inclusions.Inclusion, Distribution, *([scans.Registration] if scans else [])]
+    members = [member for union in unions for member in get_args(get_args(union)[0])]
     return {member.model_fields["kind"].default for member in members} | {"sampling"}

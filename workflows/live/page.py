@@ -45,16 +45,12 @@ class Scene:
         before = data.before
         self._lifts = data.fields[: len(data.lifts), rows]
         self._modes = np.ascontiguousarray(data.fields[before : before + modes, rows])
+        ranges = (numbers.tolist() for numbers in (data.lower, data.upper, data.nominal))
         self.told = {
             "places": data.places[self._nodes].ravel().tolist(),
             "triangles": local.ravel().tolist(),
             "outputs": [[output.name, output.unit] for output in data.outputs],
-            "parameters": [
-                [path, low, high, value]
-                for path, low, high, value in zip(
-                    data.parameters, data.lower.tolist(), data.upper.tolist(), data.nominal.tolist(), strict=True
-                )
-            ],
+            "parameters": list(zip(data.parameters, *ranges, strict=True)),
         }
         self.parameters = frozenset(data.parameters)
         self._latest: tuple[FloatArray, ...] = ()

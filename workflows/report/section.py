@@ -106,9 +106,7 @@ class Results:
 
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
-        of_output, unit = self.of(output), self.unit(output)
-        one = single(of_output, name)
-        value, error = one.value, one.error
+        (value, error, *_), unit = single(self.of(output), name), self.unit(output)
         if np.isnan(value) or output not in self.meshes_unknown or name.endswith("corrected"):
             return NONE if np.isnan(value) else and_error(value, error, unit)
         if self.meshes_unknown[output]:

@@ -138,10 +138,14 @@ class Expansion {
     const interval = values.length ? [at(0.025), at(0.975)] : [mean - 1.96 * error, mean + 1.96 * error];
     return { name, unit, mean, std: Math.sqrt(variance), error, values, interval, shares };
   }
+  amplitudes() {  // of the modes, for each group of terms
+    const factors = this.field.factors, r = factors[0].length, psi = this.psi();
+    const left = this.groups.map(() => new Float64Array(r));
+    this.groupOf.forEach((g, k) => { for (let j = 0; j < r; j++) left[g][j] += psi[k] * factors[k][j]; });
+    return left;
+  }
   displacements(out) {
-    const factors = this.field.factors, r = factors[0].length, a = new Float64Array(r), psi = this.psi();
-    this.groupOf.forEach((g, k) => { if (g === this.first) for (let j = 0; j < r; j++) a[j] += psi[k] * factors[k][j]; });
-    return this.combined(a, out);
+    return this.combined(this.amplitudes()[this.first] || new Float64Array(this.field.factors[0].length), out);
   }
   combined(a, out) {
     const r = a.length, modes = this.modes, n = modes.length / r;
@@ -156,11 +160,8 @@ class Expansion {
     return out;
   }
   deviations(nodes) {  // length of the standard deviations of the three components, at each node
-    const factors = this.field.factors, r = factors[0].length, psi = this.psi();
-    const left = this.groups.map(() => new Float64Array(r));
-    this.groupOf.forEach((g, k) => { for (let j = 0; j < r; j++) left[g][j] += psi[k] * factors[k][j]; });
     const sum = new Float32Array(nodes), one = new Float32Array(3 * nodes);
-    left.forEach((a, g) => {
+    this.amplitudes().forEach((a, g) => {
       if (g === this.first) return;
       this.combined(a, one);
       for (let v = 0; v < nodes; v++) sum[v] += one[3 * v] ** 2 + one[3 * v + 1] ** 2 + one[3 * v + 2] ** 2;

@@ -168,11 +168,7 @@ METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6
 
 
 def errors(
-    dataset: xr.Dataset,
-    output: str,
-    estimated: Estimated = "mean",
-    against: Cost = "solves",
-    ax: Axes | None = None,
+    dataset: xr.Dataset, output: str, estimated: Estimated = "mean", against: Cost = "solves", ax: Axes | None = None
 ) -> Axes:
     """Draw the root mean square error of each method of a comparison against its cost, both logarithmic.
 

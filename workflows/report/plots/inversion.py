@@ -319,7 +319,7 @@ def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     edges = np.linspace(-5, 5, 41)
     ax.hist(np.clip(z, -5, 5), bins=edges.tolist(), density=True, color=CONTROLLED, alpha=0.45)
     x = np.linspace(-5, 5, 200)
-    ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=DARK)
+    ax.plot(x, _bell(x, 0.0, 1.0), color=DARK)
     for end in (-2, 2):
         ax.axvline(end, color=PLAIN, linestyle="--", linewidth=1)
     within = f"{100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2"

@@ -6,7 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -99,7 +99,7 @@ class Scene:
     motion_name: str = ""
     cut: str = ""
 
-    @property
+    @cached_property
     def skin(self) -> Skin:
         """Its surface."""
         return skin(self.points, self.cells, self.kind)
