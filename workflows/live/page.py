@@ -53,17 +53,13 @@ class Scene:
             "parameters": list(zip(data.parameters, *ranges, strict=True)),
         }
         self.parameters = frozenset(data.parameters)
-        self._latest: tuple[FloatArray, ...] = ()
-
-    def take(self, latest: tuple[FloatArray, ...]) -> None:
-        """Keep the newest frame: parameters, modes, outputs, errors, spread."""
-        self._latest = latest
+        self.latest: tuple[FloatArray, ...] = ()  # parameters, modes, outputs, errors, spread
 
     def image(self) -> bytes:
         """Return the newest frame: numbers of the outputs (three each), then displacements of the surface, float32."""
-        if not self._latest:
+        if not self.latest:
             return b""
-        parameters, modes, *rest = self._latest
+        parameters, modes, *rest = self.latest
         moved = np.array([value if n < 0 else parameters[n] for n, value in self._data.lifts])
         u = modes @ self._modes + (moved @ self._lifts if len(moved) else 0.0)
         return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
@@ -179,6 +175,6 @@ def show(path: str, listening: socket.socket, mail: Mail, token: str | None = No
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:
-            scene.take(mail.receive())
+            scene.latest = mail.receive()
     except (EOFError, OSError, KeyboardInterrupt):
         found.shutdown()

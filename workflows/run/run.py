@@ -172,17 +172,16 @@ def exit_code(summary: Mapping[str, Any]) -> int:
 
 def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
     """Return rank 0's result, or raise its exception, on all ranks."""
-    refusal: Exception | None = None
-    found = None
+    found: int | Exception | None = None
     if world.rank == 0:
         try:
             found = prepare()
         except (StudyError, StopError) as error:
-            refusal = error
-    refusal, found = world.bcast((refusal, found))
-    if refusal is not None:
-        raise refusal
-    return found  # type: ignore[no-any-return]
+            found = error
+    found = world.bcast(found)
+    if isinstance(found, Exception):
+        raise found
+    return found
 
 
 def _leave(

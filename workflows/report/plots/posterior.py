@@ -18,7 +18,6 @@ from workflows.report.plots.figure import (
     ON_PALE,
     PLAIN,
     axes,
-    figure_of,
     finished,
     rows,
     span,
@@ -51,13 +50,12 @@ def pairs(
     They are `worth` so many independent draws, if the weights do not tell it. Modes and truths, if known (NaN
     otherwise), are in the order of the columns.
     """
+    from matplotlib.figure import Figure
+
     names, n = list(columns), len(columns)
-    first = axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
-    figure = figure_of(first)
-    first.remove()
     # Places by hand: a layout that looks at every label takes longer than all densities.
-    figure.set_layout_engine(None)
-    wide, high = figure.get_size_inches()
+    wide, high = 1.4 + 1.45 * n, 1.0 + 1.25 * n
+    figure = Figure(figsize=(wide, high))
     figure.subplots_adjust(0.75 / wide, 0.55 / high, 1 - 0.1 / wide, 1 - 0.1 / high, 0.12, 0.12)
     places = figure.add_gridspec(n, n)
     tops: list[Axes] = []  # of the columns, which share their axis
