@@ -12,19 +12,8 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.readable import number
 from uq.estimators.estimate import estimate_of
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    PLAIN,
-    axes,
-    finished,
-    quantity,
-    rows,
-    text_of,
-)
-from workflows.report.plots.outputs import WORDS, Estimated
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, rows, text_of
+from workflows.report.plots.outputs import WORDS, Estimated, quantity
 
 if TYPE_CHECKING:
     import xarray as xr

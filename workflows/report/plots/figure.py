@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import SIZES, is_path, named, power_of_ten, scale, spoken
+from forward.readable import SIZES, is_path, power_of_ten, scale, spoken
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -27,7 +26,7 @@ FOLLOWS = """<style>svg { --ink: #000; --paper: #fff; fill: var(--ink); }
 ON_PALE, ON_DEEP = "#010101", "#fefefe"  # what is written on a colour stays as it is
 MANY_POINTS = 3000
 LEGEND = 0.35  # inches that a row of a legend below all panels takes
-COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
+COLOURS = (CONTROLLED, HIGH, "#2f8f4e", "#8e5bb5", PLAIN, "#b5962d", DARK, "#c2477f")  # of models
 
 
 def png(ax: Axes) -> bytes:
@@ -228,54 +227,6 @@ def stacked(ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], col
         left = left + widths
 
 
-def banded(
-    ax: Axes,
-    x: Any,
-    middle: FloatArray,
-    reach: FloatArray,
-    colour: str,
-    label: str | None,
-    faint: float = 0.22,
-    **line: Any,
-) -> None:
-    """Draw a line with a band around it that reaches as far to both sides."""
-    ax.fill_between(x, middle - reach, middle + reach, color=colour, alpha=faint, linewidth=0)
-    ax.plot(x, middle, color=colour, label=label, **line)
-
-
-def quantity(dataset: xr.Dataset, output: str) -> str:
-    """Name and unit of an output."""
-    return named(text_of(output), str(dataset["unit"].sel(output=output).item()))
-
-
 def text_of(name: str) -> str:
     """Keep matplotlib from reading a name as a formula; numbers of a model are named by the ends of their paths."""
     return (spoken(name) if is_path(name) else name).replace("$", r"\$")
-
-
-def count_axis(ax: Axes, first: int, n: int) -> None:
-    """Make the x axis one of numbers of samples, logarithmic."""
-    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
-
-    ax.set_xscale("log")
-    ax.set_xlim(first, max(n, first + 1))
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.set_xlabel("samples")
-
-
-def span(values: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
-
-    A point far out with almost no weight, as with a wide prior, does not move an end.
-    """
-    order = np.argsort(values)
-    reached = np.cumsum(weights[order]) / weights.sum()
-    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
-    low, high = float(values[order[first]]), float(values[order[last]])
-    mean = weights @ values / weights.sum()
-    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
-    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
-    margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
-    return low - margin, high + margin

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import named, number, size
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, grid, span, text_of
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, grid, text_of
 from workflows.report.plots.posterior import density as density_of
-from workflows.report.plots.posterior import holding, pairs
+from workflows.report.plots.posterior import holding, pairs, span
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -9,20 +9,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.readable import named, number
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    ON_DEEP,
-    ON_PALE,
-    PLAIN,
-    axes,
-    finished,
-    rows,
-    span,
-    text_of,
-)
+from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, ON_DEEP, ON_PALE, PLAIN, axes, finished, rows, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -136,6 +123,22 @@ def _contours(ax: Axes, draws: FloatArray, shares: FloatArray, worth: float | No
     ax.plot(*draws[np.unique(at)].T, ".", color=colour, markersize=2, alpha=0.5)
 
 
+def span(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
+
+    A point far out with almost no weight, as with a wide prior, does not move an end.
+    """
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order]) / weights.sum()
+    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
+    low, high = float(values[order[first]]), float(values[order[last]])
+    mean = weights @ values / weights.sum()
+    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
+    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
+    margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
+    return low - margin, high + margin
+
+
 def holding(low: float, high: float, truth: float, far: float, margin: float) -> tuple[float, float]:
     """Move the ends of an axis so that they hold the truth with a margin, unless it is far away, in its lengths."""
     wide = high - low
@@ -190,7 +193,7 @@ def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     size = frame[2] - frame[0]
     known = size > 0
     places = rows(ax, outputs)
-    drawn = ((before, COLOURS[1], 0.7, "before the data"), (after, COLOURS[0], 0.35, "after"))
+    drawn = ((before, HIGH, 0.7, "before the data"), (after, CONTROLLED, 0.35, "after"))
     for values, colour, height, label in drawn:
         lower, middle, upper = (values[:, known] - frame[0, known]) / size[known]
         ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
