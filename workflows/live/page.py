@@ -69,11 +69,7 @@ class _Server(Listening):
     """Serves a scene at a socket to those who have the token; `move` is called with what sliders say."""
 
     def __init__(
-        self,
-        scene: Scene,
-        listening: socket.socket,
-        move: Callable[[dict[str, float]], object],
-        token: str | None = None,
+        self, scene: Scene, listening: socket.socket, move: Callable[[dict[str, float]], object], token: str | None
     ) -> None:
         super().__init__(listening, _Handler)
         self.scene, self.move, self.token = scene, move, token

@@ -34,23 +34,19 @@ _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across the body, and the points on it at which fields are drawn.
+    """A plane across y, and the points on it at which fields are drawn.
 
     Attributes
     ----------
-    axis, level
-        The plane: a coordinate, and its value (m).
-    along
-        The other two axes.
+    level
+        Where it is (m).
     lines
-        Coordinates (m) of the points along each of these.
+        Coordinates x and z (m) of the points.
     vertices, weights
         Numbers (n, 4) of the nodes around each point, and weights; NaN outside the body.
     """
 
-    axis: int
     level: float
-    along: tuple[int, int]
     lines: tuple[FloatArray, FloatArray]
     vertices: NDArray[np.int64]
     weights: FloatArray
@@ -74,12 +70,12 @@ class Cut:
         inner = np.einsum("nij,nj->ni", map_[:, :3], points - map_[:, 3])
         shares = np.column_stack([inner, 1 - inner.sum(axis=1)])
         shares[found < 0] = np.nan
-        return cls(1, level, (0, 2), (first, second), mesh.simplices[found], shares)
+        return cls(level, (first, second), mesh.simplices[found], shares)
 
     @property
     def words(self) -> str:
         """The plane in words."""
-        return f"the plane {'xyz'[self.axis]} = {size(self.level, 'm', 3)}"
+        return f"the plane y = {size(self.level, 'm', 3)}"
 
     def values(self, field: FloatArray) -> FloatArray:
         """Return a field (N,) at the points of the plane."""
@@ -151,7 +147,7 @@ def _panels(cut: Cut, drawn: Mapping[str, Panel], columns: int = 2, size: tuple[
         shown = ax.imshow(at, colours, clim=ends, origin="lower", extent=extent, interpolation="none")
         ax.set(xlim=cut.lines[0][[0, -1]], ylim=cut.lines[1][[0, -1]])
         ax.set_title(title, fontsize="medium")
-        finished(ax, *(f"{'xyz'[axis]} (m)" for axis in cut.along)).locator_params(nbins=3)
+        finished(ax, "x (m)", "z (m)").locator_params(nbins=3)
         bar = ax.figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.9, pad=0.22, fraction=0.2, aspect=15)
         bar.ax.locator_params(axis="x", nbins=4)
     return found[0]
