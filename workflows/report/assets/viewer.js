@@ -393,7 +393,6 @@ class Viewer {
     this.cut = { axis: told.cut, place: 0.5 };
     this.surfaceProgram = this.program(...SURFACE); this.lineProgram = this.program(...LINE);
     this.texture = gl.createTexture(); this.lineBuffer = gl.createBuffer();
-    this.own = new Map();
     this.home(); this.choose(0); this.controls(); this.gestures();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }

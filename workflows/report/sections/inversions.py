@@ -249,7 +249,7 @@ def design_card(results: Results) -> Card:
     return Card("Which observations tell most of what is not known?", answers)
 
 
-@section("clean")
+@section("clean", heading="The data")
 def synthetic_data(results: Results) -> Iterator[Block]:
     """How many data were made, how large they are, and their errors."""
     of = results.dataset
@@ -264,7 +264,6 @@ def synthetic_data(results: Results) -> Iterator[Block]:
             if made.any():
                 largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
                 rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
-    yield Heading("The data")
     yield Table(("of", "data", "largest", "largest standard error"), rows)
 
 

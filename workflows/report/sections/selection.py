@@ -27,11 +27,10 @@ if TYPE_CHECKING:
     from workflows.studies.selection import Selection
 
 
-@section("probability")
+@section("probability", heading="Evidences and probabilities")
 def evidences(results: Results) -> Iterator[Block]:
     """Evidence and probability of each model, and how each was found."""
     dataset = results.dataset
-    yield Heading("Evidences and probabilities")
     yield Text(
         "± is one standard error. Laplace's formula is shown beside the corrected evidence; the words for Bayes "
         "factors are those of Kass and Raftery. Probabilities say which candidate is true, if one is; the weights "
