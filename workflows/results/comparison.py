@@ -10,8 +10,6 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.readable import number, percent, power_of_ten, with_error
-from inverse.criticism import doubts as criticism
-from inverse.criticism.weights import resampled
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -177,6 +175,9 @@ def doubts_of_selection(
     Candidates and SI units of their constants are by their names; `noise` is the prior of the factor on the errors, if
     it was inferred.
     """
+    from inverse.criticism import doubts as criticism
+    from inverse.criticism.weights import resampled
+
     best = by_probability(dataset, dataset["log_evidence"])[0]
     inputs = candidates[best]
     names = list(inputs.names)
@@ -211,14 +212,18 @@ def doubts_of_selection(
 
 def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
+    from inverse.criticism.doubts import of_mesh
+
     of = dataset.sel(model=model, group=group)
     here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
     of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
-    return criticism.of_mesh(of, of["mesh_error"].to_numpy()[here], settled=True, from_file=of_file)
+    return of_mesh(of, of["mesh_error"].to_numpy()[here], settled=True, from_file=of_file)
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
+    from inverse.criticism import doubts as criticism
+
     if "mesh_checked" not in dataset:
         return []
     weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
@@ -258,33 +263,39 @@ def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Da
 
 def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
     """Say what the errors of candidates are that were learnt."""
+    from inverse.criticism.doubts import learnt as learnt_errors
+
     for name in dataset["model"].values if "model_error" in dataset else ():
         one = dataset.sel(model=name)
         mean, std = (one[of].dropna("output").to_numpy() for of in ("model_error", "model_error_std"))
         if mean.size:
-            yield criticism.learnt(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
+            yield learnt_errors(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
+    from inverse.criticism.doubts import certain, decides
+
     if "mesh_checked" not in dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
-    mended = dataset["mesh_corrected"] & ~criticism.decides(shift, dataset["mesh_left"].max("parameter"))
+    mended = dataset["mesh_corrected"] & ~decides(shift, dataset["mesh_left"].max("parameter"))
     mended &= ~_too_coarse_for_files(dataset)
-    known = mended | (~dataset["mesh_corrected"] & criticism.certain(dataset["mesh_log_evidence"], shift))
+    known = mended | (~dataset["mesh_corrected"] & certain(dataset["mesh_log_evidence"], shift))
     return dataset.assign(trusted=dataset["trusted"] & known)
 
 
 def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
+    from inverse.criticism.doubts import beyond_files
+
     corrected = dataset["mesh_corrected"]
     if "mesh_of_file" not in dataset:
         return corrected & False
     squares = (dataset["mesh_error"] ** 2).where(np.isfinite(dataset["measured"]))
     of_group = dataset["output_group"] == dataset["group"]
     size = np.sqrt(squares.where(of_group).mean("output"))
-    found: xr.DataArray = corrected & dataset["mesh_of_file"] & criticism.beyond_files(size)
+    found: xr.DataArray = corrected & dataset["mesh_of_file"] & beyond_files(size)
     return found.transpose(*corrected.dims)
 
 
@@ -311,6 +322,8 @@ def arviz_groups(
     `factor` is the prior of the factor on the errors, if it was inferred, and `seed` that of draws before the data.
     """
     import xarray as xr
+
+    from inverse.criticism.weights import resampled
 
     drawn, dense, before = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     measured = np.isfinite(found["measured"].to_numpy())

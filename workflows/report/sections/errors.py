@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import NONE, and_error, duration, margin, number, size, spoken
-from inverse.criticism.doubts import change_in_words
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.findings import NOT_KNOWN, only_rounding
 from workflows.report import plots
@@ -207,6 +206,8 @@ def meshes(results: Results) -> Iterator[Block]:
 @section("probability", "mesh_checked", heading="Effect of a finer mesh", level=3)
 def finer_meshes(results: Results) -> Iterator[Block]:
     """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
+    from inverse.criticism.doubts import change_in_words
+
     dataset = results.dataset
     yield Text(
         "Solves of each candidate at its mode on finer meshes, with thinner cells at the faces that are held: the "
