@@ -52,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (FileNotFoundError, PermissionError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         return _end(f"failed: {error if error.filename is None else f'{error.filename}: {error.strerror}'}", FAILED)
     except BaseException as error:
-        world = _world()
-        if world is not None:
+        mpi = sys.modules.get("mpi4py.MPI")
+        if mpi is not None and mpi.COMM_WORLD.size > 1:
             from uq.evaluation.work_queue import end_job
 
-            end_job(world, error)
+            end_job(mpi.COMM_WORLD, error)
         reason = reason_to_stop(error)
         if reason is None:
             traceback.print_exc()
@@ -82,12 +82,6 @@ def _say(text: str) -> None:
 def _first() -> bool:
     """Whether this is the first rank of the job."""
     return next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0"
-
-
-def _world() -> Any:
-    """Return all ranks of the job, or None if this process is the only one."""
-    mpi = sys.modules.get("mpi4py.MPI")
-    return None if mpi is None or mpi.COMM_WORLD.size == 1 else mpi.COMM_WORLD
 
 
 class _Version(argparse.Action):

@@ -253,11 +253,6 @@ def _is_local(host: str, called: str) -> bool:
     """Whether the name in a header, with or without a port, is a local name of this machine."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return False
-    if name in {"localhost", called}:
-        return True
-    try:
-        return ipaddress.ip_address(name).is_loopback
+        return name in {"localhost", called} or ipaddress.ip_address(name).is_loopback
     except ValueError:
         return False

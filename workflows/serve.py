@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
 from threading import Thread
@@ -175,11 +176,9 @@ class _Solver:
         self._guess: Callable[[FloatArray], Guess] | None = None
         self._last: tuple[bytes, Solution] | None = None
         if displacements(self.model):
-            try:
+            with suppress(SolveError):  # or else every solve starts from zero
                 prediction = linearise(inputs, SerialEvaluate(self.model)).prediction
-            except SolveError:
-                prediction = None  # every solve starts from zero
-            self._guess = None if prediction is None else prediction.on(self.model)
+                self._guess = None if prediction is None else prediction.on(self.model)
 
     def at(self, point: FloatArray) -> Solution:
         """Solve, unless that is where the last solution was."""

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -141,15 +141,9 @@ _WORD = 60  # letters of a key in a message
 
 def _kinds() -> set[str]:
     """Return what pydantic includes in the locations of errors: kinds, and a field whose keys are in its own block."""
-    from typing import get_args
-
     from forward.bodies import geometry, inclusions
 
-    unions = [geometry.Body, inclusions.Inclusion, Distribution]
     scans = sys.modules.get("inverse.data.registration")  # others do not import inversion
-    members = [
-        member
-        for union in [*unions, *([scans.Registration] if scans else [])]
-        for member in get_args(get_args(union)[0])
-    ]
+    unions = [geometry.Body, inclusions.Inclusion, Distribution, *([scans.Registration] if scans else [])]
+    members = [member for union in unions for member in get_args(get_args(union)[0])]
     return {member.model_fields["kind"].default for member in members} | {"sampling"}

@@ -259,10 +259,10 @@ def _override(blocks: dict[str, Any], assignment: str) -> None:
         if isinstance(here, list):
             here = _named(here, step, key)
             continue
-        if not isinstance(here.get(step, {}), dict | list):
+        inner = here.get(step, {})
+        if not isinstance(inner, dict | list):
             raise StudyError(f"--set {key}: '{step}' is a value, not a block")
-        copied = here.get(step, {})
-        here[step] = copied.copy()
+        here[step] = inner.copy()
         here = here[step]
     if isinstance(here, list):
         raise StudyError(f"--set {key}: expected the name of an element and one of its keys")

@@ -162,9 +162,8 @@ class DataFile(Settings):
                 continue
             word = row[self.mode]
             mode = self.modes.get(word, word)
-            sheared = mode == "simple-shear"
             place = f"{path}, line {line}"
-            at = _stretch(row[self.at], place, self.at, positive=not sheared)
+            at = _stretch(row[self.at], place, self.at, positive=mode != "simple-shear")
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
@@ -172,8 +171,7 @@ class DataFile(Settings):
             across = None
             if self.across is not None and mode == "biaxial":
                 across = _stretch(row[self.across], place, self.across, positive=True)
-            held = mode in HELD
-            for component, (measured, sigma) in self._in_row(row, place, held=held).items():
+            for component, (measured, sigma) in self._in_row(row, place, held=mode in HELD).items():
                 test = tests.setdefault((row[self.group] if self.group else WHOLE, word, component), {})
                 test.setdefault("at", []).append(at)
                 if across is not None:

@@ -64,12 +64,6 @@ def displacements(
     return Synthetic(model, groups, points, files, labelled)
 
 
-def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
-    """An inclusion with changed numbers, by their paths."""
-    block: dict[str, Any] = inclusion.model_dump()
-    return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
-
-
 def points_of(model: SpecimenModel) -> NDArray[np.int64]:
     """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases.
 
@@ -96,7 +90,10 @@ def synthetic_files(
     file = io.StringIO()
     file.write(head)
     if specimen.inclusions and not specimen.fields:
-        inclusions = [_with_values(inclusion, truth) for inclusion in specimen.inclusions]
+        inclusions = [
+            {key: truth.get(f"inclusions.{one.label}.{key}", value) for key, value in one.model_dump().items()}
+            for one in specimen.inclusions
+        ]
         file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
     if specimen.fields:
         file.write(f"# truth.stiffness = truth/{label}.csv\n")
@@ -127,23 +124,22 @@ def synthetic_files(
 
 
 def _described(
-    specimen: Specimen,
-    method: Synthesize,
-    label: str,
-    data: Measurements,
-    frame: FloatArray,
-    truth: Mapping[str, float],
+    specimen: Specimen, method: Synthesize, label: str, data: Measurements, frame: FloatArray, truth: dict[str, float]
 ) -> dict[str, str]:
-    """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are, and what is true.
+    """Return the texts of a cloud, or of a pair of surfaces for each load case, and of the file in TOML that says so.
 
-    Displacements, and where (m, 3) they are in the frame of the files, are in their unit.
+    That file says what is true, too. Displacements, and where (m, 3) they are in the frame of the files, are in their
+    unit.
     """
     number, arrays = _arrays(specimen, method, data)
     on_body, places = data.places[number], frame[number]
     if method.format == "stl":
-        motions = {case.name: arrays[f"displacement_{case.name}"] for case in specimen.cases}
+        facets = facets_among(specimen.body, on_body)
+        names = {case.name: f"{label}-{case.name}.stl" for case in specimen.cases}
+        texts = {file: _stl((places + arrays[f"displacement_{case}"])[facets]) for case, file in names.items()}
         more = {"units": method.units, "sigma": method.noise.absolute, "truth": truth}
-        return surfaces(label, places, motions, facets_among(specimen.body, on_body), more)
+        said = tomli_w.dumps({"reference": f"{label}.stl", "deformed": names, **more})
+        return texts | {f"{label}.stl": _stl(places[facets]), f"{label}.toml": said}
     file = f"{label}.{method.format}"
     said = tomli_w.dumps({"file": file, "units": method.units, "truth": truth})
     return {file: _cloud(places, arrays, method.format), f"{label}.toml": said}
@@ -190,25 +186,6 @@ def facets_among(body: Body, places: FloatArray) -> NDArray[np.int64]:
     corners = (np.round(Surface.of(body).triangles, SAME) + 0.0).tolist()
     found = [[rows.get(tuple(corner), -1) for corner in triangle] for triangle in corners]
     return np.array([triangle for triangle in found if min(triangle) >= 0], dtype=np.int64).reshape(-1, 3)
-
-
-def surfaces(
-    label: str,
-    places: FloatArray,
-    motions: Mapping[str, FloatArray],
-    facets: NDArray[np.int64],
-    more: Mapping[str, Any],
-) -> dict[str, str]:
-    """Return the texts of the files of a pair of surfaces for each load case, by their names, which begin with a label.
-
-    Triangles (n, 3) are rows of the undeformed places (k, 3), which displacements (k, 3) by load case move, all in the
-    unit of the files; the description says more.
-    """
-    names = {case: f"{label}-{case}.stl" for case in motions}
-    texts = {names[case]: _stl((places + motion)[facets]) for case, motion in motions.items()}
-    texts[f"{label}.stl"] = _stl(places[facets])
-    texts[f"{label}.toml"] = tomli_w.dumps({"reference": f"{label}.stl", "deformed": names, **more})
-    return texts
 
 
 def _stl(corners: FloatArray) -> str:

@@ -25,7 +25,7 @@ from forward.reduced.data import ReducedData, load
 from workflows.http import Listening, foreign
 from workflows.live.mail import Mail
 from workflows.live.token import same
-from workflows.report.scene.skin import flat, outer
+from workflows.results.surfaces import flat, outer
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request
@@ -45,29 +45,21 @@ class Scene:
         before = data.before
         self._lifts = data.fields[: len(data.lifts), rows]
         self._modes = np.ascontiguousarray(data.fields[before : before + modes, rows])
+        ranges = (numbers.tolist() for numbers in (data.lower, data.upper, data.nominal))
         self.told = {
             "places": data.places[self._nodes].ravel().tolist(),
             "triangles": local.ravel().tolist(),
             "outputs": [[output.name, output.unit] for output in data.outputs],
-            "parameters": [
-                [path, low, high, value]
-                for path, low, high, value in zip(
-                    data.parameters, data.lower.tolist(), data.upper.tolist(), data.nominal.tolist(), strict=True
-                )
-            ],
+            "parameters": list(zip(data.parameters, *ranges, strict=True)),
         }
         self.parameters = frozenset(data.parameters)
-        self._latest: tuple[FloatArray, ...] = ()
-
-    def take(self, latest: tuple[FloatArray, ...]) -> None:
-        """Keep the newest frame: parameters, modes, outputs, errors, spread."""
-        self._latest = latest
+        self.latest: tuple[FloatArray, ...] = ()  # parameters, modes, outputs, errors, spread
 
     def image(self) -> bytes:
         """Return the newest frame: numbers of the outputs (three each), then displacements of the surface, float32."""
-        if not self._latest:
+        if not self.latest:
             return b""
-        parameters, modes, *rest = self._latest
+        parameters, modes, *rest = self.latest
         moved = np.array([value if n < 0 else parameters[n] for n, value in self._data.lifts])
         u = modes @ self._modes + (moved @ self._lifts if len(moved) else 0.0)
         return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
@@ -77,11 +69,7 @@ class _Server(Listening):
     """Serves a scene at a socket to those who have the token; `move` is called with what sliders say."""
 
     def __init__(
-        self,
-        scene: Scene,
-        listening: socket.socket,
-        move: Callable[[dict[str, float]], object],
-        token: str | None = None,
+        self, scene: Scene, listening: socket.socket, move: Callable[[dict[str, float]], object], token: str | None
     ) -> None:
         super().__init__(listening, _Handler)
         self.scene, self.move, self.token = scene, move, token
@@ -183,6 +171,6 @@ def show(path: str, listening: socket.socket, mail: Mail, token: str | None = No
     threading.Thread(target=found.serve_forever, daemon=True).start()
     try:
         while True:
-            scene.take(mail.receive())
+            scene.latest = mail.receive()
     except (EOFError, OSError, KeyboardInterrupt):
         found.shutdown()

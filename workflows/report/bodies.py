@@ -13,9 +13,8 @@ from forward.readable import scale
 from workflows.report.plots.figure import DARK
 from workflows.report.plots.places import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends, forward_scene, up_of
-from workflows.report.scene.skin import flat, outer, skin
 from workflows.results.directory import TETRAHEDRON, mesh_grid
-from workflows.results.surfaces import IntArray, crossing, tetrahedra
+from workflows.results.surfaces import IntArray, crossing, flat, outer, skin, tetrahedra
 
 if TYPE_CHECKING:
     import xarray as xr

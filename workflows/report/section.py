@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from forward.external.own_modules import make_visible, refused
-from forward.readable import NONE, and_error, margin, quantity, size
+from forward.readable import NONE, and_error, margin, named, quantity, scale, size, spoken
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from uq.estimators.estimate import PARTS, holds, part, single
@@ -106,9 +106,7 @@ class Results:
 
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
-        of_output, unit = self.of(output), self.unit(output)
-        one = single(of_output, name)
-        value, error = one.value, one.error
+        (value, error, *_), unit = single(self.of(output), name), self.unit(output)
         if np.isnan(value) or output not in self.meshes_unknown or name.endswith("corrected"):
             return NONE if np.isnan(value) else and_error(value, error, unit)
         if self.meshes_unknown[output]:
@@ -141,6 +139,12 @@ class Results:
     def parameter_unit(self, path: str, label: str = "/") -> str:
         """SI unit of a number of the model of some evaluations, by its path; "1" for other names."""
         return str(self.study.units_of(label).get(path, "1"))
+
+    def columns(self, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
+        """Return by parameter what one of the unit of its column is in the SI unit, and its head, for usual values."""
+        each = {str(path): float(usual.sel(parameter=path)) for path in usual["parameter"].values}
+        found = {path: scale(value, self.parameter_unit(path)) for path, value in each.items()}
+        return {path: (one, named(spoken(path), unit)) for path, (one, unit) in found.items()}
 
 
 def written(of: Mapping[Any, Any], name: str, unit: str = "1") -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.findings import Finding
-from forward.readable import number, percent, with_error
+from forward.readable import number, percent, power_of_ten, with_error
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,6 +31,13 @@ GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, 
 def grade(log_bayes_factor: float) -> str:
     """Return the word for ln B ≥ 0 (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995) 773–795)."""
     return next((word for limit, word in GRADES if log_bayes_factor < limit), "very strong")
+
+
+def odds(log_bayes_factor: float) -> str:
+    """Write a Bayes factor by its logarithm: 12 to 1, 10⁷ to 1."""
+    if log_bayes_factor > 13:
+        return f"{power_of_ten(int(log_bayes_factor / np.log(10)))} to 1"
+    return f"{number(float(np.exp(log_bayes_factor)), 2)} to 1"
 
 
 def ranking(values: xr.DataArray) -> list[str]:

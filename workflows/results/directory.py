@@ -210,6 +210,11 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
     return arrays
 
 
+def completed(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the results of a method with norms of fields, and without what is only rounding."""
+    return above_rounding(blank_where_still(with_norms(dataset)))
+
+
 def with_norms(dataset: xr.Dataset) -> xr.Dataset:
     """Add L² norms over the body of the derivatives of the displacement field, and their root mean squares.
 

@@ -69,12 +69,9 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
         points, first, which = np.unique(places[rows], axis=0, return_index=True, return_inverse=True)
         which = which.ravel()
         sums: dict[str, FloatArray] = {name: np.zeros((len(points), 3)) for name in ("measured", "predicted")}
-        squares, counts = np.zeros(len(points)), np.zeros(len(points))
         for name, values in sums.items():
             np.add.at(values, which, numbers[name][rows, None] * along[rows])
-        np.add.at(squares, which, numbers["residual"][rows] ** 2)
-        np.add.at(counts, which, 1.0)
-        over = np.sqrt(squares / np.maximum(counts, 1))
+        over = np.sqrt(np.bincount(which, numbers["residual"][rows] ** 2) / np.bincount(which))
         found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[rows][first]))
     return found
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,9 +34,6 @@ def summarise(dataset: xr.Dataset) -> Part:
     for needed, told in _PARTS:
         if needed <= set(dataset.variables):
             summary |= told(dataset)
-    for one in _TOLD:
-        if set(one.needs or one.variables.values()) <= set(dataset.variables):
-            summary[one.key] = one.of(dataset)
     if "accuracy" in dataset.attrs:
         summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
     return summary
@@ -184,31 +180,28 @@ def _number(value: Any) -> float | None:
     return number if np.isfinite(number) else None
 
 
-@dataclass(frozen=True)
-class _Told:
-    """Variables of results of which the summary holds every number under a key, with what is known of its errors.
+def _numbers(dataset: xr.Dataset, variables: Mapping[str, str]) -> Part:
+    """Return every number of variables of the same dimensions, by output and the other dimensions in their order.
 
-    They are of the same dimensions, by their names there; one that is `ALONE` stands without a name, and without
-    errors. Those that it `needs` must be there, otherwise all.
+    They have their names there, with what is known of their errors; one that is `ALONE` stands without a name, and
+    without errors.
     """
+    names: dict[str, str] = {}
+    there = {short: name for short, name in variables.items() if name in dataset}
+    for short, name in there.items():
+        first, parts = "" if short == "value" else short, () if short == ALONE else PARTS
+        names[short] = name
+        names |= {part(first, which): part(name, which) for which in parts if holds(dataset, name, which)}
+    dims = sorted(dataset[next(iter(there.values()))].dims, key=lambda dimension: dimension != "output")
+    number = {str(one): "{:g}" if dataset[one].dtype.kind == "f" else "{}" for one in dims}
+    labels = [(one, [*map(shown.format, dataset[one].to_numpy().tolist())]) for one, shown in number.items()]
+    values = {short: dataset[name].transpose(*dims).to_numpy() for short, name in names.items()}
+    return dict(_nested(labels, values))
 
-    key: str
-    variables: Mapping[str, str]
-    needs: Collection[str] = ()
 
-    def of(self, dataset: xr.Dataset) -> Part:
-        """Return the numbers, by output and the other dimensions in their order."""
-        names: dict[str, str] = {}
-        there = {short: name for short, name in self.variables.items() if name in dataset}
-        for short, name in there.items():
-            first, parts = "" if short == "value" else short, () if short == ALONE else PARTS
-            names[short] = name
-            names |= {part(first, which): part(name, which) for which in parts if holds(dataset, name, which)}
-        dims = sorted(dataset[next(iter(there.values()))].dims, key=lambda dimension: dimension != "output")
-        number = {str(one): "{:g}" if dataset[one].dtype.kind == "f" else "{}" for one in dims}
-        labels = [(one, [*map(shown.format, dataset[one].to_numpy().tolist())]) for one, shown in number.items()]
-        values = {short: dataset[name].transpose(*dims).to_numpy() for short, name in names.items()}
-        return dict(_nested(labels, values))
+def _told(key: str, variables: Mapping[str, str], *needs: str) -> tuple[set[str], Callable[[xr.Dataset], Part]]:
+    """Return what variables are told under a key by: what that needs, unless said otherwise all of them, and how."""
+    return set(needs or variables.values()), lambda dataset: {key: _numbers(dataset, variables)}
 
 
 _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what each needs
@@ -217,18 +210,16 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"random_equal"}, _design),
     ({"probability"}, _comparison),
     ({"row_method"}, _methods),
-)
-_TOLD = (
-    _Told("outputs", {name: name for name in MOMENTS}, ("nominal", "mean")),
-    _Told("quantiles", {"value": "quantiles"}, ("quantiles", "mean")),
-    _Told("sobol", {"first": "sobol_first", "total": "sobol_total"}),
-    _Told("sobol_groups", {"first": "sobol_group_first", "total": "sobol_group_total"}),
-    _Told("sobol_second", {"second": "sobol_second"}),
-    _Told("shapley", {"value": "shapley"}),
-    _Told("outputs", {name: name for name in ("mean", "std", "within", "between")}, ("candidate_mean",)),
-    _Told("bounds", {"total": "total_bound"}),
-    _Told("local", {ALONE: "derivative"}),
-    *(_Told(f"local_per_{one}", {ALONE: f"derivative_per_{one}"}) for one in ("std", "range")),
-    *(_Told(part("local", which), {ALONE: part("derivative", which)}) for which in OF_MESH),
-    _Told("nominal", {"value": "nominal"}, ("derivative", part("nominal", "corrected"))),
+    _told("outputs", {name: name for name in MOMENTS}, "nominal", "mean"),
+    _told("quantiles", {"value": "quantiles"}, "quantiles", "mean"),
+    _told("sobol", {"first": "sobol_first", "total": "sobol_total"}),
+    _told("sobol_groups", {"first": "sobol_group_first", "total": "sobol_group_total"}),
+    _told("sobol_second", {"second": "sobol_second"}),
+    _told("shapley", {"value": "shapley"}),
+    _told("outputs", {name: name for name in ("mean", "std", "within", "between")}, "candidate_mean"),
+    _told("bounds", {"total": "total_bound"}),
+    _told("local", {ALONE: "derivative"}),
+    *(_told(f"local_per_{one}", {ALONE: f"derivative_per_{one}"}) for one in ("std", "range")),
+    *(_told(part("local", which), {ALONE: part("derivative", which)}) for which in OF_MESH),
+    _told("nominal", {"value": "nominal"}, "derivative", part("nominal", "corrected")),
 )

@@ -18,21 +18,13 @@ from forward.external.own_modules import SESSION, Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from forward.phases import phase
+from uq.evaluation.checkpoint import Checkpoint
 from uq.findings import add
 from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
-from workflows.results.directory import (
-    above_rounding,
-    blank_where_still,
-    digest,
-    read_dataset,
-    read_summary,
-    with_norms,
-    write_dataset,
-    write_fields,
-)
+from workflows.results.directory import completed, digest, read_dataset, read_summary, write_dataset, write_fields
 from workflows.run import own_code
 from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
@@ -45,7 +37,6 @@ from workflows.studies.solves import findings_of_solves
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.request import Evaluations
     from workflows.studies.study import StudyKind
 
@@ -119,7 +110,6 @@ def _run(
                 sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
 
-    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
     shown = Progress(quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
@@ -144,7 +134,7 @@ def _run(
             return DONE
         progress.close()
         evaluations = job.evaluations
-        dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+        dataset = completed(job.labelled(dataset))
         add(dataset, *study.findings)
         dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
         add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
@@ -182,17 +172,16 @@ def exit_code(summary: Mapping[str, Any]) -> int:
 
 def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
     """Return rank 0's result, or raise its exception, on all ranks."""
-    refusal: Exception | None = None
-    found = None
+    found: int | Exception | None = None
     if world.rank == 0:
         try:
             found = prepare()
         except (StudyError, StopError) as error:
-            refusal = error
-    refusal, found = world.bcast((refusal, found))
-    if refusal is not None:
-        raise refusal
-    return found  # type: ignore[no-any-return]
+            found = error
+    found = world.bcast(found)
+    if isinstance(found, Exception):
+        raise found
+    return found
 
 
 def _leave(

@@ -26,7 +26,7 @@ from workflows.config.mistakes import StudyError
 from workflows.live.loop import FIRST
 from workflows.live.mail import pair
 from workflows.live.token import kept, same
-from workflows.report.scene.skin import flat, outer
+from workflows.results.surfaces import flat, outer
 
 pytestmark = pytest.mark.fem
 

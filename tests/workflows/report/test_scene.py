@@ -14,9 +14,8 @@ from workflows.report.bodies import refined, still
 from workflows.report.plots.figure import png_of
 from workflows.report.scene.pack import Packer
 from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, packed
-from workflows.report.scene.skin import skin, split
 from workflows.report.scene.sliders import sliders
-from workflows.results.surfaces import crossing, level, tetrahedra
+from workflows.results.surfaces import crossing, level, skin, split, tetrahedra
 
 pyvista = pytest.importorskip("pyvista")
 

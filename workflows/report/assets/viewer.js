@@ -128,20 +128,24 @@ class Expansion {
         variance += left[number] ** 2;
         key.forEach((a, i) => { if (a) totals[i] += left[number] ** 2; });
       });
-      const values = samples.map((row) => row.reduce((sum, x, g) => sum + x * left[g], 0)).sort((a, b) => a - b);
-      const at = (p) => values[Math.min(values.length - 1, Math.floor(p * values.length))];
-      const std = Math.sqrt(variance);
-      return {
-        name: output.name, unit: output.unit, mean, std, error: output.error, values,
-        interval: values.length ? [at(0.025), at(0.975)] : [mean - 1.96 * output.error, mean + 1.96 * output.error],
-        shares: totals.map((total) => (variance > 0 ? total / variance : 0)),
-      };
+      const values = samples.map((row) => row.reduce((sum, x, g) => sum + x * left[g], 0));
+      return this.said(output, mean, variance, values, totals.map((total) => (variance > 0 ? total / variance : 0)));
     });
   }
+  said({ name, unit, error }, mean, variance, values, shares) {  // of an output that has these values, if it has any
+    values.sort((a, b) => a - b);
+    const at = (p) => values[Math.min(values.length - 1, Math.floor(p * values.length))];
+    const interval = values.length ? [at(0.025), at(0.975)] : [mean - 1.96 * error, mean + 1.96 * error];
+    return { name, unit, mean, std: Math.sqrt(variance), error, values, interval, shares };
+  }
+  amplitudes() {  // of the modes, for each group of terms
+    const factors = this.field.factors, r = factors[0].length, psi = this.psi();
+    const left = this.groups.map(() => new Float64Array(r));
+    this.groupOf.forEach((g, k) => { for (let j = 0; j < r; j++) left[g][j] += psi[k] * factors[k][j]; });
+    return left;
+  }
   displacements(out) {
-    const factors = this.field.factors, r = factors[0].length, a = new Float64Array(r), psi = this.psi();
-    this.groupOf.forEach((g, k) => { if (g === this.first) for (let j = 0; j < r; j++) a[j] += psi[k] * factors[k][j]; });
-    return this.combined(a, out);
+    return this.combined(this.amplitudes()[this.first] || new Float64Array(this.field.factors[0].length), out);
   }
   combined(a, out) {
     const r = a.length, modes = this.modes, n = modes.length / r;
@@ -156,11 +160,8 @@ class Expansion {
     return out;
   }
   deviations(nodes) {  // length of the standard deviations of the three components, at each node
-    const factors = this.field.factors, r = factors[0].length, psi = this.psi();
-    const left = this.groups.map(() => new Float64Array(r));
-    this.groupOf.forEach((g, k) => { for (let j = 0; j < r; j++) left[g][j] += psi[k] * factors[k][j]; });
     const sum = new Float32Array(nodes), one = new Float32Array(3 * nodes);
-    left.forEach((a, g) => {
+    this.amplitudes().forEach((a, g) => {
       if (g === this.first) return;
       this.combined(a, one);
       for (let v = 0; v < nodes; v++) sum[v] += one[3 * v] ** 2 + one[3 * v + 1] ** 2 + one[3 * v + 2] ** 2;
@@ -235,12 +236,7 @@ class Dependent extends Expansion {
       const c = output.coefficients, values = psi.map((row) => row.reduce((sum, y, k) => sum + y * c[k], 0));
       let mean = values.reduce((a, b) => a + b, 0) / n, variance = values.reduce((a, b) => a + (b - mean) ** 2, 0) / n;
       if (!some) { mean = c[this.first]; variance = c.reduce((sum, y, k) => (k === this.first ? sum : sum + y * y), 0); }
-      values.sort((a, b) => a - b);
-      const at = (p) => values[Math.min(n - 1, Math.floor(p * n))];
-      return {
-        name: output.name, unit: output.unit, mean, std: Math.sqrt(variance), error: output.error, values: n > 1 ? values : [],
-        interval: n > 1 ? [at(0.025), at(0.975)] : [mean - 1.96 * output.error, mean + 1.96 * output.error], shares: null,
-      };
+      return this.said(output, mean, variance, n > 1 ? values : [], null);
     });
   }
   follows(i) {  // the middle of a parameter, given those that are fixed
@@ -359,6 +355,20 @@ function cutOf(cells, values) {
   return { a, b, s };
 }
 
+// --- parts of a page -----------------------------------------------------------------------------------------------
+function make(tag, set = {}, ...inner) {
+  const made = Object.assign(document.createElement(tag), set);
+  made.append(...inner);
+  return made;
+}
+function curve(paths) {  // as the answers of a report have it
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  const set = { viewBox: "0 0 100 20", preserveAspectRatio: "none", class: "curve", "aria-hidden": "true" };
+  for (const [name, value] of Object.entries(set)) svg.setAttribute(name, value);
+  svg.innerHTML = paths;
+  return svg;
+}
+
 class Viewer {
   constructor(element, told, arrays) {
     this.element = element; this.told = told; this.arrays = arrays;
@@ -371,10 +381,9 @@ class Viewer {
     this.base = Float32Array.from(this.motion);
     this.moves = told.motion !== null;
     this.edges = get(told.edges); this.cells = get(told.cells);
-    this.skin = this.surface(get(told.skin.triangles), get(told.skin.nodes));
-    if (this.moves) {  // the body as it was
-      this.ghost = this.surface(get(told.skin.triangles), get(told.skin.nodes));
-    }
+    const skin = () => this.surface(get(told.skin.triangles), get(told.skin.nodes));
+    this.skin = skin();
+    if (this.moves) this.ghost = skin();  // the body as it was
     this.insides = told.insides.map((inside) => Object.assign(this.surface(get(inside.triangles), get(inside.nodes), get(inside.points)), {
       name: inside.name, paint: rgb(inside.colour).map((x) => x / 255), opacity: inside.opacity, shown: inside.shown, outside: inside.outside,
     }));
@@ -384,7 +393,6 @@ class Viewer {
     this.cut = { axis: told.cut, place: 0.5 };
     this.surfaceProgram = this.program(...SURFACE); this.lineProgram = this.program(...LINE);
     this.texture = gl.createTexture(); this.lineBuffer = gl.createBuffer();
-    this.own = new Map();
     this.home(); this.choose(0); this.controls(); this.gestures();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
@@ -621,26 +629,18 @@ class Viewer {
     const q = this.told.quantities[this.chosen], box = this.element.querySelector(".legend");
     const [one, name] = fitting(Math.max(Math.abs(q.low), Math.abs(q.high)), q.unit);
     if (q.names.length) {
-      box.replaceChildren(...q.names.map((label, i) => {
-        const item = document.createElement("span"), dot_ = document.createElement("i");
-        dot_.style.background = `#${CATEGORIES[i % CATEGORIES.length]}`; item.className = "name"; item.append(dot_, label);
-        return item;
-      }));
+      const colour = (i) => make("i", { style: `background: #${CATEGORIES[i % CATEGORIES.length]}` });
+      box.replaceChildren(...q.names.map((label, i) => make("span", { className: "name" }, colour(i), label)));
       return;
     }
-    const stops = [0, 0.25, 0.5, 0.75, 1].map((x) => { const k = 4 * Math.round(255 * x); return `rgb(${this.map[k]},${this.map[k + 1]},${this.map[k + 2]})`; });
-    const bar = document.createElement("div"), ticks = document.createElement("div");
-    bar.className = "bar"; bar.style.background = `linear-gradient(to right, ${stops.join(",")})`;
-    ticks.className = "ticks";
-    for (const x of [0, 0.25, 0.5, 0.75, 1]) {
-      const t = document.createElement("span");
-      t.textContent = x === 1 ? withUnit(digits((q.low + x * (q.high - q.low)) / one, 3), name) : digits((q.low + x * (q.high - q.low)) / one, 3);
-      ticks.append(t);
-    }
-    box.replaceChildren(bar, ticks);
+    const places = [0, 0.25, 0.5, 0.75, 1], number = (x) => digits((q.low + x * (q.high - q.low)) / one, 3);
+    const stops = places.map((x) => `rgb(${this.map.slice(4 * Math.round(255 * x)).slice(0, 3).join(",")})`);
+    const ticks = places.map((x) => make("span", {}, x === 1 ? withUnit(number(x), name) : number(x)));
+    box.replaceChildren(make("div", { className: "bar", style: `background: linear-gradient(to right, ${stops.join(",")})` }),
+      make("div", { className: "ticks" }, ...ticks));
   }
   controls() {
-    const bar = this.element.querySelector(".controls"), make = (tag, set = {}, ...inner) => { const e = document.createElement(tag); Object.assign(e, set); e.append(...inner); return e; };
+    const bar = this.element.querySelector(".controls");
     const label = (words, control) => make("label", {}, `${words} `, control);
     const check = (words, on, act) => { const box = make("input", { type: "checkbox", checked: on }); box.addEventListener("change", () => { act(box.checked); this.draw(); }); return make("label", {}, box, ` ${words}`); };
     const range = (low, high, value, act) => { const r = make("input", { type: "range", min: low, max: high, step: "any", value }); r.addEventListener("input", () => act(Number(r.value))); return r; };
@@ -712,7 +712,6 @@ class Viewer {
   }
   sliders() {
     const panel = this.element.querySelector(".sliders"), x = this.expansion, rows = [];
-    const make = (tag, set = {}, ...inner) => { const e = document.createElement(tag); Object.assign(e, set); e.append(...inner); return e; };
     const table = make("div", { className: "told" }), warning = make("p", { className: "warning", hidden: true });
     warning.setAttribute("role", "status");
     const shown = () => {
@@ -742,22 +741,18 @@ class Viewer {
       this.element.dataset.fixed = String(fixed);
     };
     const bars = (o, all) => {  // where the values lie, over where they lay before anything was fixed
-      const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), low = all[0], high = all[all.length - 1], n = 40;
-      svg.setAttribute("viewBox", "0 0 100 20"); svg.setAttribute("preserveAspectRatio", "none"); svg.setAttribute("aria-hidden", "true");
+      const low = all[0], high = all[all.length - 1], n = 40;
       const path = (values, kind) => {
         const counts = new Array(n).fill(0);
         for (const v of values) { const k = Math.floor(n * (v - low) / (high - low)); if (k >= 0 && k < n) counts[k]++; }
-        const most = Math.max(...counts, 1), p = document.createElementNS("http://www.w3.org/2000/svg", "path");
-        p.setAttribute("d", `M0 20${counts.map((c, k) => `L${100 * k / n} ${20 - 19 * c / most}L${100 * (k + 1) / n} ${20 - 19 * c / most}`).join("")}L100 20Z`);
-        p.setAttribute("class", kind); svg.append(p);
+        const most = Math.max(...counts, 1);
+        const steps = counts.map((c, k) => `L${100 * k / n} ${20 - 19 * c / most}L${100 * (k + 1) / n} ${20 - 19 * c / most}`);
+        return `<path class="${kind}" d="M0 20${steps.join("")}L100 20Z"/>`;
       };
-      if (high > low) {
-        path(all, "all");
-        if (o.values.length && x.fixed.some(Boolean)) path(o.values, "inside");
-        if (!o.values.length) { const at = 100 * (o.mean - low) / (high - low), l = document.createElementNS("http://www.w3.org/2000/svg", "path"); l.setAttribute("d", `M${at - 0.4} 0h.8v20h-.8Z`); l.setAttribute("class", "inside"); svg.append(l); }
-      }
-      svg.setAttribute("class", "curve");
-      return svg;
+      if (!(high > low)) return curve("");
+      const mark = `<path class="inside" d="M${100 * (o.mean - low) / (high - low) - 0.4} 0h.8v20h-.8Z"/>`;
+      const now = x.fixed.some(Boolean) ? path(o.values, "inside") : "";
+      return curve(path(all, "all") + (o.values.length ? now : mark));
     };
     this.all = x.outputs().map((o) => o.values);
     const moved = () => { shown(); if (x.field) this.update(); };
@@ -767,10 +762,8 @@ class Viewer {
       range.addEventListener("input", () => { if (!x.fixed[i]) { x.fixed[i] = true; x.regroup(); } x.values[i] = Number(range.value); moved(); });
       const box = make("input", { type: "checkbox" });
       box.addEventListener("change", () => { x.fixed[i] = box.checked; x.regroup(); moved(); });
-      const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-      svg.setAttribute("viewBox", "0 0 100 20"); svg.setAttribute("preserveAspectRatio", "none"); svg.setAttribute("class", "curve"); svg.setAttribute("aria-hidden", "true");
       const d = p.density.map((y, k) => `L${100 * k / (p.density.length - 1)} ${20 - 19 * y}`).join("");
-      svg.innerHTML = `<path class="all" d="M0 20${d}L100 20Z"/><line class="mark" y1="0" y2="20"/>`;
+      const svg = curve(`<path class="all" d="M0 20${d}L100 20Z"/><line class="mark" y1="0" y2="20"/>`);
       const number = make("output", {}), share = make("small", {});
       const line = make("div", { className: "slider" }, make("label", { title: p.path }, box, ` ${p.name}`), number, range, svg, share);
       rows.push({ line, box, number, share, mark: svg.querySelector("line"), range });
@@ -783,9 +776,10 @@ class Viewer {
     const start = x.outputs(), weight = (i) => Math.max(...start.map((o) => (o.shares ? o.shares[i] : 0)));
     const many = 6, lines = rows.map((_, i) => i).sort((a, b) => weight(b) - weight(a) || a - b).map((i) => rows[i].line);
     const more = lines.length > many ? [make("details", {}, make("summary", { textContent: `${lines.length - many} more parameters` }), ...lines.slice(many))] : [];
-    const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${x.field.loo !== null && isFinite(x.field.loo) ? `, whose leave-one-out error is ${digits(100 * x.field.loo, 2)} % of the standard deviation` : ""}.` : "";
+    const loo = x.field ? x.field.loo : null;
+    const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${loo !== null ? `, whose leave-one-out error is ${digits(100 * loo, 2)} % of the standard deviation` : ""}.` : "";
     const whose = this.told.sliders.source ? "of the expansion and the reduced model" : "of the expansion";
-    const miss = Math.max(x.field && x.field.loo !== null && isFinite(x.field.loo) ? x.field.loo : 0, ...start.map((o) => (o.std > 0 && isFinite(o.error) ? o.error / o.std : 0)));
+    const miss = Math.max(loo || 0, ...start.map((o) => (o.std > 0 && isFinite(o.error) ? o.error / o.std : 0)));
     const sketch = miss > 0.1 ? [make("p", { className: "warning", textContent: `A sketch: this expansion misses up to ${digits(100 * miss, 2)} % of the standard deviation of what it shows.` })] : [];
     panel.append(...sketch, make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}${this.told.sliders.source ? ` ${this.told.sliders.source}` : ""}` }),
       table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free);

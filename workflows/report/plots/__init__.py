@@ -22,7 +22,6 @@ from workflows.report.plots.figure import DARK as DARK
 from workflows.report.plots.figure import HIGH as HIGH
 from workflows.report.plots.figure import axes as axes
 from workflows.report.plots.figure import png as png
-from workflows.report.plots.figure import span as span
 from workflows.report.plots.figure import svg as svg
 from workflows.report.plots.outputs import BARS as BARS
 from workflows.report.plots.outputs import active_summary as active_summary
@@ -34,3 +33,4 @@ from workflows.report.plots.outputs import index_convergence as index_convergenc
 from workflows.report.plots.outputs import index_shares as index_shares
 from workflows.report.plots.outputs import running_estimates as running_estimates
 from workflows.report.plots.outputs import tornado as tornado
+from workflows.report.plots.posterior import span as span

@@ -12,19 +12,8 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.readable import number
 from uq.estimators.estimate import estimate_of
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    PLAIN,
-    axes,
-    finished,
-    quantity,
-    rows,
-    text_of,
-)
-from workflows.report.plots.outputs import WORDS, Estimated
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, rows, text_of
+from workflows.report.plots.outputs import WORDS, Estimated, quantity
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -168,11 +157,7 @@ METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6
 
 
 def errors(
-    dataset: xr.Dataset,
-    output: str,
-    estimated: Estimated = "mean",
-    against: Cost = "solves",
-    ax: Axes | None = None,
+    dataset: xr.Dataset, output: str, estimated: Estimated = "mean", against: Cost = "solves", ax: Axes | None = None
 ) -> Axes:
     """Draw the root mean square error of each method of a comparison against its cost, both logarithmic.
 

@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.readable import SIZES, is_path, named, power_of_ten, scale, spoken
+from forward.readable import SIZES, is_path, power_of_ten, scale, spoken
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
-LOW, HIGH = "#0b6bb8", "#d1622b"
+PLAIN, CONTROLLED, HIGH, DARK = "#8a97a6", "#0b6bb8", "#d1622b", "#1d2733"
 # What is black or white on paper follows the page on a screen that is dark.
 FOLLOWING = {"#000000": "var(--ink)", DARK: "var(--ink)", "#ffffff": "var(--paper)"}
 FOLLOWS = """<style>svg { --ink: #000; --paper: #fff; fill: var(--ink); }
@@ -27,8 +25,8 @@ FOLLOWS = """<style>svg { --ink: #000; --paper: #fff; fill: var(--ink); }
 <defs>"""
 ON_PALE, ON_DEEP = "#010101", "#fefefe"  # what is written on a colour stays as it is
 MANY_POINTS = 3000
-LEGEND = 0.35  # inches that a legend below all panels takes
-COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
+LEGEND = 0.35  # inches that a row of a legend below all panels takes
+COLOURS = (CONTROLLED, HIGH, "#2f8f4e", "#8e5bb5", PLAIN, "#b5962d", DARK, "#c2477f")  # of models
 
 
 def png(ax: Axes) -> bytes:
@@ -170,26 +168,30 @@ def grid(
     columns: int,
     size: tuple[float, float] = (2.8, 3.0),
     inside: tuple[float, float, float, float] = (0.65, 0.5, 0.15, 0.3),
-    below: float = 0.0,
+    legend: int = 0,
 ) -> list[Axes]:
     """Return axes side by side on a new figure, so many in a row; all lengths are inches.
 
     Their places are given by hand: a layout that measures every label takes longer than to draw the picture. Of the
-    width and height of each panel its labels take what is `inside`: to the left, below, to the right, above. The height
-    `below` is left free under all of them, for a legend.
+    width and height of each panel its labels take what is `inside`: to the left, below, to the right, above. Under all
+    of them there is room for a `legend` of so many rows.
     """
     from matplotlib.figure import Figure
 
     rows, (width, height), (left, bottom, right, top) = -(-count // columns), size, inside
-    whole = width * columns, height * rows + below
+    whole = width * columns, height * rows + LEGEND * legend
     figure = Figure(figsize=whole)
     places = [(width * (i % columns) + left, whole[1] - height * (i // columns + 1) + bottom) for i in range(count)]
     extent = (width - left - right) / whole[0], (height - bottom - top) / whole[1]
     return [figure.add_axes((x / whole[0], y / whole[1], *extent)) for x, y in places]
 
 
-def finished(ax: Axes, x: str = "", y: str = "", *, log: str = "", above: int = 0, **legend: Any) -> Axes:
+def finished(
+    ax: Axes, x: str = "", y: str = "", *, log: str = "", above: int = 0, below: int = 0, **legend: Any
+) -> Axes:
     """Write what axes show, and a legend of what has labels: beside the data, or in so many columns `above` it.
+
+    In so many `below` all panels of the figure it is that of all.
 
     `log` names those that are logarithmic: "xy".
     """
@@ -198,9 +200,14 @@ def finished(ax: Axes, x: str = "", y: str = "", *, log: str = "", above: int = 
         ax.set_xlabel(x)
     if y:
         ax.set_ylabel(y)
-    if ax.get_legend_handles_labels()[0]:
-        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.02, 1), "ncols": above} if above else {}
-        ax.legend(**{"fontsize": "small", "frameon": False} | place | legend)
+    shown = ax.get_legend_handles_labels()
+    plain: dict[str, Any] = {"fontsize": "small", "frameon": False}
+    if shown[0] and below:
+        where = "lower center" if figure_of(ax).get_layout_engine() is None else "outside lower center"
+        figure_of(ax).legend(*shown, loc=where, ncols=below, **plain)
+    elif shown[0]:
+        place = {"loc": "lower right", "bbox_to_anchor": (1.02, 1), "ncols": above} if above else {}
+        ax.legend(**plain | place | legend)
     return ax
 
 
@@ -220,54 +227,6 @@ def stacked(ax: Axes, names: Sequence[str], parts: Mapping[str, FloatArray], col
         left = left + widths
 
 
-def banded(
-    ax: Axes,
-    x: Any,
-    middle: FloatArray,
-    reach: FloatArray,
-    colour: str,
-    label: str | None,
-    faint: float = 0.22,
-    **line: Any,
-) -> None:
-    """Draw a line with a band around it that reaches as far to both sides."""
-    ax.fill_between(x, middle - reach, middle + reach, color=colour, alpha=faint, linewidth=0)
-    ax.plot(x, middle, color=colour, label=label, **line)
-
-
-def quantity(dataset: xr.Dataset, output: str) -> str:
-    """Name and unit of an output."""
-    return named(text_of(output), str(dataset["unit"].sel(output=output).item()))
-
-
 def text_of(name: str) -> str:
     """Keep matplotlib from reading a name as a formula; numbers of a model are named by the ends of their paths."""
     return (spoken(name) if is_path(name) else name).replace("$", r"\$")
-
-
-def count_axis(ax: Axes, first: int, n: int) -> None:
-    """Make the x axis one of numbers of samples, logarithmic."""
-    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
-
-    ax.set_xscale("log")
-    ax.set_xlim(first, max(n, first + 1))
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.set_xlabel("samples")
-
-
-def span(values: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
-
-    A point far out with almost no weight, as with a wide prior, does not move an end.
-    """
-    order = np.argsort(values)
-    reached = np.cumsum(weights[order]) / weights.sum()
-    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
-    low, high = float(values[order[first]]), float(values[order[last]])
-    mean = weights @ values / weights.sum()
-    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
-    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
-    margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
-    return low - margin, high + margin

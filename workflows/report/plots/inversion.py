@@ -11,22 +11,9 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import named, number, size
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    LEGEND,
-    PLAIN,
-    axes,
-    figure_of,
-    finished,
-    grid,
-    span,
-    text_of,
-)
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, finished, grid, text_of
 from workflows.report.plots.posterior import density as density_of
-from workflows.report.plots.posterior import holding, pairs
+from workflows.report.plots.posterior import holding, pairs, span
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,23 +34,19 @@ _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across the body, and the points on it at which fields are drawn.
+    """A plane across y, and the points on it at which fields are drawn.
 
     Attributes
     ----------
-    axis, level
-        The plane: a coordinate, and its value (m).
-    along
-        The other two axes.
+    level
+        Where it is (m).
     lines
-        Coordinates (m) of the points along each of these.
+        Coordinates x and z (m) of the points.
     vertices, weights
         Numbers (n, 4) of the nodes around each point, and weights; NaN outside the body.
     """
 
-    axis: int
     level: float
-    along: tuple[int, int]
     lines: tuple[FloatArray, FloatArray]
     vertices: NDArray[np.int64]
     weights: FloatArray
@@ -87,12 +70,12 @@ class Cut:
         inner = np.einsum("nij,nj->ni", map_[:, :3], points - map_[:, 3])
         shares = np.column_stack([inner, 1 - inner.sum(axis=1)])
         shares[found < 0] = np.nan
-        return cls(1, level, (0, 2), (first, second), mesh.simplices[found], shares)
+        return cls(level, (first, second), mesh.simplices[found], shares)
 
     @property
     def words(self) -> str:
         """The plane in words."""
-        return f"the plane {'xyz'[self.axis]} = {size(self.level, 'm', 3)}"
+        return f"the plane y = {size(self.level, 'm', 3)}"
 
     def values(self, field: FloatArray) -> FloatArray:
         """Return a field (N,) at the points of the plane."""
@@ -164,7 +147,7 @@ def _panels(cut: Cut, drawn: Mapping[str, Panel], columns: int = 2, size: tuple[
         shown = ax.imshow(at, colours, clim=ends, origin="lower", extent=extent, interpolation="none")
         ax.set(xlim=cut.lines[0][[0, -1]], ylim=cut.lines[1][[0, -1]])
         ax.set_title(title, fontsize="medium")
-        finished(ax, *(f"{'xyz'[axis]} (m)" for axis in cut.along)).locator_params(nbins=3)
+        finished(ax, "x (m)", "z (m)").locator_params(nbins=3)
         bar = ax.figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.9, pad=0.22, fraction=0.2, aspect=15)
         bar.ax.locator_params(axis="x", nbins=4)
     return found[0]
@@ -200,7 +183,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
     names = [str(one.parameter.values[i]) for i in chosen]
-    found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, LEGEND)
+    found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, legend=1)
     for close, whole, name in zip(found[::2], found[1::2], names, strict=True):
         of = one.sel(parameter=name)
         draws = of["draw"].to_numpy()
@@ -222,8 +205,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
         _beside(whole, values, density, x, posterior)
         _finish(whole, label, np.array(whole.get_xlim()))
     found[1].set_title("the whole prior", fontsize="small")
-    _legend(found)
-    return found[0]
+    return finished(found[0], below=4 if len(names) > 1 else 2)
 
 
 def _beside(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
@@ -288,20 +270,13 @@ def _finish(ax: Axes, label: str, x: FloatArray) -> None:
     ax.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _legend(found: list[Axes]) -> None:
-    handles, labels = found[0].get_legend_handles_labels()
-    figure = figure_of(found[0])
-    columns = 4 if figure.get_figwidth() > 5 else 2
-    figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize="small", frameon=False)
-
-
 def node_marginals(one: xr.Dataset) -> Axes:
     """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, the least certain."""
     mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
     before = one["stiffness_prior_std"].to_numpy()
     centre = float(one["prior_mean"][0])
     nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
-    found = grid(len(nodes), len(nodes), (2.2, 2.2), AROUND_DENSITY, LEGEND)
+    found = grid(len(nodes), len(nodes), (2.2, 2.2), AROUND_DENSITY, legend=1)
     for ax, node in zip(found, nodes, strict=True):
         x = np.linspace(*_span(np.zeros(0), mean[node], std[node], float(one["stiffness_true"][node])), 300)
         ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)
@@ -311,8 +286,7 @@ def node_marginals(one: xr.Dataset) -> Axes:
         place = ", ".join(f"{x + 0.0:.3g}" for x in one["node_position"].to_numpy()[node].round(9))
         _finish(ax, f"ln stiffness at\n({place}) m", x)
         ax.xaxis.label.set_fontsize("x-small")
-    _legend(found)
-    return found[0]
+    return finished(found[0], below=4 if len(nodes) > 2 else 2)
 
 
 def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:
@@ -341,7 +315,7 @@ def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     edges = np.linspace(-5, 5, 41)
     ax.hist(np.clip(z, -5, 5), bins=edges.tolist(), density=True, color=CONTROLLED, alpha=0.45)
     x = np.linspace(-5, 5, 200)
-    ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=DARK)
+    ax.plot(x, _bell(x, 0.0, 1.0), color=DARK)
     for end in (-2, 2):
         ax.axvline(end, color=PLAIN, linestyle="--", linewidth=1)
     within = f"{100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2"

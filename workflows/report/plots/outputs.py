@@ -7,26 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from forward.model import FloatArray
 from forward.readable import named
 from uq.estimators.estimate import estimate_of, holds, single
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
 from uq.estimators.tails import skewed
-from workflows.report.plots.figure import (
-    CONTROLLED,
-    DARK,
-    HIGH,
-    LOW,
-    PLAIN,
-    axes,
-    banded,
-    count_axis,
-    finished,
-    quantity,
-    rows,
-    stacked,
-    text_of,
-)
+from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, finished, rows, stacked, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,6 +28,32 @@ WORDS: dict[Estimated, str] = {"mean": "mean", "std": "standard deviation"}
 FIRST_SHOWN = 8  # estimates from fewer samples are meaningless
 MOST_BINS = 200
 WIDEST = 40  # characters of a name beside a plot
+
+
+def quantity(dataset: xr.Dataset, output: str) -> str:
+    """Name and unit of an output."""
+    return named(text_of(output), str(dataset["unit"].sel(output=output).item()))
+
+
+def banded(
+    ax: Axes, x: Any, middle: FloatArray, reach: FloatArray, colour: str, label: str, faint: float = 0.22, **line: Any
+) -> None:
+    """Draw a line with a band around it that reaches as far to both sides."""
+    ax.fill_between(x, middle - reach, middle + reach, color=colour, alpha=faint, linewidth=0)
+    ax.plot(x, middle, color=colour, label=label, **line)
+
+
+def count_axis(ax: Axes, counts: NDArray[np.int64]) -> None:
+    """Make the x axis one of numbers of samples, logarithmic."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    first, n = int(counts[0]), int(counts[-1])
+    ax.set_xscale("log")
+    ax.set_xlim(first, max(n, first + 1))
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_xlabel("samples")
 
 
 def running_estimates(
@@ -84,7 +98,7 @@ def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axe
             series.append((label, colour, *np.array([(one.mean, one.mean_error) for one in running]).T))
     for label, colour, mean, error in series:
         banded(ax, counts, mean, half_width(dataset) * error, colour, label)
-    count_axis(ax, int(counts[0]), int(counts[-1]))
+    count_axis(ax, counts)
     return finished(ax, y=f"running mean of {quantity(dataset, output)}", title="mean, 95 % band")
 
 
@@ -233,7 +247,7 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     order = np.argsort(-np.abs(effects))[:BARS]
     ax = ax or axes(height=1.3 + 0.42 * len(order))
     places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
-    for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
+    for sign, colour, label in ((-1, CONTROLLED, "one standard deviation below its mean"), (1, HIGH, "above")):
         ax.barh(places, sign * effects[order], height=0.6, color=colour, label=label)
     ax.axvline(0, color=DARK, linewidth=0.8)
     ax.locator_params(axis="x", nbins=6)
@@ -283,10 +297,10 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
         name = text_of(str(of_parameter["parameter"].item()))
         for which, style in (("first", "--"), ("total", "-")):
             mean, error = (of_parameter[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
-            label = name if which == "total" else None
+            label = name if which == "total" else ""
             banded(ax, counts, mean, half_width(dataset) * error, colour, label, faint=0.12, linestyle=style)
     ax.set_ylim(-0.1, 1.1)
-    count_axis(ax, int(counts[0]), int(counts[-1]))
+    count_axis(ax, counts)
     return finished(ax, y=f"indices of {text_of(output)}", title="total; dashed: first order")
 
 

@@ -10,20 +10,7 @@ import numpy as np
 from forward.bodies.geometry import AXES
 from forward.model import FloatArray
 from forward.readable import number, scale
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    LEGEND,
-    ON_DEEP,
-    PLAIN,
-    axes,
-    figure_of,
-    finished,
-    grid,
-    text_of,
-)
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, ON_DEEP, PLAIN, axes, finished, grid, text_of
 from workflows.results.points import MeasuredPoints, displacements, measured_points
 
 if TYPE_CHECKING:
@@ -204,7 +191,7 @@ def pressure_map(dataset: xr.Dataset, tool: str, direction: Vector, ax: Axes | N
     corners = seen.triangles[(pressure[seen.triangles] > 0).any(axis=1)].ravel()
     if len(corners):  # the area in contact and the cells around it
         ax.set(xlim=(x[corners].min(), x[corners].max()), ylim=(y[corners].min(), y[corners].max()))
-    figure_of(ax).colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
+    ax.figure.colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
     ax.set_aspect("equal")
     return finished(ax, f"{AXES[int(across[0])]} (mm)", f"{AXES[int(across[1])]} (mm)")
 
@@ -229,7 +216,7 @@ def on_body(found: xr.Dataset, bounds: Sequence[tuple[float, float]]) -> Axes:
 
     Points are coloured by load case.
     """
-    (ax,) = grid(1, 1, (5.4, 4.4), (0.2, 0.25, 0.2, 0.2), LEGEND)
+    (ax,) = grid(1, 1, (5.4, 4.4), (0.2, 0.25, 0.2, 0.2), legend=1)
     box(ax, np.array(bounds).T)
     places, chosen = found["candidate_place"].to_numpy(), found["chosen"].to_numpy()
     every = np.unique(places[np.isfinite(places).all(axis=1)], axis=0)
@@ -246,5 +233,4 @@ def on_body(found: xr.Dataset, bounds: Sequence[tuple[float, float]]) -> Axes:
     for place, numbers in said.items():
         x, y, _ = seen(np.array(place))
         ax.text(x, y, f"  {', '.join(numbers)}", fontsize=8, va="center")
-    ax.figure.legend(fontsize="small", frameon=False, loc="lower center", ncols=4)
-    return ax
+    return finished(ax, below=4)

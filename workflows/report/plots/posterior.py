@@ -9,21 +9,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.readable import named, number
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    ON_DEEP,
-    ON_PALE,
-    PLAIN,
-    axes,
-    figure_of,
-    finished,
-    rows,
-    span,
-    text_of,
-)
+from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, ON_DEEP, ON_PALE, PLAIN, axes, finished, rows, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -51,13 +37,12 @@ def pairs(
     They are `worth` so many independent draws, if the weights do not tell it. Modes and truths, if known (NaN
     otherwise), are in the order of the columns.
     """
+    from matplotlib.figure import Figure
+
     names, n = list(columns), len(columns)
-    first = axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
-    figure = figure_of(first)
-    first.remove()
     # Places by hand: a layout that looks at every label takes longer than all densities.
-    figure.set_layout_engine(None)
-    wide, high = figure.get_size_inches()
+    wide, high = 1.4 + 1.45 * n, 1.0 + 1.25 * n
+    figure = Figure(figsize=(wide, high))
     figure.subplots_adjust(0.75 / wide, 0.55 / high, 1 - 0.1 / wide, 1 - 0.1 / high, 0.12, 0.12)
     places = figure.add_gridspec(n, n)
     tops: list[Axes] = []  # of the columns, which share their axis
@@ -138,6 +123,22 @@ def _contours(ax: Axes, draws: FloatArray, shares: FloatArray, worth: float | No
     ax.plot(*draws[np.unique(at)].T, ".", color=colour, markersize=2, alpha=0.5)
 
 
+def span(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
+
+    A point far out with almost no weight, as with a wide prior, does not move an end.
+    """
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order]) / weights.sum()
+    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
+    low, high = float(values[order[first]]), float(values[order[last]])
+    mean = weights @ values / weights.sum()
+    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
+    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
+    margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
+    return low - margin, high + margin
+
+
 def holding(low: float, high: float, truth: float, far: float, margin: float) -> tuple[float, float]:
     """Move the ends of an axis so that they hold the truth with a margin, unless it is far away, in its lengths."""
     wide = high - low
@@ -192,7 +193,7 @@ def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     size = frame[2] - frame[0]
     known = size > 0
     places = rows(ax, outputs)
-    drawn = ((before, COLOURS[1], 0.7, "before the data"), (after, COLOURS[0], 0.35, "after"))
+    drawn = ((before, HIGH, 0.7, "before the data"), (after, CONTROLLED, 0.35, "after"))
     for values, colour, height, label in drawn:
         lower, middle, upper = (values[:, known] - frame[0, known]) / size[known]
         ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
@@ -227,6 +228,4 @@ def specimens(of: xr.Dataset, name: str, unit: str, ax: Axes | None = None) -> A
         wide = upper - lower
         ax.set_xlim(max(left, min(lower, float(ends[1].min())) - 0.3 * wide), right)
         ax.locator_params(axis="x", nbins=5)
-    ax.set_xlabel(named(text_of(name), unit))
-    ax.figure.legend(loc="outside lower center", ncols=2, fontsize="small", frameon=False)
-    return ax
+    return finished(ax, named(text_of(name), unit), below=2)

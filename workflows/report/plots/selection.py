@@ -9,19 +9,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.readable import named, percent, with_error
-from workflows.report.plots.figure import (
-    COLOURS,
-    CONTROLLED,
-    DARK,
-    HIGH,
-    LEGEND,
-    axes,
-    figure_of,
-    finished,
-    grid,
-    stacked,
-    text_of,
-)
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, finished, grid, stacked, text_of
 from workflows.report.plots.posterior import pairs
 from workflows.results.comparison import by_probability, ranking
 
@@ -58,9 +46,7 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     shares = {model: dataset["variant_probability"].sel(model=model).values for model in of}
     stacked(ax, names, shares, list(of.values()))
     ax.set_xlim(0, 1)
-    ax.set_xlabel("probability")
-    ax.figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
-    return ax
+    return finished(ax, "probability", below=3)
 
 
 def corner(dataset: xr.Dataset, model: str, group: str, units: Mapping[str, str] | None = None) -> Axes:
@@ -109,16 +95,13 @@ def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -
 def fits(dataset: xr.Dataset, tests: Sequence[tuple[str, str]]) -> Axes:
     """Draw the curves of all tests, given with their groups, side by side, with one legend below."""
     several = len({group for group, _ in tests}) > 1
-    panels = grid(len(tests), min(len(tests), WIDE + several), (3.7, 2.9), (0.75, 0.55, 0.1, 0.3), below=2 * LEGEND)
+    panels = grid(len(tests), min(len(tests), WIDE + several), (3.7, 2.9), (0.75, 0.55, 0.1, 0.3), legend=2)
     for panel, (group, test) in zip(panels, tests, strict=True):
         panel.set_title(text_of(group) if several else "", fontsize="medium")
         legend = curves(dataset, group, test, panel).get_legend()
         if legend is not None:
             legend.remove()
-    last = panels[-1]
-    handles = last.get_legend_handles_labels()
-    figure_of(last).legend(*handles, loc="lower center", ncols=3, fontsize="small", frameon=False)
-    return last
+    return finished(panels[-1], below=3)
 
 
 def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, ax: Axes | None = None) -> Axes:

@@ -6,7 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,10 +16,9 @@ from forward.model import FloatArray
 from forward.readable import spoken
 from uq.estimators.estimate import estimate_of, holds
 from workflows.report.scene.pack import Packer
-from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
 from workflows.results.points import measured_points
-from workflows.results.surfaces import IntArray, level, surface, tetrahedra, tools_of
+from workflows.results.surfaces import IntArray, Skin, level, skin, split, surface, tetrahedra, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -100,7 +99,7 @@ class Scene:
     motion_name: str = ""
     cut: str = ""
 
-    @property
+    @cached_property
     def skin(self) -> Skin:
         """Its surface."""
         return skin(self.points, self.cells, self.kind)
@@ -113,9 +112,8 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
     insides = list(_regions(dataset, points, cells, kind))
     if study is not None and "parameter" in dataset.coords:  # inclusions where they were before the body moved
         names, means = [str(name) for name in dataset["parameter"].values], dataset["parameter_mean"].to_numpy()
-        box = points.min(axis=0), points.max(axis=0)
         inclusions = [one for body in study.model.bodies for one in body.inclusions]
-        insides += [Inside(one.label, *_ball(one, names, box, means), "inside") for one in inclusions]
+        insides += [Inside(one.label, *_ball(one, names, points, means), "inside") for one in inclusions]
     for tool in tools_of(dataset):
         at, triangles = surface(tool, points)
         insides.append(Inside(f"tool {tool.label}", triangles, at, "tool", 0.5))
@@ -138,9 +136,8 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
     inclusions = study.model.inclusions
     names = [str(name) for name in one["parameter"].values]
     insides = []
-    box = points.min(axis=0), points.max(axis=0)
     for inclusion in inclusions:
-        ball = partial(_ball, inclusion, names, box)
+        ball = partial(_ball, inclusion, names, points)
         insides.append(Inside(f"{inclusion.label}, posterior mean", *ball(one["mean"].to_numpy()), "inside"))
         if np.isfinite(one["true"]).any():
             truth = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
@@ -304,16 +301,15 @@ def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> 
             yield Inside(f"region {name}", own.nodes[own.triangles], None, "inside")
 
 
-def _ball(
-    inclusion: Any, names: Sequence[str], box: tuple[FloatArray, FloatArray], values: FloatArray
-) -> tuple[IntArray, FloatArray]:
-    """Triangles and points of where the indicator of an inclusion is ½, in the body, by values of what is not known."""
+def _ball(inclusion: Any, names: Sequence[str], body: FloatArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Triangles and points of where an indicator is ½, in a body with nodes (n, 3), by values of what is not known."""
     of = dict(zip(names, values.tolist(), strict=True))
     own = inclusion.model_dump(exclude={"kind", "name", "contrast"})
     numbers = {key: of.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in own.items()}
     radii = [numbers[r] for r in ("radius",) if r in numbers] or [numbers[r] for r in "abc"]
     centre, reach = np.array([numbers[axis] for axis in "xyz"]), 1.15 * max(radii)
-    low, high = np.maximum(centre - reach, box[0] - 0.1 * reach), np.minimum(centre + reach, box[1] + 0.1 * reach)
+    low = np.maximum(centre - reach, body.min(axis=0) - 0.1 * reach)
+    high = np.minimum(centre + reach, body.max(axis=0) + 0.1 * reach)
     if (low >= high).any():
         return np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3))
     indicator = INDICATORS[inclusion.kind]

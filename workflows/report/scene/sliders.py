@@ -12,6 +12,7 @@ import numpy as np
 from forward.model import FloatArray, SolveError
 from forward.readable import named as with_its_unit
 from forward.readable import spoken
+from uq.inputs.distributions import Normal
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels
@@ -35,6 +36,7 @@ QUANTILES, FEWER = 256, 64  # of each parameter
 CURVE, SHORTER = 61, 31  # points of each density
 SINGLE = 2.0**-21  # relative rounding of sums in the browser, which are of single precision
 CHECKED = 64  # points at which the error of the packed field is measured
+OF_FIELDS = Normal(mean=0.0, std=1.0)  # the distribution of coefficients of random fields
 FARTHEST = 3.72  # standard normal deviations that a slider reaches where a distribution has tails
 
 
@@ -110,20 +112,15 @@ class Sliders:
         }
 
     def _parameter(self, i: int, name: str) -> dict[str, Any]:
-        distribution, basis = self.given.get(name), self.expansion.basis
+        from scipy.special import ndtri
+
+        distribution, basis = self.given.get(name, OF_FIELDS), self.expansion.basis
         z = np.linspace(-FARTHEST, FARTHEST, 401)
         few = len(self.expansion.parameters) > MANY
         count, points = (FEWER, SHORTER) if few else (QUANTILES, CURVE)
         u = (np.arange(count) + 0.5) / count
-        from scipy.special import ndtri
-
-        if distribution is None:  # a coefficient of a random field
-            values, slopes, middle = z, np.ones_like(z), ndtri(u)
-        else:
-            values, slopes = distribution.from_normal(z)
-            middle = distribution.from_normal(ndtri(u))[0]
-        support = None if distribution is None else distribution.support
-        low, high = support if support is not None else (float(values[0]), float(values[-1]))
+        (values, slopes), middle = distribution.from_normal(z), distribution.from_normal(ndtri(u))[0]
+        low, high = distribution.support or (float(values[0]), float(values[-1]))
         low, high = min(low, float(self.expansion.lower[i])), max(high, float(self.expansion.upper[i]))
         at = np.linspace(low, high, points)
         density = (

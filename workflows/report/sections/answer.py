@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from forward.readable import (
-    and_error,
-    duration,
-    interval,
-    margin,
-    number,
-    percent,
-    power_of_ten,
-    quantity,
-    size,
-    spoken,
-    with_error,
-)
+from forward.readable import and_error, duration, interval, margin, number, percent, quantity, size, spoken, with_error
 from uq.estimators.estimate import single
 from uq.findings import NOT_KNOWN
 from workflows.report.blocks import CURVE, Answer, Block, Card, Curve, Text, curve_of, smooth
@@ -30,7 +18,7 @@ from workflows.report.sections.errors import counting, parts_of
 from workflows.report.sections.frame import gravest
 from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
-from workflows.results.comparison import bayes_factor, by_probability, grade
+from workflows.results.comparison import bayes_factor, by_probability, grade, odds
 from workflows.results.summary import NEITHER, leading
 
 if TYPE_CHECKING:
@@ -319,9 +307,9 @@ def selection(results: Results) -> Card:
         lines = [f"ln Z {with_error(float(one['log_evidence']), error)}"] if rank < SEVERAL else []
         if rank == 0 and len(order) > 1:
             ln_B, _ = bayes_factor(of, model, order[1])
-            lines.append(f"{_odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
+            lines.append(f"{odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
         elif rank:
-            lines.append(f"{_odds(bayes_factor(of, order[0], model)[0])} against it")
+            lines.append(f"{odds(bayes_factor(of, order[0], model)[0])} against it")
         if "stacking" in one and rank < SEVERAL:
             lines.append(f"stacking {percent(float(one['stacking']))}")
         if "mesh_checked" in one and not bool(one["mesh_checked"].all()):
@@ -330,12 +318,6 @@ def selection(results: Results) -> Card:
             lines.append("not to be trusted")
         answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
     return Card(question, answers)
-
-
-def _odds(ln_B: float) -> str:
-    if ln_B > 13:
-        return f"{power_of_ten(int(ln_B / np.log(10)))} to 1"
-    return f"{number(float(np.exp(ln_B)), 2)} to 1"
 
 
 def compared(results: Results) -> Card:

@@ -203,13 +203,12 @@ def meshes(results: Results) -> Iterator[Block]:
         )
 
 
-@section("probability", "mesh_checked")
+@section("probability", "mesh_checked", heading="Effect of a finer mesh", level=3)
 def finer_meshes(results: Results) -> Iterator[Block]:
     """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
     from inverse.criticism.doubts import change_in_words
 
     dataset = results.dataset
-    yield Heading("Effect of a finer mesh", level=3)
     yield Text(
         "Solves of each candidate at its mode on finer meshes, with thinner cells at the faces that are held: the "
         "error of its mesh, and what correcting it does. Where a candidate is corrected, evidence and unknowns "
@@ -233,13 +232,12 @@ def finer_meshes(results: Results) -> Iterator[Block]:
     yield Table(head, rows, text={0, 1, 5}, long={5})
 
 
-@section("mesh_indicator")
+@section("mesh_indicator", heading="The mesh")
 def adapted_mesh(results: Results) -> Iterator[Block]:
     """How the mesh was refined, what errors are left, and where they come from."""
     from workflows.report.bodies import refined
 
     dataset, adapt = results.dataset, results.study.model.adapt
-    yield Heading("The mesh")
     by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
     yield Text(
         "Solved at the mean of the parameters, and refined where cells have most of the estimated error, by "

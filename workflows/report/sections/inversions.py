@@ -8,20 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.readable import (
-    NONE,
-    and_error,
-    interval,
-    named,
-    number,
-    percent,
-    place,
-    quantity,
-    scale,
-    size,
-    spoken,
-    with_error,
-)
+from forward.readable import NONE, and_error, interval, number, percent, place, quantity, size, spoken, with_error
 from forward.specimen import Specimen
 from uq.estimators.estimate import single
 from workflows.report.blocks import CURVE, Answer, Block, Card, Heading, Pictures, Table, Text, curve_of, smooth
@@ -46,7 +33,7 @@ def batch(results: Results) -> Iterator[Block]:
         "inverted follow one by one."
     )
     dataset = results.dataset
-    sizes = _sizes(results, abs(dataset["mean"]).median("data_set"))
+    sizes = results.columns(abs(dataset["mean"]).median("data_set"))
     rows = []
     for label in dataset.data_set.values:
         one = dataset.sel(data_set=label)
@@ -64,12 +51,6 @@ def batch(results: Results) -> Iterator[Block]:
     units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     yield Table(head, rows, text={0, 2})
-
-
-def _sizes(results: Results, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
-    """Return by parameter what one of the unit of its column is in the SI unit, and its head, for usual values."""
-    found = {name: scale(float(usual.sel(parameter=name)), results.parameter_unit(name)) for name in results.parameters}
-    return {name: (one, named(spoken(name), unit)) for name, (one, unit) in found.items()}
 
 
 SHOWN = 24  # rows of the table of a data set
@@ -141,7 +122,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         "By its own data alone, and with what the others say on what specimens are like. The last column is how "
         "many of its draws lie where the population is."
     )
-    sizes = _sizes(results, of["typical_quantiles"].transpose(..., "parameter")[1])
+    sizes = results.columns(of["typical_quantiles"].transpose(..., "parameter")[1])
     rows = []
     for specimen in map(str, of["specimen"].values):
         one = of.sel(specimen=specimen)
@@ -268,7 +249,7 @@ def design_card(results: Results) -> Card:
     return Card("Which observations tell most of what is not known?", answers)
 
 
-@section("clean")
+@section("clean", heading="The data")
 def synthetic_data(results: Results) -> Iterator[Block]:
     """How many data were made, how large they are, and their errors."""
     of = results.dataset
@@ -283,7 +264,6 @@ def synthetic_data(results: Results) -> Iterator[Block]:
             if made.any():
                 largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
                 rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
-    yield Heading("The data")
     yield Table(("of", "data", "largest", "largest standard error"), rows)
 
 

@@ -71,15 +71,11 @@ def posterior(results: Results) -> Iterator[Block]:
                 yield Pictures.of(*drawn)
         yield Pictures.of(*pictures(one, before, units))
         names = [str(name) for name in one.parameter.values if name != "noise"]
-        sizes = {
-            name: scale(float(one["alone_std"].sel(parameter=name).median()), units.get(name, "1")) for name in names
-        }
-        widths = [
-            *one["alone_std"].sel(parameter=names).to_numpy(),
-            one["together_std"].sel(parameter=names).to_numpy(),
-        ]
+        alone = one["alone_std"].sel(parameter=names)
+        sizes = results.columns(alone.median("case"))
+        widths = [*alone.to_numpy(), one["together_std"].sel(parameter=names).to_numpy()]
         shown = [[number(x / size, 2) for x, (size, _) in zip(row, sizes.values(), strict=True)] for row in widths]
-        yield from cases(one, [f"± {named(spoken(name), unit)}" for name, (_, unit) in sizes.items()], shown)
+        yield from cases(one, [f"± {head}" for _, head in sizes.values()], shown)
         if one.sizes["case"] <= CASES_DRAWN and len(names) <= CASES_DRAWN:
             caption = (
                 f"How many times narrower each {_part(one)} alone makes what was known of each parameter "
