@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
 from forward.combine import Joined, Rows, sums_of, taking
@@ -16,7 +16,7 @@ from forward.findings import Finding
 from forward.materials.admissible import Materials
 from forward.model import ForwardModel
 from forward.registry import OfKind
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
 from forward.spec import MODELS, ModelSpec, NamedOutput
 
@@ -152,11 +152,6 @@ class JoinedModels(ModelSpec):
             part = model.build(comm, tuple(path for path, _ in acting))
             made.append(taking(part, [column for _, column in acting], parameters))
         return Joined(tuple(made), tuple(one.name for one in self.outputs), tuple(f"model '{n}'" for n in self.models))
-
-    @model_validator(mode="after")
-    def _check(self) -> JoinedModels:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         for i, path in enumerate(self.shared):

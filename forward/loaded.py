@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from forward.adapt import Adapt, Refinable
 from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
@@ -23,7 +23,7 @@ from forward.findings import Finding
 from forward.materials.material import splits
 from forward.model import ModelError
 from forward.observables.observable import Output
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.solvers.settings import SolverSettings
 from forward.terms.displacement import Block, Displacement, lists, too_far
@@ -317,11 +317,6 @@ class LoadedBody(Refinable):
         found = super().identity()
         found["body"].pop("file", None)
         return found
-
-    @model_validator(mode="after")
-    def _check(self) -> LoadedBody:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""

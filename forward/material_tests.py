@@ -6,14 +6,14 @@ import math
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.bodies.geometry import Vector
 from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume
 from forward.materials.material_point import HomogeneousModel, MaterialTest, stresses_of, unfit
 from forward.registry import KindError
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.solid import block
 from forward.spec import ModelSpec
@@ -111,11 +111,6 @@ class MaterialTests(ModelSpec):
     def build(self, comm: Any, parameters: tuple[str, ...]) -> HomogeneousModel:
         """Make the model; constants that are no parameters keep their values."""
         return HomogeneousModel(self.energy, self.fixed, self.tests, parameters, self.fibres)
-
-    @model_validator(mode="after")
-    def _check(self) -> MaterialTests:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         wrong = next(self._of_material(), None)

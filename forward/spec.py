@@ -11,10 +11,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
+from pydantic import model_validator
+
 from forward.model import ModelError
 from forward.readable import named
 from forward.registry import Kinds, OfKind
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Scalar, refuse
 from forward.settings import Settings
 
 if TYPE_CHECKING:
@@ -304,6 +306,15 @@ class ModelSpec(Settings):
     def identity(self) -> dict[str, Any]:
         """Return everything that results depend on, as a table."""
         return self.model_dump(mode="json", exclude_none=True)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(type(self).__name__, self._mistakes())
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        """Find mistakes that no single block can see."""
+        yield from ()
 
 
 MODELS = Kinds(

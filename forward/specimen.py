@@ -19,7 +19,7 @@ from forward.model import ModelError
 from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solid import Solid
 from forward.terms.displacement import Displacement
@@ -281,11 +281,6 @@ class Specimen(Solid):
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms of every case, as `Hyperelastic.build` does of one; collective."""
         return named("forward.fem.joined:specimen")(self, comm, parameters)
-
-    @model_validator(mode="after")
-    def _check(self) -> Specimen:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)
