@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
@@ -18,21 +18,12 @@ from forward.model import ForwardModel
 from forward.registry import OfKind
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
-from forward.spec import MODELS, ModelSpec, NamedOutput
+from forward.spec import MODELS, ModelSpec, NamedOutput, PlainOutput
 
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges
 
 Name = Annotated[str, Field(pattern=r"^[^.\s]+$")]
-
-
-class Named(NamedTuple):
-    """An output of one of the models, by its name among those of all."""
-
-    name: str
-    unit: str
-    estimable: bool
-    negative: bool
 
 
 class JoinedModels(ModelSpec):
@@ -78,7 +69,7 @@ class JoinedModels(ModelSpec):
     def outputs(self) -> tuple[NamedOutput, ...]:
         """What all models return, of one after that of the other."""
         return tuple(
-            Named(f"{name}.{one.name}", one.unit, getattr(one, "estimable", True), getattr(one, "negative", True))
+            PlainOutput(f"{name}.{one.name}", one.unit, getattr(one, "estimable", True), getattr(one, "negative", True))
             for name, model in self.models.items()
             for one in model.returned
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -16,19 +16,12 @@ from forward.registry import KindError
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.solid import block
-from forward.spec import ModelSpec
+from forward.spec import ModelSpec, PlainOutput
 
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges
 
 Constants = dict[str, float | str | tuple[Vector, ...]]  # of a material: its kind, constants and fibres by name
-
-
-class Stress(NamedTuple):
-    """A stress that a test measures."""
-
-    name: str
-    unit: str = "Pa"
 
 
 class MaterialTests(ModelSpec):
@@ -74,9 +67,9 @@ class MaterialTests(ModelSpec):
         return found if isinstance(found, tuple) else ()
 
     @property
-    def outputs(self) -> tuple[Stress, ...]:
+    def outputs(self) -> tuple[PlainOutput, ...]:
         """The stresses of all tests, one after the other."""
-        return tuple(map(Stress, stresses_of(self.tests)))
+        return tuple(PlainOutput(name, "Pa") for name in stresses_of(self.tests))
 
     @property
     def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:

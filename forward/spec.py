@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 from pydantic import model_validator
 
@@ -44,6 +44,15 @@ class NamedOutput(Protocol):
     @property
     def unit(self) -> str:
         """SI unit of its value; "1" for ratios."""
+
+
+class PlainOutput(NamedTuple):
+    """An output of which no more is known than this; the last two as of `forward.observables.observable`."""
+
+    name: str
+    unit: str
+    estimable: bool = True
+    negative: bool = True
 
 
 class ModelSpec(Settings):
