@@ -15,22 +15,14 @@ from forward.observables.functionals import Integral
 from forward.observables.observable import Equations, Functional, Observable
 
 
-class _Largest(Observable):
-    """The largest of some sizes."""
-
-    @property
-    def negative(self) -> bool:
-        """Whether it can be below 0."""
-        return False
-
-
-class MaxDisplacement(_Largest):
+class MaxDisplacement(Observable):
     """Largest |u_c| over the nodes (m), or largest |u| where `component` is "magnitude".
 
     Differentiable where only one node attains it; derivatives are those at that node.
     """
 
     kind: Literal["max-displacement"] = "max-displacement"
+    negative: ClassVar[bool] = False
     component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
     def functional(self, equations: Equations) -> Functional:
@@ -38,19 +30,20 @@ class MaxDisplacement(_Largest):
         return _MaxDisplacement(equations, None if self.component == "magnitude" else AXES.index(self.component))
 
 
-class MaxVonMises(_Largest):
+class MaxVonMises(Observable):
     """Largest von Mises stress (Pa, Cauchy) over the quadrature points; derivatives are those at that point."""
 
     kind: Literal["max-von-mises"] = "max-von-mises"
     unit: ClassVar[str] = "Pa"
     estimable: ClassVar[bool] = False  # at an edge that is held it grows without end as the mesh is refined
+    negative: ClassVar[bool] = False
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         return _MaxVonMises(equations)
 
 
-class MaxPressure(_Largest):
+class MaxPressure(Observable):
     """Largest pressure (Pa, per undeformed area) of a tool at vertices of the mesh; derivatives are those at that one.
 
     Pressures at vertices are averages over the facets that meet there, weighted by hat functions, so that they make up
@@ -61,6 +54,7 @@ class MaxPressure(_Largest):
     kind: Literal["max-pressure"] = "max-pressure"
     unit: ClassVar[str] = "Pa"
     estimable: ClassVar[bool] = False
+    negative: ClassVar[bool] = False
     tool: str = "indenter"
 
     def functional(self, equations: Equations) -> Functional:

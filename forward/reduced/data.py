@@ -11,6 +11,7 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -163,11 +164,9 @@ class ReducedData:
 
 def save(data: ReducedData, path: Path) -> None:
     """Write a reduced model to one file: arrays of NumPy, and a table that says what they are."""
-    import io
-
     arrays: dict[str, NDArray[Any]] = {}
     table = _packed(data, "", arrays)
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     np.savez_compressed(buffer, table=np.array(json.dumps({"format": FORMAT, "model": table})), **arrays)
     write_whole(path, buffer.getvalue())
 
