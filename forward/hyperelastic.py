@@ -83,15 +83,7 @@ class Hyperelastic(LoadedBody):
         yield from in_words(self, said, where)
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
-        """Mesh the body and compile the forms on a communicator; collective.
-
-        Parameters
-        ----------
-        comm
-            mpi4py communicator of the ranks that share the model.
-        parameters
-            Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
-            random fields that it does not hold are zero.
+        """Mesh the body and compile the forms; collective. Coefficients of fields that are no parameters are zero.
 
         Raises
         ------

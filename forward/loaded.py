@@ -1,6 +1,6 @@
 """What finite elements ask of the specification of a hyperelastic body under loads.
 
-What the body consists of is in `forward.solid`, what holds it in `forward.terms.support`.
+What the body consists of is in `forward.solid`, what holds it in `forward.terms.displacement`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from forward.observables.observable import Output
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.solvers.settings import SolverSettings
-from forward.terms.displacement import Block, Displacement, lists, too_far
-from forward.terms.support import Support
+from forward.terms.displacement import Block, Displacement, Support, lists, too_far
 from forward.terms.term import Load
 
 INCREMENTS = 10  # of a load with friction

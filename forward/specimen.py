@@ -174,10 +174,7 @@ class Specimen(Solid):
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number of every case that can be made a parameter, by its path; equal paths are one parameter."""
-        found: dict[str, Scalar] = {}
-        for case in self.cases:
-            found |= self.loaded(case).scalars
-        return found
+        return {path: number for case in self.cases for path, number in self.loaded(case).scalars.items()}
 
     def path_in(self, case: LoadCase, path: str) -> str:
         """Return the path of a number of one load case alone: of what acts there `cases.NAME.PATH`, else the same."""
@@ -186,10 +183,8 @@ class Specimen(Solid):
     @property
     def every_scalar(self) -> dict[str, Scalar]:
         """Every number, those of what acts apart by load case."""
-        found: dict[str, Scalar] = {}
-        for case in self.cases:
-            found |= {self.path_in(case, path): number for path, number in self.loaded(case).scalars.items()}
-        return found
+        numbers = ((case, path, number) for case in self.cases for path, number in self.loaded(case).scalars.items())
+        return {self.path_in(case, path): number for case, path, number in numbers}
 
     @property
     def unavailable(self) -> Mapping[str, str]:
