@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from annotated_types import Gt
 from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
@@ -21,7 +22,7 @@ from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.readable import number, scale, with_unit
 from forward.registry import named
-from forward.scalars import Factor, Mistake, Scalar
+from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.spec import UNREFINED
 from forward.terms.displacement import Block, label, lists, too_far
@@ -175,7 +176,7 @@ class Path(Hyperelastic):
     def every_scalar(self) -> dict[str, Scalar]:
         """Every number, and of what has steps a factor on all of them, `steps.PATH`, unless the body remembers."""
         factors = () if self.path_dependent else self.steps
-        return {**super().every_scalar, **{f"steps.{path}": Scalar(1.0, Factor, "factor") for path in factors}}
+        return {**super().every_scalar, **{f"steps.{path}": Scalar(1.0, besides=(Gt(0),)) for path in factors}}
 
     @property
     def unavailable(self) -> Mapping[str, str]:

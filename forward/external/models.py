@@ -71,12 +71,6 @@ def _values(given: Any) -> Any:
 Output = Annotated[Value, BeforeValidator(_named, json_schema_input_type=Value | str)]
 
 
-class _Number(Settings):
-    """The block of a parameter of an external model: any finite number."""
-
-    value: float
-
-
 class _External(ModelSpec):
     """A map from d numbers to m outputs, without a mesh.
 
@@ -107,7 +101,7 @@ class _External(ModelSpec):
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be a parameter, by name."""
-        return {name: Scalar(value, _Number, "value") for name, value in self.parameters.items()}
+        return {name: Scalar(value) for name, value in self.parameters.items()}
 
     @abstractmethod
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:

@@ -111,8 +111,8 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        placed = zip(("x", "y", "z", *POINTING), (*self.at, *self.along), strict=True)
-        return found | {name: Scalar(value, tools.Pose, name) for name, value in placed}
+        found |= {axis: Scalar(value, besides=(Unit("m"),)) for axis, value in zip("xyz", self.at, strict=True)}
+        return found | {name: Scalar(value) for name, value in zip(POINTING, self.along, strict=True)}
 
     @property
     def size(self) -> float:
