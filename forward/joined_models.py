@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
@@ -16,12 +16,9 @@ from forward.findings import Finding
 from forward.materials.admissible import Materials
 from forward.model import ForwardModel
 from forward.registry import OfKind
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest
 from forward.spec import MODELS, ModelSpec, NamedOutput, PlainOutput
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
 
 Name = Annotated[str, Field(pattern=r"^[^.\s]+$")]
 

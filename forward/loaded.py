@@ -19,13 +19,12 @@ from forward.bodies.inclusions import too_narrow
 from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
-from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
 from forward.findings import Finding
 from forward.materials.material import splits
 from forward.model import ModelError
 from forward.observables.observable import Output
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest, shown
 from forward.solid import Solid
 from forward.solvers.settings import SolverSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -13,13 +13,10 @@ from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume
 from forward.materials.material_point import HomogeneousModel, MaterialTest, stresses_of, unfit
 from forward.registry import KindError
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest, shown
 from forward.solid import block
 from forward.spec import ModelSpec, PlainOutput
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
 
 Constants = dict[str, float | str | tuple[Vector, ...]]  # of a material: its kind, constants and fibres by name
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
@@ -13,6 +13,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.settings import Settings
 
 Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
+Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths
 
 
 def refuse(title: str, mistakes: Iterable[Mistake]) -> None:

@@ -14,12 +14,12 @@ from pydantic import Field, create_model, field_validator
 from forward.bodies.geometry import AXES, Body, Vector, extent, outside
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
-from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.fem.locking import Decision, Formulation, decide, of_locking
 from forward.findings import Finding
 from forward.materials.admissible import Materials, moduli
 from forward.materials.material import MATERIALS, Energy, constants, energy_of, measures, splits
 from forward.registry import OfKind
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
 from forward.spec import ModelSpec

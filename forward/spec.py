@@ -13,20 +13,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, 
 
 from pydantic import model_validator
 
-from forward.model import ModelError
+from forward.model import FloatArray, ForwardModel, ModelError
 from forward.readable import named
 from forward.registry import Kinds, OfKind
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Ranges, Scalar, refuse
 from forward.settings import Settings
 
 if TYPE_CHECKING:
     from forward.bodies.mesh import Contents
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
-    from forward.fem.locking import Ranges
     from forward.fem.mesh_error_cost import Estimate
     from forward.findings import Finding
     from forward.materials.admissible import Materials
-    from forward.model import FloatArray, ForwardModel
 
 UNREFINED = (
     "meshes are refined by studies that sample a model; run one, and name the mesh that it leaves: "

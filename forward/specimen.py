@@ -11,7 +11,6 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import AXES, Vector, holds
 from forward.fem.cost import Times, sum_of
-from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate, own_estimate
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
@@ -19,7 +18,7 @@ from forward.model import ModelError
 from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import Settings, nearest
 from forward.solid import Solid
 from forward.terms.displacement import Displacement

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from forward import model as contract
 from forward.errors import UnknownError
 from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, SolveError, gathered
 from forward.settings import nearest
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from forward import model as contract
 
 SHOWN = 8  # outputs that are written
 

@@ -14,7 +14,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -23,12 +23,9 @@ from forward.external.own_modules import imported
 from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import FloatArray, ModelError, SolveError
 from forward.pointwise import FunctionModel, real
-from forward.scalars import Scalar
+from forward.scalars import Ranges, Scalar
 from forward.settings import Settings, Sized, nearest, written_out
 from forward.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
 
 SECONDS_TO_ANSWER = 30.0  # for questions that need no solve
 PROTOCOL = 1.0

@@ -7,22 +7,19 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
+from forward.materials.admissible import Materials
 from forward.model import FloatArray, ModelError
 from forward.registry import named
-from forward.scalars import Scalar
+from forward.scalars import Ranges, Scalar
 from forward.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
-    from forward.loaded import LoadedBody
-    from forward.materials.admissible import Materials
 
 LETTERS = 16  # of a hash
 BY_CHANCE = 0.01  # so rarely an end of the distribution is farther from all snapshots than a study may go beyond them
