@@ -29,7 +29,8 @@ def refuse(title: str, mistakes: Iterable[Mistake]) -> None:
 class Scalar(NamedTuple):
     """A number of the model that can be made a parameter.
 
-    Its unit, and what it may be, are among the annotations of a field of a block, and those that are given besides.
+    Its unit, and what it may be, are among the annotations of a field of a block, and those that are given besides. By
+    the name of the field it is known as a coordinate or as part of a direction, where there is no block too.
     """
 
     value: float

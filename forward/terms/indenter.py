@@ -111,8 +111,9 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        found |= {axis: Scalar(value, besides=(Unit("m"),)) for axis, value in zip("xyz", self.at, strict=True)}
-        return found | {name: Scalar(value) for name, value in zip(POINTING, self.along, strict=True)}
+        places, pointing = zip("xyz", self.at, strict=True), zip(POINTING, self.along, strict=True)
+        found |= {axis: Scalar(value, field=axis, besides=(Unit("m"),)) for axis, value in places}
+        return found | {name: Scalar(value, field=name) for name, value in pointing}
 
     @property
     def size(self) -> float:
