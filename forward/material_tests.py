@@ -103,7 +103,7 @@ class MaterialTests(ModelSpec):
         return HomogeneousModel(self.energy, self.fixed, self.tests, parameters, self.fibres)
 
     def _mistakes(self) -> Iterator[Mistake]:
-        wrong = next(self._of_material(), None)
+        wrong = self._of_material()
         if wrong is not None:
             yield (), wrong, self.material
             return
@@ -117,31 +117,28 @@ class MaterialTests(ModelSpec):
         for _, said in () if self.varied else self.materials().objections({}):
             yield ("material",), said, dict(self.fixed)
 
-    def _of_material(self) -> Iterator[str]:
-        """Find what is wrong with the kind or the constants."""
+    def _of_material(self) -> str | None:
+        """Say what is wrong with the kind or the constants, or None if nothing is."""
         kind = self.material.get("kind")
         if kind is None:
-            yield "material.kind: missing"
-            return
+            return "material.kind: missing"
         try:
             MATERIALS[str(kind)]
         except KindError as error:
-            yield f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
-            return
+            return f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
         words = [name for name in self.material if name not in {"kind", "fibres", *self.fixed}]
         if words:
-            yield f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
+            return f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
         known = constants(self.energy)
         given = dict.fromkeys([*self.fixed, *self.varied])
         for name in given:
             if name not in known:
-                yield f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+                return f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
             if name in self.fixed and name in self.varied:
-                yield f"'{name}' is given in material and in parameters, expected one of them"
+                return f"'{name}' is given in material and in parameters, expected one of them"
         left_out = of_volume(self.energy) if incompressible(self.energy, given) else ()
-        missing = [name for name in known if name not in given and name not in left_out]
-        if missing:
-            yield f"missing: {', '.join(missing)}, expected in material{' or parameters' if self.varied else ''}"
+        missing = ", ".join(name for name in known if name not in given and name not in left_out)
+        return f"missing: {missing}, expected in material{' or parameters' if self.varied else ''}" if missing else None
 
 
 class CandidateTests(MaterialTests):
