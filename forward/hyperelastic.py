@@ -137,13 +137,12 @@ class Path(Hyperelastic):
             items = given.get(block, ())
             if not isinstance(items, list | tuple):
                 continue
-            of_items = [lists(block, item) for item in items]
-            for item, of_item in zip(items, of_items, strict=True):
+            changed[block] = ()
+            for item in items:
+                of_item = lists(block, item)
                 found |= {f"{block}.{label(block, item)}.{name}": values for name, values in of_item.items()}
-            changed[block] = tuple(
-                {**item, **{name: values[-1] for name, values in of_item.items()}} if of_item else item
-                for item, of_item in zip(items, of_items, strict=True)
-            )
+                last = {name: values[-1] for name, values in of_item.items()}
+                changed[block] += ({**item, **last} if last else item,)
         return {**given, **changed, "steps": stated if found == stated else found}
 
     @property
