@@ -11,10 +11,9 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.assumptions import cube_spec
-from forward.enlargements import enlarged
+from forward.enlargements import QUARTICS, enlarged, quartics
 from forward.model import FloatArray
 from forward.specimen import Specimen
-from forward.terms.fibres import QUARTICS, quartics
 from inverse.criticism.questions import CALLED, asked
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace

@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from forward.reduced.data import load
 from forward.reduced.model import ReducedModel
-from forward.reduced.stream import begin, local
+from forward.reduced.stream import Stream, local
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
 from uq.inputs.sampling import random_points
@@ -134,7 +134,8 @@ def _frames(model: ReducedModel) -> None:
     names, radius = list(data.parameters), 0.015
     moved = [i for i, name in enumerate(names) if name in {"loads.spot.x", "loads.spot.y", "loads.pressure.size"}]
     uncertain[moved] = 0
-    stream, lasted, busy = begin(model, uncertain), np.empty(FRAMES), np.empty(FRAMES)
+    stream = Stream(model, local(model, model.data.nominal, None, uncertain))
+    lasted, busy = np.empty((2, FRAMES))
     errors = []
     for k in range(FRAMES):
         at = data.nominal.copy()

@@ -7,11 +7,14 @@ the strengths are standard normal beforehand: changes of ln of the stiffness at 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from itertools import combinations_with_replacement
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Unit
+from pydantic import create_model
 
-from forward.bodies.geometry import Body
+from forward.bodies.geometry import AXES, Body
 from forward.bodies.inclusions import RADII, Ellipsoid, Sphere, log_factor
 from forward.bodies.random_fields import RandomField
 from forward.bodies.surface import Surface, facets, fan
@@ -19,7 +22,7 @@ from forward.model import FloatArray
 from forward.readable import number, place, told
 from forward.solid import Solid
 from forward.specimen import Specimen
-from forward.terms.fibres import QUARTICS, Fibres, quartics
+from forward.terms.term import Place, Term
 
 # Standard deviations beforehand: of ln of an edge's width, of ln of the ratio of two radii over 2, of ln of stiffness.
 EDGE, RATIO, STIFFNESS = np.log(2), 0.25, np.log(2)
@@ -32,6 +35,37 @@ DEPTHS = (0.1, 0.2)  # of a layer, over the smallest extent of the body
 LENGTH, MODES = 0.5, 16  # of a field: its correlation length over the smallest extent, and its modes
 DIRECTIONS = 48  # of fibres
 ASKED = "asked"  # name of what is added
+PAIRS = list(combinations_with_replacement(range(3), 2))
+QUARTICS = [f"{'x' * p}{'y' * q}{'z' * (4 - p - q)}" for p in range(5) for q in range(5 - p)]
+"""Names of the 15 numbers that fibres are described by."""
+
+
+class _Fibres(Term):
+    """Fibres that carry tension and compression: ½ ∫ Σ_f k_f (a_f·E a_f)² dX, E = (C − I)/2.
+
+    A fibre stretched by 1 + e has the tension k e to first order. All families together are the fourth-order tensor
+    Σ k a⊗a⊗a⊗a, which is symmetric in all of its indices: its 15 components are the numbers of this load.
+    """
+
+    kind: str = "fibres"
+
+    def potential(self, at: Place) -> Any:
+        """Return its energy (J)."""
+        C = at.F.T * at.F
+        # Components of E, those off the diagonal twice, with the two axes of each.
+        strains = [(C[a, a] - 1) / 2 if a == b else C[a, b] for a, b in PAIRS]
+        named = [[at.numbers["".join(sorted(AXES[i] for i in (*one, *other)))] for other in PAIRS] for one in PAIRS]
+        stresses = [sum(k * e for k, e in zip(row, strains, strict=True)) for row in named]
+        return sum(s * e for s, e in zip(stresses, strains, strict=True)) / 2 * at.dx
+
+
+_NUMBERS: dict[str, Any] = {name: (Annotated[float, Unit("Pa")], 0.0) for name in QUARTICS}
+Fibres: type[Term] = create_model("Fibres", __base__=_Fibres, **_NUMBERS)
+
+
+def quartics(direction: FloatArray) -> FloatArray:
+    """Return the numbers (15,) of fibres along a unit vector (3,), of modulus one."""
+    return np.array([np.prod([direction[AXES.index(axis)] for axis in name]) for name in QUARTICS])
 
 
 class Lump(NamedTuple):

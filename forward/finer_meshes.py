@@ -12,18 +12,15 @@ of what is held (`forward.bodies.tetrahedra`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from forward.bodies.random_fields import RandomField
 from forward.bodies.tetrahedra import RATIO, layers_of, within
+from forward.loaded import LoadedBody
 from forward.model import ModelError
+from forward.specimen import Specimen
 
-if TYPE_CHECKING:
-    from forward.loaded import LoadedBody
-    from forward.specimen import Specimen
-
-    AnyBody = LoadedBody | Specimen
-
+AnyBody = LoadedBody | Specimen
 TIMES = 1.5  # cells along an edge, over those of the body
 LEAST = {TIMES: 5, 1.0: 3}  # cells along an edge of the finer and of the coarser mesh
 OF_EQUAL = 1.6  # order with which errors fall where cells are not graded towards what causes them

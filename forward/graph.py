@@ -8,7 +8,7 @@ the part of it that some outputs need, as arrays: it is what files hold (data, n
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -318,13 +318,7 @@ class Scalar:
 
 def to_arrays(tape: Tape) -> dict[str, NDArray[Any]]:
     """Return a tape as arrays for a file."""
-    return {
-        "inputs": np.array(tape.inputs),
-        "constants": tape.constants,
-        "codes": tape.codes,
-        "arguments": tape.arguments,
-        "outputs": tape.outputs,
-    }
+    return {one.name: np.asarray(getattr(tape, one.name)) for one in fields(tape)}
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Tape:

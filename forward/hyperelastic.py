@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from annotated_types import Gt
 from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
@@ -21,7 +22,7 @@ from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.readable import number, scale, with_unit
 from forward.registry import named
-from forward.scalars import Factor, Mistake, Scalar
+from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
 from forward.spec import UNREFINED
 from forward.terms.displacement import Block, label, lists, too_far
@@ -83,15 +84,7 @@ class Hyperelastic(LoadedBody):
         yield from in_words(self, said, where)
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
-        """Mesh the body and compile the forms on a communicator; collective.
-
-        Parameters
-        ----------
-        comm
-            mpi4py communicator of the ranks that share the model.
-        parameters
-            Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
-            random fields that it does not hold are zero.
+        """Mesh the body and compile the forms; collective. Coefficients of fields that are no parameters are zero.
 
         Raises
         ------
@@ -144,13 +137,12 @@ class Path(Hyperelastic):
             items = given.get(block, ())
             if not isinstance(items, list | tuple):
                 continue
-            of_items = [lists(block, item) for item in items]
-            for item, of_item in zip(items, of_items, strict=True):
+            changed[block] = ()
+            for item in items:
+                of_item = lists(block, item)
                 found |= {f"{block}.{label(block, item)}.{name}": values for name, values in of_item.items()}
-            changed[block] = tuple(
-                {**item, **{name: values[-1] for name, values in of_item.items()}} if of_item else item
-                for item, of_item in zip(items, of_items, strict=True)
-            )
+                last = {name: values[-1] for name, values in of_item.items()}
+                changed[block] += ({**item, **last} if last else item,)
         return {**given, **changed, "steps": stated if found == stated else found}
 
     @property
@@ -183,7 +175,7 @@ class Path(Hyperelastic):
     def every_scalar(self) -> dict[str, Scalar]:
         """Every number, and of what has steps a factor on all of them, `steps.PATH`, unless the body remembers."""
         factors = () if self.path_dependent else self.steps
-        return {**super().every_scalar, **{f"steps.{path}": Scalar(1.0, Factor, "factor") for path in factors}}
+        return {**super().every_scalar, **{f"steps.{path}": Scalar(1.0, besides=(Gt(0),)) for path in factors}}
 
     @property
     def unavailable(self) -> Mapping[str, str]:

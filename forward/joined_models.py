@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.sparse import block_diag, csr_matrix, identity, kron, vstack
 
 from forward.combine import Joined, Rows, sums_of, taking
@@ -16,23 +16,11 @@ from forward.findings import Finding
 from forward.materials.admissible import Materials
 from forward.model import ForwardModel
 from forward.registry import OfKind
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest
-from forward.spec import MODELS, ModelSpec, NamedOutput
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
+from forward.spec import MODELS, ModelSpec, NamedOutput, PlainOutput
 
 Name = Annotated[str, Field(pattern=r"^[^.\s]+$")]
-
-
-class Named(NamedTuple):
-    """An output of one of the models, by its name among those of all."""
-
-    name: str
-    unit: str
-    estimable: bool
-    negative: bool
 
 
 class JoinedModels(ModelSpec):
@@ -78,7 +66,7 @@ class JoinedModels(ModelSpec):
     def outputs(self) -> tuple[NamedOutput, ...]:
         """What all models return, of one after that of the other."""
         return tuple(
-            Named(f"{name}.{one.name}", one.unit, getattr(one, "estimable", True), getattr(one, "negative", True))
+            PlainOutput(f"{name}.{one.name}", one.unit, getattr(one, "estimable", True), getattr(one, "negative", True))
             for name, model in self.models.items()
             for one in model.returned
         )
@@ -152,11 +140,6 @@ class JoinedModels(ModelSpec):
             part = model.build(comm, tuple(path for path, _ in acting))
             made.append(taking(part, [column for _, column in acting], parameters))
         return Joined(tuple(made), tuple(one.name for one in self.outputs), tuple(f"model '{n}'" for n in self.models))
-
-    @model_validator(mode="after")
-    def _check(self) -> JoinedModels:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         for i, path in enumerate(self.shared):

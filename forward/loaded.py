@@ -1,6 +1,6 @@
 """What finite elements ask of the specification of a hyperelastic body under loads.
 
-What the body consists of is in `forward.solid`, what holds it in `forward.terms.support`.
+What the body consists of is in `forward.solid`, what holds it in `forward.terms.displacement`.
 """
 
 from __future__ import annotations
@@ -11,23 +11,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from forward.adapt import Adapt, Refinable
+from forward.adapt import Adapt
 from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
 from forward.bodies.inclusions import too_narrow
+from forward.bodies.mesh import Contents
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
-from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
 from forward.findings import Finding
 from forward.materials.material import splits
 from forward.model import ModelError
 from forward.observables.observable import Output
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest, shown
+from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
-from forward.terms.displacement import Block, Displacement, lists, too_far
-from forward.terms.support import Support
+from forward.terms.displacement import Block, Displacement, Support, lists, too_far
 from forward.terms.term import Load
 
 INCREMENTS = 10  # of a load with friction
@@ -38,7 +39,7 @@ IN_WORDS = {  # what linear systems are solved with
 }
 
 
-class LoadedBody(Refinable):
+class LoadedBody(Solid):
     """A hyperelastic body under loads, as finite elements ask for it; its fields are those of `Hyperelastic`."""
 
     meshed: ClassVar[bool] = True
@@ -182,6 +183,54 @@ class LoadedBody(Refinable):
         if followers and self.strains == "finite" and not self.solver.accept_unstable:
             yield Finding("followers", "note", {"loads": ", ".join(followers)})
 
+    def enriched(self) -> Self:
+        """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
+        formulation = "mixed" if self.mixed else "displacement"
+        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the mesh is refined before anything else is solved."""
+        return self.adapt is not None
+
+    @property
+    def unrefined(self) -> bool:
+        """Whether that is still to be done."""
+        return self.adapt is not None and not self.adapt.refined
+
+    @property
+    def largest_bytes(self) -> float:
+        """Predicted memory (bytes) of the largest mesh that it may be refined to, with estimates; 0 where it is not."""
+        return 0.0 if self.adapt is None or self.adapt.refined else self.adapt.largest_bytes(self)
+
+    def on_mesh(self, file: str, contents: Contents | None = None) -> Self:
+        """Return the same problem with the same elements on a refined mesh in a file, or one that holds the same.
+
+        Raises
+        ------
+        ValidationError
+            If the file cannot be read.
+        """
+        elements = {"degree": self.body.degree, "quadrature_degree": self.body.quadrature_degree}
+        known = {} if contents is None else {"contents": contents}
+        body = MeshFile.model_validate({"file": file, **known, **elements})
+        adapt = None if self.adapt is None else self.adapt.model_copy(update={"refined": True})
+        return self.model_copy(update={"body": body, "adapt": adapt})
+
+    def require_modes(self) -> None:
+        """Make sure that random fields let the mesh be changed.
+
+        Raises
+        ------
+        ModelError
+            If coefficients of fields are those of its vertices.
+        """
+        if any(field.basis != "modes" for field in self.fields):
+            message = (
+                "a random field with a coefficient at every vertex would change with the mesh, expected basis = 'modes'"
+            )
+            raise ModelError(message)
+
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""
         return self.model_copy(update={"body": self.body.refined(level)})
@@ -318,11 +367,6 @@ class LoadedBody(Refinable):
         found["body"].pop("file", None)
         return found
 
-    @model_validator(mode="after")
-    def _check(self) -> LoadedBody:
-        refuse(type(self).__name__, self._mistakes())
-        return self
-
     def _mistakes(self) -> Iterator[Mistake]:
         """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
         boundaries = self.body.boundaries
@@ -354,7 +398,8 @@ class LoadedBody(Refinable):
         yield from self._mistakes_of_linear_solver()
         support = Support(self.body, self.clamp, self.displacements, self.loads)
         yield from support.contradictions()
-        yield from self.mistakes_of_adapt()
+        if self.adapt is not None and self.unrefined:
+            yield from self.adapt.mistakes(self)
         what = self.unestimated_with
         if self.adapt is not None and what:
             expected = "friction = 0" if what == "friction" else "neither"

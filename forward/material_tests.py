@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.bodies.geometry import Vector
 from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume
 from forward.materials.material_point import HomogeneousModel, MaterialTest, stresses_of, unfit
 from forward.registry import KindError
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import nearest, shown
 from forward.solid import block
-from forward.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
+from forward.spec import ModelSpec, PlainOutput
 
 Constants = dict[str, float | str | tuple[Vector, ...]]  # of a material: its kind, constants and fibres by name
-
-
-class Stress(NamedTuple):
-    """A stress that a test measures."""
-
-    name: str
-    unit: str = "Pa"
 
 
 class MaterialTests(ModelSpec):
@@ -74,9 +64,9 @@ class MaterialTests(ModelSpec):
         return found if isinstance(found, tuple) else ()
 
     @property
-    def outputs(self) -> tuple[Stress, ...]:
+    def outputs(self) -> tuple[PlainOutput, ...]:
         """The stresses of all tests, one after the other."""
-        return tuple(map(Stress, stresses_of(self.tests)))
+        return tuple(PlainOutput(name, "Pa") for name in stresses_of(self.tests))
 
     @property
     def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
@@ -112,13 +102,8 @@ class MaterialTests(ModelSpec):
         """Make the model; constants that are no parameters keep their values."""
         return HomogeneousModel(self.energy, self.fixed, self.tests, parameters, self.fibres)
 
-    @model_validator(mode="after")
-    def _check(self) -> MaterialTests:
-        refuse(type(self).__name__, self._mistakes())
-        return self
-
     def _mistakes(self) -> Iterator[Mistake]:
-        wrong = next(self._of_material(), None)
+        wrong = self._of_material()
         if wrong is not None:
             yield (), wrong, self.material
             return
@@ -132,31 +117,28 @@ class MaterialTests(ModelSpec):
         for _, said in () if self.varied else self.materials().objections({}):
             yield ("material",), said, dict(self.fixed)
 
-    def _of_material(self) -> Iterator[str]:
-        """Find what is wrong with the kind or the constants."""
+    def _of_material(self) -> str | None:
+        """Say what is wrong with the kind or the constants, or None if nothing is."""
         kind = self.material.get("kind")
         if kind is None:
-            yield "material.kind: missing"
-            return
+            return "material.kind: missing"
         try:
             MATERIALS[str(kind)]
         except KindError as error:
-            yield f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
-            return
+            return f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
         words = [name for name in self.material if name not in {"kind", "fibres", *self.fixed}]
         if words:
-            yield f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
+            return f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
         known = constants(self.energy)
         given = dict.fromkeys([*self.fixed, *self.varied])
         for name in given:
             if name not in known:
-                yield f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+                return f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
             if name in self.fixed and name in self.varied:
-                yield f"'{name}' is given in material and in parameters, expected one of them"
+                return f"'{name}' is given in material and in parameters, expected one of them"
         left_out = of_volume(self.energy) if incompressible(self.energy, given) else ()
-        missing = [name for name in known if name not in given and name not in left_out]
-        if missing:
-            yield f"missing: {', '.join(missing)}, expected in material{' or parameters' if self.varied else ''}"
+        missing = ", ".join(name for name in known if name not in given and name not in left_out)
+        return f"missing: {missing}, expected in material{' or parameters' if self.varied else ''}" if missing else None
 
 
 class CandidateTests(MaterialTests):

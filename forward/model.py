@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from forward.errors import Error
 
@@ -260,17 +260,12 @@ class MeshError:
     nonlinearity: float = 0.0
     stored: float = math.nan
 
-    def calibrated(self, saturation: Saturation, ratios: ArrayLike = 1.0) -> MeshError:
+    def calibrated(self, saturation: Saturation) -> MeshError:
         """Return the estimate of the whole error, with what elements of one degree more do not see.
 
-        Parameters
-        ----------
-        saturation
-            What calibrates it.
-        ratios
-            Outputs (m,) over those where that was found.
+        At the solution where the `saturation` was found: shifts are not in proportion to other outputs.
         """
-        added = 0.0 if saturation.shifts is None else saturation.shifts * np.asarray(ratios)
+        added = 0.0 if saturation.shifts is None else saturation.shifts
         return replace(
             self,
             outputs=saturation.outputs * self.outputs + added,

@@ -159,15 +159,12 @@ class FunctionModel(OneByOne):
     outputs: tuple[str, ...]
     jacobian: Callable[[FloatArray], ArrayLike] | None = None
 
+    space = None  # no states
+
     @property
     def differentiable(self) -> bool:
         """Whether a jacobian was given."""
         return self.jacobian is not None
-
-    @property
-    def space(self) -> None:
-        """No states."""
-        return
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FunctionSolution:
         """Evaluate the function at `parameters` (d,); there is no state to guess, and nothing to iterate on."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -137,8 +138,7 @@ def _read_again(_folders: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]
 
 def named(text: str) -> Any:
     """Import and return the object that a string "module:Name" names."""
-    module, _, name = text.partition(":")
-    return getattr(importlib.import_module(module), name)
+    return pkgutil.resolve_name(text)
 
 
 def dotted(document: Any) -> Iterator[str]:

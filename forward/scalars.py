@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
@@ -13,6 +13,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.settings import Settings
 
 Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
+Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths
 
 
 def refuse(title: str, mistakes: Iterable[Mistake]) -> None:
@@ -26,31 +27,29 @@ def refuse(title: str, mistakes: Iterable[Mistake]) -> None:
 
 
 class Scalar(NamedTuple):
-    """A number of the model that can be made a parameter."""
+    """A number of the model that can be made a parameter.
+
+    Its unit, and what it may be, are among the annotations of a field of a block, and those that are given besides. By
+    the name of the field it is known as a coordinate or as part of a direction, where there is no block too.
+    """
 
     value: float
-    block: type[Settings]
-    field: str
-    limits: tuple[Any, ...] = ()  # beyond those of the field
+    block: type[Settings] | None = None
+    field: str = ""
+    besides: tuple[Any, ...] = ()
 
     def objection(self, value: float) -> str | None:
         """Say why the number cannot be `value`, or None if it can."""
         try:
-            _admissible(self.block, self.field, self.limits).validate_python(value)
+            _admissible(*self[1:]).validate_python(value)
         except ValidationError as error:
             return str(error.errors()[0]["msg"]).lower()
         return None
 
     @property
     def unit(self) -> str:
-        """SI unit from the annotation of the field; "1" without."""
-        return unit_of(self.block.model_fields[self.field].metadata) or "1"
-
-
-class Factor(Settings):
-    """A factor on numbers of a model."""
-
-    factor: Annotated[float, Field(gt=0), Unit("1")] = 1.0
+        """SI unit among the annotations; "1" without."""
+        return unit_of(_annotations(*self[1:])) or "1"
 
 
 def numbers(block: type[Settings]) -> tuple[str, ...]:
@@ -63,6 +62,10 @@ def unit_of(annotations: Iterable[Any]) -> str | None:
     return next((item.unit for item in annotations if isinstance(item, Unit)), None)
 
 
+def _annotations(block: type[Settings] | None, field: str, besides: tuple[Any, ...]) -> tuple[Any, ...]:
+    return besides if block is None else (*block.model_fields[field].metadata, *besides)
+
+
 @cache
-def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> TypeAdapter[float]:
-    return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
+def _admissible(block: type[Settings] | None, field: str, besides: tuple[Any, ...]) -> TypeAdapter[float]:
+    return TypeAdapter(Annotated[(float, Field(), *_annotations(block, field, besides))])

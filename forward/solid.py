@@ -14,17 +14,17 @@ from pydantic import Field, create_model, field_validator
 from forward.bodies.geometry import AXES, Body, Vector, extent, outside
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
-from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.fem.locking import Decision, Formulation, decide, of_locking
 from forward.findings import Finding
 from forward.materials.admissible import Materials, moduli
 from forward.materials.material import MATERIALS, Energy, constants, energy_of, measures, splits
 from forward.registry import OfKind
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
 from forward.spec import ModelSpec
 
-CONTRAST = "contrast"
+CONTRAST = "contrast"  # of a region: factor (1) on the stiffness that follows from its constants
 
 
 class _Fibrous(Settings):
@@ -61,18 +61,6 @@ def _block(kind: str, energy: Energy) -> type[Settings]:
 Material = Annotated[Settings, OfKind(MATERIALS, make=block)]
 
 
-class RegionNumbers(Settings):
-    """What a region may have besides material constants.
-
-    Parameters
-    ----------
-    contrast
-        Factor (1) on the stiffness that follows from its constants.
-    """
-
-    contrast: Annotated[float, Gt(0)]
-
-
 class Solid(ModelSpec):
     """A body of a hyperelastic material: the part of a specification that knows neither supports nor loads.
 
@@ -106,9 +94,11 @@ class Solid(ModelSpec):
             found[f"material.{name}"] = Scalar(self.numbers[name], type(self.material), name)
         for region, numbers in self.regions.items():
             for name, value in numbers.items():
-                block = RegionNumbers if name == CONTRAST else type(self.material)
-                if name in block.model_fields:
-                    found[f"regions.{region}.{name}"] = Scalar(value, block, name)
+                path = f"regions.{region}.{name}"
+                if name == CONTRAST:
+                    found[path] = Scalar(value, besides=(Gt(0),))
+                elif name in type(self.material).model_fields:
+                    found[path] = Scalar(value, type(self.material), name)
         for inclusion in self.inclusions:
             for name, value in inclusion:
                 if name not in {"kind", "name"}:

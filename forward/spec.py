@@ -9,22 +9,22 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
-from forward.model import ModelError
+from pydantic import model_validator
+
+from forward.model import FloatArray, ForwardModel, ModelError
 from forward.readable import named
 from forward.registry import Kinds, OfKind
-from forward.scalars import Mistake, Scalar
+from forward.scalars import Mistake, Ranges, Scalar, refuse
 from forward.settings import Settings
 
 if TYPE_CHECKING:
     from forward.bodies.mesh import Contents
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
-    from forward.fem.locking import Ranges
     from forward.fem.mesh_error_cost import Estimate
     from forward.findings import Finding
     from forward.materials.admissible import Materials
-    from forward.model import FloatArray, ForwardModel
 
 UNREFINED = (
     "meshes are refined by studies that sample a model; run one, and name the mesh that it leaves: "
@@ -42,6 +42,15 @@ class NamedOutput(Protocol):
     @property
     def unit(self) -> str:
         """SI unit of its value; "1" for ratios."""
+
+
+class PlainOutput(NamedTuple):
+    """An output of which no more is known than this; the last two as of `forward.observables.observable`."""
+
+    name: str
+    unit: str
+    estimable: bool = True
+    negative: bool = True
 
 
 class ModelSpec(Settings):
@@ -304,6 +313,15 @@ class ModelSpec(Settings):
     def identity(self) -> dict[str, Any]:
         """Return everything that results depend on, as a table."""
         return self.model_dump(mode="json", exclude_none=True)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(type(self).__name__, self._mistakes())
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        """Find mistakes that no single block can see."""
+        yield from ()
 
 
 MODELS = Kinds(

@@ -11,7 +11,6 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import AXES, Vector, holds
 from forward.fem.cost import Times, sum_of
-from forward.fem.locking import Ranges
 from forward.fem.mesh_error_cost import Estimate, own_estimate
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
@@ -19,7 +18,7 @@ from forward.model import ModelError
 from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Scalar, refuse
+from forward.scalars import Mistake, Ranges, Scalar
 from forward.settings import Settings, nearest
 from forward.solid import Solid
 from forward.terms.displacement import Displacement
@@ -174,10 +173,7 @@ class Specimen(Solid):
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number of every case that can be made a parameter, by its path; equal paths are one parameter."""
-        found: dict[str, Scalar] = {}
-        for case in self.cases:
-            found |= self.loaded(case).scalars
-        return found
+        return {path: number for case in self.cases for path, number in self.loaded(case).scalars.items()}
 
     def path_in(self, case: LoadCase, path: str) -> str:
         """Return the path of a number of one load case alone: of what acts there `cases.NAME.PATH`, else the same."""
@@ -186,10 +182,8 @@ class Specimen(Solid):
     @property
     def every_scalar(self) -> dict[str, Scalar]:
         """Every number, those of what acts apart by load case."""
-        found: dict[str, Scalar] = {}
-        for case in self.cases:
-            found |= {self.path_in(case, path): number for path, number in self.loaded(case).scalars.items()}
-        return found
+        numbers = ((case, path, number) for case in self.cases for path, number in self.loaded(case).scalars.items())
+        return {self.path_in(case, path): number for case, path, number in numbers}
 
     @property
     def unavailable(self) -> Mapping[str, str]:
@@ -281,11 +275,6 @@ class Specimen(Solid):
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms of every case, as `Hyperelastic.build` does of one; collective."""
         return named("forward.fem.joined:specimen")(self, comm, parameters)
-
-    @model_validator(mode="after")
-    def _check(self) -> Specimen:
-        refuse(type(self).__name__, self._mistakes())
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from forward import model as contract
 from forward.errors import UnknownError
 from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, SolveError, gathered
 from forward.settings import nearest
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from forward import model as contract
 
 SHOWN = 8  # outputs that are written
 
@@ -44,6 +41,8 @@ class Model:
 
     Attributes
     ----------
+    model
+        The model as methods see it: vectors in, vectors out.
     parameters
         The numbers that can change, with their values in the specification, by path.
     units
@@ -67,10 +66,10 @@ class Model:
         for path in names:
             if path not in spec.scalars:
                 raise UnknownError(f"'{path}' is not a number of the model; {nearest(path, tuple(spec.scalars))}")
-        self._model: contract.ForwardModel = spec.build(comm, names)
+        self.model: contract.ForwardModel = spec.build(comm, names)
         self.parameters = {name: spec.scalars[name].value for name in names}
         self.units = {output.name: output.unit for output in spec.returned}
-        self.nodes = None if self._model.space is None else self._model.space.coordinates
+        self.nodes = None if self.model.space is None else self.model.space.coordinates
 
     def __repr__(self) -> str:
         """Its kind, how many numbers can change, and its outputs."""
@@ -109,12 +108,7 @@ class Model:
                 raise UnknownError(message)
         point = np.array([values.get(path, value) for path, value in self.parameters.items()])
         guess = None if near is None else Guess(near.solved.state, ReferenceSolution(near.point, near.solved.state))
-        return Solution(self, point, self._model.solve(point, guess))
-
-    @property
-    def model(self) -> contract.ForwardModel:
-        """The model as methods see it: vectors in, vectors out."""
-        return self._model
+        return Solution(self, point, self.model.solve(point, guess))
 
 
 def _first(words: Iterable[str]) -> str:

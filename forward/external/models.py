@@ -14,7 +14,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -23,12 +23,9 @@ from forward.external.own_modules import imported
 from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import FloatArray, ModelError, SolveError
 from forward.pointwise import FunctionModel, real
-from forward.scalars import Scalar
+from forward.scalars import Ranges, Scalar
 from forward.settings import Settings, Sized, nearest, written_out
 from forward.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
 
 SECONDS_TO_ANSWER = 30.0  # for questions that need no solve
 PROTOCOL = 1.0
@@ -71,12 +68,6 @@ def _values(given: Any) -> Any:
 Output = Annotated[Value, BeforeValidator(_named, json_schema_input_type=Value | str)]
 
 
-class _Number(Settings):
-    """The block of a parameter of an external model: any finite number."""
-
-    value: float
-
-
 class _External(ModelSpec):
     """A map from d numbers to m outputs, without a mesh.
 
@@ -107,7 +98,7 @@ class _External(ModelSpec):
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be a parameter, by name."""
-        return {name: Scalar(value, _Number, "value") for name, value in self.parameters.items()}
+        return {name: Scalar(value) for name, value in self.parameters.items()}
 
     @abstractmethod
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:

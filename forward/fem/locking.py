@@ -8,7 +8,7 @@ between samples would be a jump of their outputs.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,8 +16,8 @@ import numpy as np
 from forward.findings import Finding
 from forward.materials.admissible import Materials, admissible, moduli
 from forward.materials.material import splits
+from forward.scalars import Ranges
 
-Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths
 Formulation = Literal["displacement", "mixed", "auto"]
 
 # κ/μ above which "auto" takes the mixed form (ν = 0.35). There the two forms differ by 0.5 to 1 % on the meshes of

@@ -156,6 +156,8 @@ def _blocks(path: Path, depth: int = 0) -> Iterator[Block]:
 def read(path: Path) -> Part:
     """Read a file: its instances that have elements, joined; the parts, or the flat file, where there are none.
 
+    The nodes of a file that has no elements.
+
     Raises
     ------
     ValueError
@@ -186,7 +188,10 @@ def read(path: Path) -> Part:
         except ValueError as error:
             where = "" if str(error).startswith("line ") else f"line {block.line}: *{block.keyword}: "
             raise ValueError(f"{where}{error}") from None
-    return _chosen(instances.values()) or _chosen(parts.values()) or _chosen([flat]) or _alone(flat)
+    found = _chosen(instances.values()) or _chosen(parts.values()) or _chosen([flat])
+    if found is None and not flat.nodes:
+        raise ValueError("no *NODE with rows")
+    return found or flat
 
 
 def _chosen(those: Iterable[Part]) -> Part | None:
@@ -199,13 +204,6 @@ def _chosen(those: Iterable[Part]) -> Part | None:
     for other in others:
         first.join(other)
     return first
-
-
-def _alone(flat: Part) -> Part:
-    """Return the nodes of a file that has no elements."""
-    if not flat.nodes:
-        raise ValueError("no *NODE with rows")
-    return flat
 
 
 def _of_instances(instances: dict[str, Part], block: Block) -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import meshio
 
 OWN = {".inp": abaqus_mesh.read, ".xdmf": xdmf.read, ".vtp": vtk.read}
+BESIDE = {".inp": abaqus.included, ".xdmf": xdmf.stored}
 OF_VTK = (".vtk", ".vtu")  # of which meshio reads the usual ones, faster and without VTK
 
 
@@ -25,11 +26,8 @@ def beside(path: Path) -> list[Path]:
     OSError
         If the file cannot be read.
     """
-    if path.suffix == ".inp":
-        return abaqus.included(path)
-    if path.suffix == ".xdmf":
-        return xdmf.stored(path)
-    return []
+    found = BESIDE.get(path.suffix)
+    return [] if found is None else found(path)
 
 
 def read(path: Path) -> meshio.Mesh:

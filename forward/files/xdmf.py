@@ -31,8 +31,7 @@ TAGS = "cell_tags"  # the array of all tags, where there is one set for cells an
 
 def stored(path: Path) -> list[Path]:
     """Return the files in which a file stores its numbers; raises OSError."""
-    whole = path.read_bytes()
-    names = {name for name, _ in STORED.findall(whole)} | {name for _, name in STORED.findall(whole)}
+    names = {name for either in STORED.findall(path.read_bytes()) for name in either}
     return [path.parent / os.fsdecode(name) for name in sorted(names - {b""})]
 
 

@@ -15,11 +15,10 @@ import inspect
 from collections.abc import Callable, Mapping
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 from forward.materials.kinematics import dilation_of, expm1_of, log1p_of, of_stretches
 from forward.registry import Kinds
-from forward.scalars import unit_of
 
 Energy = Callable[..., Any]
 KNOWN = ("i1", "i2", "j", "l1", "l2", "l3", "i4", "trace", "square")  # measures of a deformation
@@ -108,11 +107,6 @@ def _constants(energy: Energy) -> dict[str, Any]:
         parameters = inspect.signature(part).parameters.items()
         found |= {name: hints.get(name, Any) for name, p in parameters if p.kind is p.KEYWORD_ONLY}
     return found
-
-
-def units(energy: str | Energy) -> dict[str, str]:
-    """Return the names of the constants of an energy, each with its SI unit ("1" for ratios)."""
-    return {name: unit_of(get_args(hint)) or "1" for name, hint in constants(energy).items()}
 
 
 def _quadratic(ops: Any, j: Any, *, D1: Any) -> Any:

@@ -36,7 +36,6 @@ from forward.materials.material import (
     isochoric,
     measured,
     measures,
-    of_volume,
 )
 from forward.model import FloatArray, Guess, InadmissibleError, SolveError
 from forward.pointwise import FunctionModel, FunctionSolution, OneByOne
@@ -127,10 +126,7 @@ class HomogeneousModel(OneByOne):
         Directions of one or two families of fibres, if the material has them: components along the stretch x, along the
         direction across (in simple shear, x moves along the first, more so along the second), and along y.
 
-    Raises
-    ------
-    ValueError
-        If constants are missing or unknown, or a test would shear the specimen.
+    What of these does not fit together is refused by `forward.material_tests.MaterialTests`.
     """
 
     differentiable = True
@@ -145,18 +141,10 @@ class HomogeneousModel(OneByOne):
         fibres: Sequence[Fibre] = (),
     ) -> None:
         units = tuple(tuple((np.array(fibre) / np.linalg.norm(fibre)).tolist()) for fibre in fibres)
-        objection = next(filter(None, (unfit(energy, test.mode, fibres) for test in tests)), None)
-        if objection is not None:
-            raise ValueError(objection)
-        known = constants(energy)
         varied = [path.rpartition(".")[2] for path in parameters]
-        given = dict.fromkeys([*values, *varied])
-        left_out = of_volume(energy) if incompressible(energy, given) else ()
-        unknown, missing = set(given) - set(known), set(known) - set(given) - set(left_out)
-        if unknown or missing:
-            raise ValueError(f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}")
+        given = {*values, *varied}
         self.parameters = tuple(parameters)
-        self._names = tuple(name for name in known if name in given)
+        self._names = tuple(name for name in constants(energy) if name in given)
         self._energy = energy
         self._free = not incompressible(energy, given)  # free faces, whose displacement has to be found
         self._values = np.array([values.get(name, np.nan) for name in self._names])

@@ -38,12 +38,8 @@ class ContactArea(Observable):
     kind: Literal["contact-area"] = "contact-area"
     unit: ClassVar[str] = "m²"
     estimable: ClassVar[bool] = False
+    negative: ClassVar[bool] = False
     tool: str = "indenter"
-
-    @property
-    def negative(self) -> bool:
-        """Whether it can be below 0."""
-        return False
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""

@@ -157,7 +157,7 @@ class Force(Observable):
     times: Annotated[float, Gt(0)] = 1.0
 
     @property
-    def negative(self) -> bool:
+    def negative(self) -> bool:  # type: ignore[override]
         """Whether it can be below 0: a tool presses and never pulls."""
         return self.component != "along"
 

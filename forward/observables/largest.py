@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -15,22 +16,14 @@ from forward.observables.functionals import Integral
 from forward.observables.observable import Equations, Functional, Observable
 
 
-class _Largest(Observable):
-    """The largest of some sizes."""
-
-    @property
-    def negative(self) -> bool:
-        """Whether it can be below 0."""
-        return False
-
-
-class MaxDisplacement(_Largest):
+class MaxDisplacement(Observable):
     """Largest |u_c| over the nodes (m), or largest |u| where `component` is "magnitude".
 
     Differentiable where only one node attains it; derivatives are those at that node.
     """
 
     kind: Literal["max-displacement"] = "max-displacement"
+    negative: ClassVar[bool] = False
     component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
     def functional(self, equations: Equations) -> Functional:
@@ -38,19 +31,20 @@ class MaxDisplacement(_Largest):
         return _MaxDisplacement(equations, None if self.component == "magnitude" else AXES.index(self.component))
 
 
-class MaxVonMises(_Largest):
+class MaxVonMises(Observable):
     """Largest von Mises stress (Pa, Cauchy) over the quadrature points; derivatives are those at that point."""
 
     kind: Literal["max-von-mises"] = "max-von-mises"
     unit: ClassVar[str] = "Pa"
     estimable: ClassVar[bool] = False  # at an edge that is held it grows without end as the mesh is refined
+    negative: ClassVar[bool] = False
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         return _MaxVonMises(equations)
 
 
-class MaxPressure(_Largest):
+class MaxPressure(Observable):
     """Largest pressure (Pa, per undeformed area) of a tool at vertices of the mesh; derivatives are those at that one.
 
     Pressures at vertices are averages over the facets that meet there, weighted by hat functions, so that they make up
@@ -61,6 +55,7 @@ class MaxPressure(_Largest):
     kind: Literal["max-pressure"] = "max-pressure"
     unit: ClassVar[str] = "Pa"
     estimable: ClassVar[bool] = False
+    negative: ClassVar[bool] = False
     tool: str = "indenter"
 
     def functional(self, equations: Equations) -> Functional:
@@ -68,11 +63,26 @@ class MaxPressure(_Largest):
         return _MaxPressure(equations, self.tool)
 
 
-def _over_ranks(equations: Equations, values: FloatArray) -> float:
-    """Return the largest of values ≥ 0 of all ranks."""
-    from forward.fem import ranks
+class _Largest:
+    """ψ = max of values ≥ 0 at the places of all ranks; its derivatives are those of what it is at its place."""
 
-    return -ranks.smallest(equations.comm, -float(values.max(initial=0.0)))
+    _equations: Equations
+    _values: Callable[[], FloatArray]
+
+    def value(self) -> float:
+        from forward.fem import ranks
+
+        return -ranks.smallest(self._equations.comm, -float(self._values().max(initial=0.0)))
+
+    def _at_place(self) -> Integral:
+        """Return the integral that ψ is as long as its place does not move."""
+        raise NotImplementedError
+
+    def gradient(self) -> FloatArray:
+        return self._at_place().gradient()
+
+    def partial(self) -> FloatArray:
+        return self._at_place().partial()
 
 
 def _first(equations: Equations, here: NDArray[np.intp]) -> bool:
@@ -81,7 +91,7 @@ def _first(equations: Equations, here: NDArray[np.intp]) -> bool:
     return True in holders and holders.index(True) == equations.comm.rank
 
 
-class _MaxDisplacement:
+class _MaxDisplacement(_Largest):
     """ψ = max over the nodes of |u_c|, or of |u|; of tied nodes, the first in canonical order counts."""
 
     reduced_as = "largest"
@@ -90,22 +100,19 @@ class _MaxDisplacement:
         self._equations = equations
         self._axis = axis
 
-    def _candidates(self) -> FloatArray:
+    def _values(self) -> FloatArray:
         u = self._equations.displacements()
         return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
 
-    def value(self) -> float:
-        return _over_ranks(self._equations, self._candidates())
-
     def place(self) -> int:
         """Number of the node of this rank at which it is largest."""
-        candidates = self._candidates()
+        candidates = self._values()
         return int(_tied(candidates, candidates.max(initial=0.0))[0])
 
     def gradient(self) -> FloatArray:
         from forward.fem import ranks
 
-        candidates, top = self._candidates(), self.value()
+        candidates, top = self._values(), self.value()
         ties = _tied(candidates, top)
         position = self._equations.layout.positions[ties]
         first = ranks.smallest(self._equations.comm, float(position.min(initial=np.iinfo(np.int64).max)))
@@ -128,7 +135,7 @@ def _tied(candidates: FloatArray, top: float) -> NDArray[np.intp]:
     return np.flatnonzero(candidates >= top * (1 - 1e-10))
 
 
-class _MaxVonMises:
+class _MaxVonMises(_Largest):
     """ψ = max of the von Mises stress over the quadrature points; of tied points, the first of the lowest rank.
 
     The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
@@ -151,15 +158,11 @@ class _MaxVonMises:
         self._selector = spaces.function(spaces.quadrature_space(equations.mesh, degree))
         self.stress = stress
 
-    def value(self) -> float:
-        return _over_ranks(self._equations, self._values())
-
     def place(self) -> int:
         """Number of the quadrature point of this rank at which it is largest."""
         return int(np.argmax(self._values()))
 
     def _at_place(self) -> Integral:
-        """Return the stress at the point where it is currently largest."""
         here = np.argwhere(self._values() >= self.value())
         self._selector.x.array[:] = 0
         if _first(self._equations, here):
@@ -177,42 +180,27 @@ class _MaxVonMises:
     def _weight(self) -> Any:
         return self._equations.scalar(self._selector * self._equations.dx)
 
-    def gradient(self) -> FloatArray:
-        return self._at_place().gradient()
 
-    def partial(self) -> FloatArray:
-        return self._at_place().partial()
-
-
-class _MaxPressure:
+class _MaxPressure(_Largest):
     """ψ = max ∫p φ_i dS/∫φ_i dS over hat functions φ_i; of tied ones, that of the first vertex of the lowest rank."""
 
     def __init__(self, equations: Equations, label: str) -> None:
         from forward.fem.dolfinx import spaces
 
         self._equations = equations
-        self._pressures = equations.pressures_at_vertices(label)
+        self._values = pressures = equations.pressures_at_vertices(label)
+        self._areas = pressures.areas
         self._hat = spaces.function(spaces.scalar_space(equations.mesh, 1))
-        self._at_hat = Integral(equations, self._pressures.density * self._hat, measure=self._pressures.measure)
+        self._at_hat = Integral(equations, pressures.density * self._hat, measure=pressures.measure)
 
-    def value(self) -> float:
-        return _over_ranks(self._equations, self._pressures())
-
-    def _choose(self) -> float:
-        """Set the hat function to that of the largest pressure; return its integral (m²)."""
-        values, top = self._pressures(), self.value()
+    def _at_place(self) -> Integral:
+        values, top = self._values(), self.value()
         here = np.flatnonzero(values >= top) if top > 0 else np.zeros(0, dtype=int)
         self._hat.x.array[:] = 0.0
         mine = _first(self._equations, here)
         if mine:
             self._hat.x.array[here[0]] = 1.0
         self._hat.x.scatter_forward()
-        return float(self._equations.comm.allreduce(float(self._pressures.areas[here[0]]) if mine else 0.0)) or 1.0
-
-    def gradient(self) -> FloatArray:
-        area = self._choose()
-        return self._at_hat.gradient() / area
-
-    def partial(self) -> FloatArray:
-        area = self._choose()
-        return self._at_hat.partial() / area
+        area = self._equations.comm.allreduce(float(self._areas[here[0]]) if mine else 0.0)
+        self._at_hat.size = float(area) or 1.0
+        return self._at_hat

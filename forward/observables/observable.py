@@ -57,11 +57,7 @@ class Observable(Settings):
     unit: ClassVar[str] = "m"  # SI unit of the value
     of_held: ClassVar[bool] = False  # whether its boundary has to be clamped or moved
     estimable: ClassVar[bool] = True  # whether an error of the mesh can be estimated: not of stresses at single points
-
-    @property
-    def negative(self) -> bool:
-        """Whether it can be below 0."""
-        return True
+    negative: ClassVar[bool] = True  # whether it can be below 0
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation; collective.

@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,10 @@ class Points:
     fields: FloatArray
     given: FloatArray
     logs: tuple[tuple[int, FloatArray, FloatArray], ...] = ()
+
+    def of(self, coordinates: int) -> Points:
+        """Return the points with the first coordinates."""
+        return replace(self, fields=np.ascontiguousarray(self.fields[:, :, :coordinates]))
 
     def some(self, chosen: NDArray[np.int64], weights: FloatArray, coordinates: int) -> Points:
         """Return some of the points with other weights, and the first coordinates."""
@@ -163,11 +168,9 @@ class ReducedData:
 
 def save(data: ReducedData, path: Path) -> None:
     """Write a reduced model to one file: arrays of NumPy, and a table that says what they are."""
-    import io
-
     arrays: dict[str, NDArray[Any]] = {}
     table = _packed(data, "", arrays)
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     np.savez_compressed(buffer, table=np.array(json.dumps({"format": FORMAT, "model": table})), **arrays)
     write_whole(path, buffer.getvalue())
 

@@ -147,8 +147,6 @@ def in_steps(
 
 def outside_of(data: ReducedData, whole: FloatArray) -> str:
     """Say which parameters (d,) lie outside the snapshots; empty if none does."""
-    if (whole >= data.lower).all() and (whole <= data.upper).all():
-        return ""
     found = [
         f"{path} = {value:.4g} (trained from {low:.4g} to {high:.4g})"
         for path, value, low, high in zip(data.parameters, whole, data.lower, data.upper, strict=True)

@@ -297,15 +297,10 @@ def _of_output(output: Output, level: ReducedEquations, numbers: int) -> _Output
         case "largest":
             return _Largest(output, level)
         case "integral":
-            points = level.integrals[output.which] if output.points is None else _all(output.points, level)
+            points = level.integrals[output.which] if output.points is None else output.points.of(level.count)
             return _Integral(output, level, points, numbers)
         case "peak":
             assert output.points is not None
-            return _Peak(output, level, _all(output.points, level), numbers)
+            return _Peak(output, level, output.points.of(level.count), numbers)
         case _:
             raise ValueError(f"the file has an output of the unknown kind '{output.kind}'")
-
-
-def _all(points: Points, level: ReducedEquations) -> Points:
-    """Return all points, with the coordinates of a level."""
-    return points.some(np.arange(len(points.weights)), points.weights, level.count)

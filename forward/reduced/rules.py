@@ -146,9 +146,8 @@ class Rules:
         for level, n in enumerate(counts):
             works, integrals = [], []
             for number, points in enumerate(known):
-                all_of_them = np.arange(len(points.weights))
-                if number > 0 and (self._whole[number] or len(all_of_them) <= KEPT_WHOLE or every):
-                    works.append(points.some(all_of_them, points.weights, before + n))
+                if number > 0 and (self._whole[number] or len(points.weights) <= KEPT_WHOLE or every):
+                    works.append(points.of(before + n))
                     continue
                 sizes = (counts[0],) if level == 0 else counts
                 fixed = in_full[number][candidates[number]]

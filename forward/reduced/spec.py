@@ -6,24 +6,20 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import sha256
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from forward.findings import Finding
 from forward.hyperelastic import Hyperelastic
+from forward.loaded import LoadedBody
+from forward.materials.admissible import Materials
 from forward.model import FloatArray, ModelError
 from forward.registry import named
-from forward.scalars import Scalar
+from forward.scalars import Ranges, Scalar
 from forward.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from forward.fem.locking import Ranges
-    from forward.loaded import LoadedBody
-    from forward.materials.admissible import Materials
 
 LETTERS = 16  # of a hash
 BY_CHANCE = 0.01  # so rarely an end of the distribution is farther from all snapshots than a study may go beyond them
@@ -44,20 +40,12 @@ class _About(NamedTuple):
     digest: str
 
 
-def _content(file: str) -> bytes:
-    try:
-        return Path(file).read_bytes()
-    except OSError as error:
-        raise ModelError(f"{file}: cannot be read: {error.strerror}") from None
-
-
-def _digest(content: bytes) -> str:
-    return sha256(content).hexdigest()[:LETTERS]
-
-
 def digest_of(file: str) -> str:
     """Return the hash of a reduced model; a ModelError says that its file cannot be read."""
-    return _digest(_content(file))
+    try:
+        return sha256(Path(file).read_bytes()).hexdigest()[:LETTERS]
+    except OSError as error:
+        raise ModelError(f"{file}: cannot be read: {error.strerror}") from None
 
 
 class Reduced(ModelSpec):
@@ -110,9 +98,9 @@ class Reduced(ModelSpec):
 
     @cached_property
     def _about(self) -> _About:
-        content = _content(self.file)
+        digest = digest_of(self.file)
         try:
-            with np.load(BytesIO(content), allow_pickle=False) as file:
+            with np.load(self.file, allow_pickle=False) as file:
                 parts = json.loads(str(file["table"]))["model"]["parts"]
                 told, body = parts["about"]["table"], parts["spec"]["table"]
                 names = tuple(parts["parameters"]["tuple"])
@@ -121,8 +109,7 @@ class Reduced(ModelSpec):
             message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
             raise ModelError(message) from None
         nominal, spread, lower, upper = arrays
-        spec = Hyperelastic.model_validate(body)
-        return _About(spec, names, nominal, spread, lower, upper, told, _digest(content))
+        return _About(Hyperelastic.model_validate(body), names, nominal, spread, lower, upper, told, digest)
 
     @property
     def outputs(self) -> Sequence[Any]:

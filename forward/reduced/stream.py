@@ -202,8 +202,3 @@ def _learnt(before: float, seconds: float) -> float:
         return seconds
     share = SHORTER if seconds < before else LONGER
     return before + share * (min(seconds, 3 * before) - before)
-
-
-def begin(model: ReducedModel, uncertain: FloatArray) -> Stream:
-    """Return a stream that begins at the mean parameters."""
-    return Stream(model, local(model, model.data.nominal, None, uncertain))

@@ -111,8 +111,9 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        placed = zip(("x", "y", "z", *POINTING), (*self.at, *self.along), strict=True)
-        return found | {name: Scalar(value, tools.Pose, name) for name, value in placed}
+        places, pointing = zip("xyz", self.at, strict=True), zip(POINTING, self.along, strict=True)
+        found |= {axis: Scalar(value, field=axis, besides=(Unit("m"),)) for axis, value in places}
+        return found | {name: Scalar(value, field=name) for name, value in pointing}
 
     @property
     def size(self) -> float:

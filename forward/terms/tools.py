@@ -11,12 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from annotated_types import Unit
-
-from forward.settings import Settings
 
 TINY = 1e-8  # of a length, which keeps slopes of roots finite
 NUMPY = SimpleNamespace(
@@ -26,25 +23,6 @@ NUMPY = SimpleNamespace(
     positive=lambda x: np.maximum(x, 0.0),
     choose=lambda z, positive, negative: np.where(z > 0, positive, negative),
 )
-
-
-class Pose(Settings):
-    """Where a tool is, and how it points.
-
-    Parameters
-    ----------
-    x, y, z
-        Of its tip (m) before it is moved.
-    direction_x, direction_y, direction_z
-        Components of its direction; their length does not matter.
-    """
-
-    x: Annotated[float, Unit("m")]
-    y: Annotated[float, Unit("m")]
-    z: Annotated[float, Unit("m")]
-    direction_x: Annotated[float, Unit("1")]
-    direction_y: Annotated[float, Unit("1")]
-    direction_z: Annotated[float, Unit("1")]
 
 
 class Touch(NamedTuple):

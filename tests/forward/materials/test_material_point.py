@@ -6,6 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.hyperelastic import Hyperelastic
+from forward.material_tests import MaterialTests
 from forward.materials.material import MATERIALS, constants, measures, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import SolveError
@@ -31,6 +32,11 @@ def model(kind: str, values: dict[str, float], *tests: MaterialTest) -> Homogene
     alike = "i4" in measures(kind)
     chosen = [test for test in tests or TESTS if not (alike and test.mode == "equibiaxial")]
     return HomogeneousModel(kind, values, chosen, tuple(values), [(1.0, 0.0, 0.0)] if alike else ())
+
+
+def stated(kind: str, values: dict[str, float], tests: list[dict], fibres=()) -> MaterialTests:
+    of_fibres = {"fibres": fibres} if fibres else {}
+    return MaterialTests.model_validate({"material": {"kind": kind, **values, **of_fibres}, "tests": tests})
 
 
 @pytest.mark.unit
@@ -188,12 +194,12 @@ def test_fibres_that_a_test_would_shear_are_refused():
         ("equibiaxial", [(1.0, 0.0, 0.0)], "stretch unequally"),
         ("uniaxial", [], "expected fibres"),
     ):
-        with pytest.raises(ValueError, match=told):
-            HomogeneousModel("holzapfel-gasser-ogden", values, [MaterialTest(mode=mode, at=(1.1,))], (), fibres)
+        with pytest.raises(ValidationError, match=told):
+            stated("holzapfel-gasser-ogden", values, [{"mode": mode, "at": [1.1]}], fibres)
     for mode, fibres in (("equibiaxial", [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0)]), ("simple-shear", [(1.0, 2.0, 3.0)])):
-        HomogeneousModel("holzapfel-gasser-ogden", values, [MaterialTest(mode=mode, at=(1.1,))], (), fibres)
-    with pytest.raises(ValueError, match="has no fibres"):
-        HomogeneousModel("neo-hookean", {"C1": 1.0}, TESTS, (), [(1.0, 0.0, 0.0)])
+        stated("holzapfel-gasser-ogden", values, [{"mode": mode, "at": [1.1]}], fibres).build(MPI.COMM_SELF, ())
+    with pytest.raises(ValidationError, match="has no fibres"):
+        stated("neo-hookean", {"C1": 1.0}, [{"mode": "uniaxial", "at": [1.1]}], [(1.0, 0.0, 0.0)])
 
 
 def test_many_parameter_sets_at_once():
@@ -221,5 +227,6 @@ def test_mistakes_are_named():
     ):
         with pytest.raises(ValidationError, match=told):
             MaterialTest.model_validate(settings)
-    with pytest.raises(ValueError, match="expected: C1, C2, D1"):
-        HomogeneousModel("mooney-rivlin", {"C1": 1.0}, TESTS, ("C3",))
+    for values, told in (({"C1": 1.0, "C3": 1.0}, "'C3' is no constant"), ({"C1": 1.0}, "missing: C2, expected in")):
+        with pytest.raises(ValidationError, match=told):
+            stated("mooney-rivlin", values, [{"mode": "uniaxial", "at": [1.1]}])

@@ -6,7 +6,7 @@ import pytest
 from forward.reduced import stream
 from forward.reduced.data import load, save
 from forward.reduced.model import ReducedModel
-from forward.reduced.stream import Stream, begin, local
+from forward.reduced.stream import Stream, local
 from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
     NOMINAL,
     SPREAD,
@@ -24,8 +24,12 @@ def model(small):  # noqa: F811
     return ReducedModel(small, small.parameters)
 
 
+def at_mean(model):
+    return Stream(model, local(model, model.data.nominal, None, SPREAD))
+
+
 def test_frames_follow_the_equilibrium(model, small):  # noqa: F811
-    stream = begin(model, SPREAD)
+    stream = at_mean(model)
     way = NOMINAL + SPREAD * np.linspace(0, 1, 60)[:, None] * np.array([1, -1, 1, 0.5, 1, 0.5, 0])
     spread = np.array(small.about["spread"])
     smooth = [i for i, output in enumerate(small.outputs) if output.kind != "peak"]
@@ -38,7 +42,7 @@ def test_frames_follow_the_equilibrium(model, small):  # noqa: F811
 
 def test_errors_count_what_the_tangent_misses(model, small):  # noqa: F811
     """Of a largest stress, which stays on the tangent of local models that come late."""
-    stream, asked = begin(model, SPREAD), NOMINAL
+    stream, asked = at_mean(model), NOMINAL
     peak = next(i for i, output in enumerate(small.outputs) if output.kind == "peak")
     missed, claimed = [], []
     for k in range(120):
@@ -68,7 +72,7 @@ def test_a_local_model_knows_errors_and_spread(model):
 
 
 def test_where_it_cannot_follow_it_says_so_and_catches_up(model):
-    stream = begin(model, SPREAD)
+    stream = at_mean(model)
     far = NOMINAL.copy()
     far[[0, 2, 4]] = 300, 1500, 0.03
     frame = stream.frame(far)
@@ -83,7 +87,7 @@ def test_where_it_cannot_follow_it_says_so_and_catches_up(model):
 
 def test_where_there_is_no_time_the_last_frame_moves_along_the_slopes(model, small):  # noqa: F811
     """An answer on time, the correction after it; with time again, or a step later, it is exact as before."""
-    stream = begin(model, SPREAD)
+    stream = at_mean(model)
     smooth = [i for i, output in enumerate(small.outputs) if output.kind != "peak"]
     spread = np.array(small.about["spread"])[smooth]
     stream.frame(NOMINAL)

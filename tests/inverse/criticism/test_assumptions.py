@@ -132,6 +132,7 @@ def test_a_model_without_an_answer_says_nothing_and_stops_nothing():
 @pytest.mark.unit
 def test_what_is_otherwise_and_by_how_much():
     gravity = {"kind": "gravity", "direction": [0, 0, -1], "density": 1000}
+    tool = {"kind": "indenter", "shape": "sphere", "radius": 5e-3, "direction": [0, 0, -1], "depth": 1e-3}
     blocks = {
         "body": {"kind": "box", "size": [0.02, 0.04, 0.04], "cells": [1, 1, 1]},
         "material": {"kind": "neo-hookean", "C1": 1e3, "D1": 1e4},
@@ -139,6 +140,7 @@ def test_what_is_otherwise_and_by_how_much():
         "cases": [
             {"name": "one", "clamp": ["z-min"], "loads": [gravity]},
             {"name": "two", "clamp": ["z-min"], "displacements": [{"on": "z-max", "x": 0, "z": -1e-3}]},
+            {"name": "three", "clamp": ["z-min"], "loads": [tool | {"on": "z-max", "at": [0.01, 0.02, 0.04]}]},
         ],
     }  # fmt: skip
     found = {one.name: one for one in of_numbers(Specimen.model_validate(blocks).every_scalar, ["material.C1"], 0.04)}
@@ -149,6 +151,8 @@ def test_what_is_otherwise_and_by_how_much():
     assert found["cases.one.loads.gravity.density"].size == 10.0
     assert found["cases.two.displacements.z-max.z"].size == pytest.approx(-1e-5)
     assert found["cases.two.displacements.z-max.x"].size == 0  # of which nothing is known
+    assert found["cases.three.loads.indenter.z"][1:] == (4e-4, "m", 0.0)
+    assert found["cases.three.loads.indenter.direction_z"][1:] == (PART, "1", 0.0)  # by an angle
     shared = of_numbers(Specimen.model_validate(blocks).every_scalar, ["loads.gravity.density"], 0.04)
     assert "cases.one.loads.gravity.density" not in {one.name for one in shared}
 

@@ -7,12 +7,11 @@ import pytest
 from mpi4py import MPI
 
 from benchmarks import assumptions as bench
-from forward.enlargements import Lump, asked_of, enlarged, enlargements, fitted
+from forward.enlargements import QUARTICS, Fibres, Lump, asked_of, enlarged, enlargements, fitted, quartics
 from forward.fem.layout import vertex_matrices
 from forward.hyperelastic import Hyperelastic
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from forward.terms.fibres import QUARTICS, Fibres, quartics
 from inverse.criticism.questions import CALLED, Questions, answers, asked
 from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
