@@ -191,7 +191,9 @@ def comparison(
 
     def joined(of: Callable[[Compared], xr.Dataset], dim: str) -> xr.Dataset:
         """Put together what is known of each candidate for each group; NaN of what one of them does not have."""
-        whole = xr.concat([xr.concat([of(found[name, group]) for group in groups], dim) for name in names], "model")
+        how: Any = {"join": "outer", "data_vars": "all"}  # newer versions of xarray warn where it is not said
+        several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
+        whole = xr.concat(several, "model", **how)
         return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
 
     sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)

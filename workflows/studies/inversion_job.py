@@ -252,21 +252,9 @@ def _problem(
     truth = None
     if seen.truth is not None and study.model_error is not None:
         truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
-    return Problem(
-        data,
-        study.method,
-        study.data.errors,
-        finer=finer,
-        shared=shared,
-        start=start,
-        model=seen.model,
-        say=ensemble.say,
-        steps=steps,
-        assumed=assumed,
-        sampled=sampled,
-        questions=seen.questions,
-        truth=truth,
-    )
+    known: dict[str, Any] = {"finer": finer, "shared": shared, "start": start, "model": seen.model, "truth": truth}
+    known |= {"assumed": assumed, "sampled": sampled, "questions": seen.questions, "say": ensemble.say, "steps": steps}
+    return Problem(data, study.method, study.data.errors, **known)
 
 
 def _inverted(
