@@ -16,7 +16,7 @@ Probabilities, averages and residual tests share this file because all come from
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -189,13 +189,6 @@ def comparison(
         sums = np.array([sum(value for value, _ in part) for part in parts])
         return sums, np.array([np.sqrt(sum(error**2 for _, error in part)) for part in parts])
 
-    def joined(of: Callable[[Compared], xr.Dataset], dim: str) -> xr.Dataset:
-        """Put together what is known of each candidate for each group; NaN of what one of them does not have."""
-        how: Any = {"join": "outer", "data_vars": "all"}  # newer versions of xarray warn where it is not said
-        several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
-        whole = xr.concat(several, "model", **how)
-        return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
-
     sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)
     chances = np.array([probabilities(total, weights) for total in sums])
     P = chances[0]
@@ -240,8 +233,10 @@ def comparison(
     taken = [one.assumed[0] for one in found.values() if one.assumed]
     held = {one.name: one.unit for several in taken for one in several.shown[0]}
     bends = list(dict.fromkeys(name for one in taken for name in one.groups))
-    of_groups = joined(_of_group, "group").reindex(parameter=parameters, assumption=list(held), uncertain=bends)
-    of_groups["point_weight"] = of_groups["point_weight"].fillna(0.0)
+    of_groups = _joined(found, candidates, data_groups, _of_group, "group").reindex(
+        parameter=parameters, assumption=list(held), uncertain=bends
+    )
+    of_groups = of_groups.assign(point_weight=of_groups["point_weight"].fillna(0.0))
     if held:
         # A candidate takes the same for granted in all groups.
         alike = {f"assumption_{name}": of_groups[f"assumption_{name}"].max("group") for name in ("size", "part")}
@@ -250,8 +245,8 @@ def comparison(
         of_groups = of_groups.drop_dims(["assumption", "uncertain"])
     if not any(one.assessment.chains for one in found.values()):
         of_groups = of_groups.drop_vars(["chains", "chain_rhat", "chain_effective"])
-    of_outputs = joined(_of_outputs, "output")
-    mean, std = of_outputs["prediction_mean"].to_numpy(), of_outputs["prediction_std"].to_numpy()
+    of_outputs = _joined(found, candidates, data_groups, _of_outputs, "output")
+    mean, std = (of_outputs[f"prediction_{name}"].to_numpy() for name in ("mean", "std"))
     average = P @ mean
     variables |= {
         "output_group": ("output", np.repeat(groups, [len(data) for data in data_groups.values()])),
@@ -270,6 +265,18 @@ def comparison(
     coordinates |= {"left_out": list(left_out)} if left_out else {}
     coordinates |= {"assumption": list(held), "uncertain": bends} if held else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
+
+
+def _joined(
+    found: Mapping[Pair, Compared], names: Iterable[str], groups: Iterable[str], of: Callable[[Compared], Any], dim: str
+) -> xr.Dataset:
+    """Put together what is known of each candidate for each group; NaN of what one of them does not have."""
+    import xarray as xr
+
+    how: Any = {"join": "outer", "data_vars": "all"}  # newer versions of xarray warn where it is not said
+    several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
+    whole = xr.concat(several, "model", **how)
+    return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
 
 
 def _of_data(data_groups: Mapping[str, Measurements], found: Sequence[Compared]) -> dict[str, list[Any]]:

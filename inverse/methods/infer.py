@@ -9,14 +9,12 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from forward.settings import Settings
-from inverse.criticism.assessment import Assessment, Kind, When, assess
+from inverse.criticism.assessment import Assessment, assess
 from inverse.criticism.assumptions import BENT, Assumptions, Moves, moved_by
 from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
 from inverse.criticism.questions import Questions
@@ -27,7 +25,8 @@ from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.residual_process import Process, with_process
 from inverse.low_dimensional.wider import Wider, missed, widened
-from inverse.methods.mesh_correction import Treatment, before_few, corrected_few
+from inverse.methods.invert import Inference
+from inverse.methods.mesh_correction import before_few, corrected_few
 from inverse.methods.model_error import Truth, over_posterior, over_prior
 from uq.evaluation.evaluate import ALL_AGAIN, Recorder, Steps
 from uq.evaluation.request import Evaluate, Start
@@ -38,32 +37,6 @@ from uq.surrogates.linearisation import linearise
 ROUNDS, SETTLED = 4, 0.5
 
 Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what predicts states near there; None if nothing
-
-
-class Inference(Settings):
-    """What methods that infer have in common; each says what it is there."""
-
-    starts: Annotated[int, Field(ge=1)] = 4
-    seed: Annotated[int, Field(ge=0)] = 0
-    chains: Kind | None = None
-    chains_when: When = "always"
-    mesh_error: Treatment | Literal[False] = "correct"
-    mesh_check: bool = True
-    assumptions: bool = True
-
-    def solves(self, size: int, *, field: bool) -> int:
-        """Number of solves for a data set with `size` unknown parameters that correct the Gaussian."""
-        raise NotImplementedError
-
-    @property
-    def treatment(self) -> Treatment | None:
-        """What is done about the error of the mesh; None where it is not asked for."""
-        return (self.mesh_error or None) if self.mesh_check else None
-
-    @property
-    def unchecked(self) -> str:
-        """Why the mesh is not looked at, where it is not."""
-        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,13 @@ from pydantic import Field, field_validator, model_validator
 
 from forward.model import ForwardModel, ModelError
 from forward.settings import Settings
-from inverse.criticism.assessment import solves_of
+from inverse.criticism.assessment import Kind, When, solves_of
 from inverse.criticism.chains import FIELD
 from inverse.criticism.weights import usual
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.infer import Inference
+from inverse.methods.mesh_correction import Treatment
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
@@ -52,6 +52,32 @@ class ByReduced(Settings):
     def files(self) -> str:
         """The file, or all of them."""
         return ", ".join(self.by_case.values())
+
+
+class Inference(Settings):
+    """What methods that infer have in common; each says what it is there."""
+
+    starts: Annotated[int, Field(ge=1)] = 4
+    seed: Annotated[int, Field(ge=0)] = 0
+    chains: Kind | None = None
+    chains_when: When = "always"
+    mesh_error: Treatment | Literal[False] = "correct"
+    mesh_check: bool = True
+    assumptions: bool = True
+
+    def solves(self, size: int, *, field: bool) -> int:
+        """Number of solves for a data set with `size` unknown parameters that correct the Gaussian."""
+        raise NotImplementedError
+
+    @property
+    def treatment(self) -> Treatment | None:
+        """What is done about the error of the mesh; None where it is not asked for."""
+        return (self.mesh_error or None) if self.mesh_check else None
+
+    @property
+    def unchecked(self) -> str:
+        """Why the mesh is not looked at, where it is not."""
+        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
 
 class Invert(Inference):

@@ -27,7 +27,8 @@ from inverse.data.noise import Noise
 from inverse.data.shared_motion import determined
 from inverse.low_dimensional.evidence import LEAST, nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.infer import Inference, Inferred, Problem, by_tangents, infer
+from inverse.methods.infer import Inferred, Problem, by_tangents, infer
+from inverse.methods.invert import Inference
 from inverse.methods.model_error import Truth
 from inverse.methods.record import of_learnt
 from uq.evaluation.evaluate import Steps
