@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.indices import coefficient_moments, pair_variances, partial_variances, shares
+from uq.estimators.indices import partial_variances, shares, sobol_indices
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion
 
@@ -160,14 +160,8 @@ class _Projected:
         return np.asarray(np.linalg.lstsq(self.rows, of, rcond=None)[0])
 
     def _indices(self, of: FloatArray, name: str) -> FloatArray:
-        coefficients, indices = self._coefficients(of).T, self.basis.indices
-        if name in SINGLE:
-            return coefficient_moments(coefficients, indices)[name]
-        squares = coefficients**2
-        variance, first, total = partial_variances(squares, indices, self.members)
-        if name in GROUPED:
-            return shares(first if name == GROUPED[0] else total, variance[..., None])
-        return shares(pair_variances(squares, indices), variance[..., None, None])
+        coefficients = self._coefficients(of).T
+        return sobol_indices(coefficients, self.basis.indices, self.members, pairs=name == PAIRED)[name]
 
     def _bounds(self, of: FloatArray, name: str) -> FloatArray:
         """Mean squared derivatives (c, d), over the variance for bounds of total indices; by the coordinates.

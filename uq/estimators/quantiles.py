@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
-from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
+from uq.estimators.fidelities import ROUNDS, Samples, folds, pooled_means, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
 from uq.estimators.subsampled_difference import Chosen, Pooled
 from uq.findings import add
@@ -352,12 +352,7 @@ def _parts(
 ) -> list[FloatArray]:
     """Return the summands (n, t) of the shares by group, from indicators (n, K, t) and the weights of each fold."""
     parts = [np.zeros((len(one), one.shape[2])) for one in indicators]
-    middle = np.array(
-        [
-            np.concatenate([i[:, k] for i, group in zip(indicators, groups, strict=True) if k in group]).mean(axis=0)
-            for k in range(indicators[0].shape[1])
-        ]
-    )
+    middle = pooled_means(groups, indicators)
     for kept, share, a in cut:
         for g, (found, values) in enumerate(zip(parts, indicators, strict=True)):
             of_fold = g == 0 and inner

@@ -10,7 +10,7 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.model import FloatArray, SolveError
-from uq.estimators.blue import Problem
+from uq.estimators.blue import Problem, informations
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated
 from uq.estimators.moments import Estimates, Z, combine, controlled, either, estimate, monomials, ratio, student, term
@@ -115,10 +115,11 @@ class ByModels(OfPilot):
         return self.found.relative
 
     def _problem(self) -> Problem | None:
-        """How to choose numbers; None if controls leave nothing."""
-        team = self._team
-        found = self.found.problem(team.groups, team.costs, team.counts(), self.estimates.size)
-        return found if len(found.told) else None
+        """How to choose numbers of samples for means, relative to their sizes; None if controls leave nothing."""
+        team, fitted = self._team, zip(self.found.fitted, self.estimates.size, strict=True)
+        known = [(one.covariances[0], size) for one, size in fitted if one.covariances[0, 0, 0] > 0]
+        told = [informations(team.groups, covariance / size**2) for covariance, size in known]
+        return Problem(np.array(told), team.costs, team.counts()) if told else None
 
     def expected(self, cost: float) -> float:
         """Predict the largest relative variance of a mean once so much more is spent."""

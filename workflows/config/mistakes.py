@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -141,8 +141,6 @@ _WORD = 60  # letters of a key in a message
 
 def _kinds() -> set[str]:
     """Return what pydantic includes in the locations of errors: kinds, and a field whose keys are in its own block."""
-    from typing import get_args
-
     from forward.bodies import geometry, inclusions
 
     unions = [geometry.Body, inclusions.Inclusion, Distribution]

@@ -18,6 +18,7 @@ from forward.external.own_modules import SESSION, Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from forward.phases import phase
+from uq.evaluation.checkpoint import Checkpoint
 from uq.findings import add
 from workflows.accuracy.adapted_mesh import FILES as REFINED
 from workflows.config.blocks import KEPT
@@ -45,7 +46,6 @@ from workflows.studies.solves import findings_of_solves
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.request import Evaluations
     from workflows.studies.study import StudyKind
 
@@ -119,7 +119,6 @@ def _run(
                 sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
 
-    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
     shown = Progress(quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.model import WORK
 from uq.estimators import failure_domain
 from uq.findings import findings
 from workflows.results.summary import summarise
@@ -30,8 +31,6 @@ def summarised(
     study: StudyKind, name: str, dataset: xr.Dataset, job: Job, ranks: int, rank_groups: int, wall: float
 ) -> dict[str, Any]:
     """Return the contents of summary.json: the study, its results, their cost, and the versions that made them."""
-    from forward.model import WORK
-
     evaluations = job.evaluations
     every, done = evaluations.values(), _counts(study, evaluations, job.outcomes)
     seconds = sum(one.seconds for one in job.outcomes) or float(sum(found.seconds.sum() for found in every))
