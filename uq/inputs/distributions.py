@@ -188,8 +188,8 @@ class TruncatedNormal(Bounded):
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
         """As for every distribution."""
-        cut = self._cut
-        return cut.origin, cut.unit * cut.nodes, cut.weights
+        nodes, weights, _ = self._cut.rule
+        return self._cut.origin, self._cut.unit * nodes, weights
 
     @property
     def _frame(self) -> tuple[float, float]:

@@ -28,8 +28,8 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
-from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
-from uq.methods.method import UNASKED, Method
+from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded
+from uq.methods.method import UNASKED, Method, Probability
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
 from uq.surrogates.field_regression import Deviations, deviations
 

@@ -26,7 +26,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods.method import Amount
+from uq.methods.method import Amount, Probability, refuse
 from uq.surrogates.basis import (
     DICTIONARY,
     FULL,
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
     from uq.accuracy.goal import Goal
 
-Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up by default
 GROWTH, LEAST_GROWTH = 1.5, 1.1  # growth of the design between checks of the tolerance
 AGAIN = 2  # rounds: the first samples are explained by what was chosen by them, until others show more
@@ -188,9 +187,7 @@ class Chaos(Amount):
         The samples are those of a scramble of the Sobol' points. After each round `wanted` may say how many there
         should be next, at most half as many more. Errors as in `run`.
         """
-        refusal = self.objection(inputs)
-        if refusal is not None:
-            raise ValueError(refusal)
+        refuse(self.objection(inputs))
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         projection, open_ended = self.fit == "projection", self.open_ended or limit is not None

@@ -36,9 +36,12 @@ class Way:
     ----------
     estimates
         Mean and standard deviation.
+    pilot
+        What a pilot tells.
     """
 
     estimates: Estimates
+    pilot: Found
 
     def __init__(self, team: Fidelities) -> None:
         self._team = team
@@ -63,12 +66,6 @@ class Way:
             gain = ratio(variance, error**2 * cost, empty=1.0)
             yield gain, gain * np.sqrt(relative + 4 * ratio(e.std_error, e.std) ** 2)
 
-
-class OfPilot(Way):
-    """A way by samples of groups, of which a pilot tells something (`pilot`)."""
-
-    pilot: Found
-
     @property
     def plain(self) -> tuple[FloatArray, FloatArray]:
         """Variances (m,) of plain samples, and of those that have the tangent as control."""
@@ -76,7 +73,7 @@ class OfPilot(Way):
         return plain, np.einsum("mkk->mk", self.pilot.covariance)[:, 0]
 
 
-class ByModels(OfPilot):
+class ByModels(Way):
     """Groups of models that share their samples.
 
     Attributes
@@ -173,7 +170,7 @@ def _share(found: Found, i: int) -> FloatArray:
     return ratio(errors[i], errors.sum(axis=0))
 
 
-class ByExpansion(OfPilot):
+class ByExpansion(Way):
     """An expansion fitted to the pilot, and samples of the study's model that correct what it leaves.
 
     Attributes

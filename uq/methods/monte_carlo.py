@@ -31,7 +31,7 @@ from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
-from uq.methods.method import Amount
+from uq.methods.method import Amount, Probability
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
 MOST_GROWTH = 4.0  # growth of the number of samples between checks
 FEW = 512  # samples, for fewer of which no better prediction is worth its making
 UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
-Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class MonteCarlo(Amount):

@@ -29,8 +29,8 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods.chaos import Expanded, Probability, expansion_dataset, objection
-from uq.methods.method import Amount
+from uq.methods.chaos import Expanded, expansion_dataset, objection
+from uq.methods.method import Amount, Probability, refuse
 from uq.surrogates.basis import hyperbolic_count, orthonormal, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
@@ -139,9 +139,7 @@ class MultilevelChaos(Amount):
             (`level_residual`, `level_change`, …); see docs/results.md.
         """
         d = len(inputs.names)
-        for refusal in (self.objection(inputs), self.shortage(d)):
-            if refusal is not None:
-                raise ValueError(refusal)
+        refuse(self.objection(inputs) or self.shortage(d))
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         bases, n = whole(inputs, self.order), self.per_level(d)

@@ -26,8 +26,8 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two
 from uq.methods.chaos import LARGEST, Chaos
-from uq.methods.method import Amount
-from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
+from uq.methods.method import Amount, Probability, refuse
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED
 from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Rows, by_output, by_round, with_maps
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
@@ -160,9 +160,7 @@ class Sobol(Amount):
         FileNotFoundError
             If the source holds no results of this model and these parameters; otherwise as every method.
         """
-        objection = self.objection(inputs) or self.unknown(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refuse(self.objection(inputs) or self.unknown(inputs))
         dataset = {"chaos": self._expand, "saltelli": self._exchange, "given-data": self._take}[self.design](
             inputs, evaluate
         )

@@ -430,5 +430,4 @@ class Regression:
 
 def tails_of(inputs: Inputs) -> BoolArray:
     """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
-    bounded = [marginal.support is not None for marginal in inputs.marginals.values()]
-    return ~np.array(bounded, dtype=bool) | np.isin(np.arange(len(bounded)), inputs.joint)
+    return inputs.unbounded | np.isin(np.arange(len(inputs.names)), inputs.joint)

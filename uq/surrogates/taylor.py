@@ -100,7 +100,7 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
     Beyond, the expansion is a guess that no sample supports, while E[φφᵀ] counts it in full. None if all parameters
     are bounded: samples then reach the ends.
     """
-    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    tails = inputs.unbounded
     if not tails.any():
         return None
     lower, upper = fitted.reach
