@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -146,7 +147,8 @@ class _Projected:
     def analysis(self, dataset: xr.Dataset, name: str) -> Callable[[FloatArray, int], FloatArray]:
         """Return the function (values (n, c), output) → a variable (c, …), for a `Consequence`."""
         if name not in BOUNDS:
-            return lambda of, _: self._indices(of, name)
+            about = partial(sobol_indices, indices=self.basis.indices, members=self.members, pairs=name == PAIRED)
+            return lambda of, _: about(self._coefficients(of).T)[name]
         stated = dataset[name].to_numpy()
 
         def scaled(of: FloatArray, i: int) -> FloatArray:
@@ -158,10 +160,6 @@ class _Projected:
     def _coefficients(self, of: FloatArray) -> FloatArray:
         """Coefficients (P, c) of values (n, c)."""
         return np.asarray(np.linalg.lstsq(self.rows, of, rcond=None)[0])
-
-    def _indices(self, of: FloatArray, name: str) -> FloatArray:
-        coefficients = self._coefficients(of).T
-        return sobol_indices(coefficients, self.basis.indices, self.members, pairs=name == PAIRED)[name]
 
     def _bounds(self, of: FloatArray, name: str) -> FloatArray:
         """Mean squared derivatives (c, d), over the variance for bounds of total indices; by the coordinates.

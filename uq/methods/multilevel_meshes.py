@@ -20,17 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from uq.estimators.moments import (
-    Estimates,
-    Moments,
-    Term,
-    combine,
-    controlled,
-    estimate,
-    monomials,
-    ratio,
-    term,
-)
+from uq.estimators.moments import Estimates, Moments, Term, combine, controlled, estimate, monomials, ratio, term
 from uq.estimators.tails import influences, kurtosis, with_tails
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN

@@ -51,12 +51,10 @@ class _FieldProducts(FieldSum):
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         state = scattered(model, self.state[None, :])[0]
         control = self.control
-        coefficients = None if control is None else scattered(model, control.state)
+        coefficients = np.empty((0, 0)) if control is None else scattered(model, control.state)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            controls = None
-            if control is not None and coefficients is not None:
-                controls = control.predict(control.features(parameters), coefficients)
+            controls = None if control is None else control.predict(control.features(parameters), coefficients)
             deviation = solution.state - state
             return np.concatenate([_products(deviation, controls), [deviation**3, deviation**4]])
 

@@ -176,10 +176,7 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
             "derivative_per_std": (("output", "parameter"), centre.tangents * inputs.std),
             "derivative_per_range": (("output", "parameter"), centre.tangents * ranges),
         }
-    coordinates: dict[str, list[str]] = {
-        "output": list(evaluate.outputs),
-        "parameter": list(evaluate.parameters),
-    }
+    coordinates = {"output": list(evaluate.outputs), "parameter": list(evaluate.parameters)}
     if fields and centre.state.size:
         count = evaluate.displacements
         coordinates["component"] = ["x", "y", "z"]
