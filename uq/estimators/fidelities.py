@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,20 +151,16 @@ class Found:
         return np.array([one.covariances[0] for one in self.fitted])
 
 
-class Fold(NamedTuple):
-    """Which samples (n,) of all models tell weights, and the share of the estimate that these are for."""
+def folds(whole: Samples, *, inner: bool) -> list[tuple[NDArray[np.bool_], float]]:
+    """Cut the samples of all models into parts, each of which the others weigh; if they count in the estimate.
 
-    kept: NDArray[np.bool_]
-    share: float
-
-
-def folds(whole: Samples, *, inner: bool) -> list[Fold]:
-    """Cut the samples of all models into parts, each of which the others weigh; if they count in the estimate."""
+    Returns which samples (n,) tell weights, and the share of the estimate that these are for.
+    """
     n = whole.count
     if not inner:
-        return [Fold(np.ones(n, dtype=bool), 1.0)]
+        return [(np.ones(n, dtype=bool), 1.0)]
     part = np.arange(n) % min(FOLDS, n)
-    return [Fold(part != f, size / n) for f, size in enumerate(np.bincount(part))]
+    return [(part != f, size / n) for f, size in enumerate(np.bincount(part))]
 
 
 def estimated(

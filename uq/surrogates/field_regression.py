@@ -122,8 +122,6 @@ class Deviations:
         Which samples (n,) had an answer and were fitted.
     prediction
         Of the state, from which the solver may start; None if the state was not requested.
-    reach
-        Lowest and highest coordinates (2, d) of the samples that were fitted.
     rest
         Norms (m,) of what the functions miss in the outputs, see `Regression.missing`; None if no parameter has a tail.
     trial
@@ -138,7 +136,6 @@ class Deviations:
     relative: FloatArray
     ok: NDArray[np.bool_]
     prediction: StateExpansion | None
-    reach: FloatArray
     rest: FloatArray | None
     trial: Trial
     repeats: tuple[Deviations, ...] = ()
@@ -175,17 +172,14 @@ def _deviating(basis: Basis, coefficients: FloatArray, outputs: FloatArray) -> F
 
 def deviations(regression: Regression, evaluations: Evaluations, centre: Linearisation) -> Deviations:
     """Return an expansion as one of deviations, with the state where `Projections` of it were summed."""
-    fit, basis, data = regression.fit, regression.basis, regression.data
+    fit, basis = regression.fit, regression.basis
     outputs = _deviating(basis, fit.coefficients, centre.outputs)
     state, prediction = np.zeros((len(outputs), 0)), None
     if evaluations.fields.size:
         state = solved(fit, evaluations.fields[fit.chosen.which])
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
-    t = regression.inputs.coordinates.of(data.points)
-    reach = np.array([t.min(axis=0), t.max(axis=0)])
-    rest = regression.missing()
-    trial = repeated(regression)
-    found = Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest, trial)
+    rest, trial = regression.missing(), repeated(regression)
+    found = Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, rest, trial)
     return replace(found, repeats=tuple(found.of(*one, centre.outputs) for one in trial.fits))
 
 

@@ -103,7 +103,8 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
     tails = inputs.unbounded
     if not tails.any():
         return None
-    lower, upper = fitted.reach
+    t = inputs.coordinates.of(fitted.trial.points)
+    lower, upper = t.min(axis=0), t.max(axis=0)
     more = MARGIN * (upper - lower)
     held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
     mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))
