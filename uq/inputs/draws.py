@@ -208,19 +208,13 @@ class Empirical:
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
-    """The parts of one level of a tree: across which coordinate each is halved, where, and number of the first half."""
-
-    axis: IntArray
-    share: FloatArray
-    child: IntArray
-
-
-@dataclass(frozen=True, eq=False)
 class _Tree:
-    """Halves of halves of draws, down to draws: `draw` are those of the parts of the last level."""
+    """Halves of halves of draws, down to draws: `draw` are those of the parts of the last level.
 
-    levels: list[_Level]
+    Each level says of its parts across which coordinate they are halved, where, and the number of the first half.
+    """
+
+    levels: list[tuple[IntArray, FloatArray, IntArray]]
     draw: IntArray
 
     @classmethod
@@ -232,7 +226,7 @@ class _Tree:
         weight = np.bincount(inverse.ravel(), weights=weights[order])
         order = order[first]
         starts = np.array([0])
-        levels: list[_Level] = []
+        levels = []
         while len(starts) < len(order):
             sizes = np.diff(np.append(starts, len(order)))
             part = np.repeat(np.arange(len(starts)), sizes)
@@ -253,7 +247,7 @@ class _Tree:
             alone = sizes == 1
             share = np.where(alone, 1.0, below[cut])
             children = np.where(alone, 1, 2)
-            levels.append(_Level(axis, share, np.cumsum(children) - children))
+            levels.append((axis, share, np.cumsum(children) - children))
             starts = np.sort(np.concatenate([starts, cut[~alone] + 1]))
         return cls(levels, order)
 
@@ -261,13 +255,13 @@ class _Tree:
         """Return the draw (n,) in whose box each point (n, k) of the cube lies."""
         u, rows = np.array(uniforms, dtype=float), np.arange(len(uniforms))
         part = np.zeros(len(u), dtype=np.int64)
-        for level in self.levels:
-            axis, share = level.axis[part], level.share[part]
+        for axes, cuts, children in self.levels:
+            axis, share = axes[part], cuts[part]
             at = u[rows, axis]
             first = (at < share) | (share == 1.0)  # rounding may bring a coordinate to 1
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of the half that is not taken
                 u[rows, axis] = np.where(first, at / share, (at - share) / (1 - share))
-            part = level.child[part] + ~first
+            part = children[part] + ~first
         return np.asarray(self.draw[part])
 
 

@@ -130,7 +130,7 @@ class Automatic(Method):
         chaos = self._chaos(inputs, goal)
         trail: list[tuple[int, float]] = []
         found: Expanded | None = None
-        other: _Outlook | None = None
+        control, samples = plain, 0  # of quasi-Monte Carlo, as predicted
 
         def wanted() -> float:
             return trail[-1][0] + ENOUGH * _further(trail) if len(trail) >= AGAIN else np.inf
@@ -141,10 +141,10 @@ class Automatic(Method):
                 trail.append((found.count, reached))
                 if reached <= 1 and len(trail) >= AGAIN:
                     break
-                other = _Outlook.of(found, goal, gradients=gradients)
+                control, samples = _outlook(found, goal, gradients=gradients)
                 weight = WITH_DERIVATIVES if gradients else 1.0
                 spent, further = weight * found.count, weight * _further(trail)
-                if len(trail) >= ROUNDS and spent > PATIENCE * other.samples and further > WORTH * other.samples:
+                if len(trail) >= ROUNDS and spent > PATIENCE * samples and further > WORTH * samples:
                     break
         except SolveError as error:
             if found is None:
@@ -156,14 +156,14 @@ class Automatic(Method):
             f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
         )
         between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
-        if last <= 1 or other is None or goal.most - count < WORTH * count:
+        if last <= 1 or not samples or goal.most - count < WORTH * count:
             what = "fitted to values and gradients" if gradients else "fitted to values"
             return _Pilot(None, f"Polynomial chaos {what}: {fell}{between}.", found)
         reason = (
-            f"about {other.samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
+            f"about {samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
             f"{fell}{between}"
         )
-        return _Pilot(other.control, reason, found)
+        return _Pilot(control, reason, found)
 
     def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
         return Chaos(
@@ -224,33 +224,24 @@ def _further(trail: Sequence[tuple[int, float]]) -> float:
     return float(max(min(enough) - count, (LEAST_GROWTH - 1) * count))
 
 
-@dataclass(frozen=True)
-class _Outlook:
-    """Quasi-Monte Carlo as it is predicted: the control variate that takes least, and the samples."""
-
-    control: Control
-    samples: int
-
-    @classmethod
-    def of(cls, found: Expanded, goal: Goal, *, gradients: bool) -> _Outlook:
-        """Predict it from an expansion and its samples."""
-        regression, centre = found.regression, found.centre
-        inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
-        std = np.asarray(estimates["std"])
-        left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
-        missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
-        if gradients:
-            missed["tangent"] = data.values - (centre.middle + centre.predicted(data.points))
-            left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
-        points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
-        outside = regression.beyond(points).share
-        ways = []
-        for way, of in left.items():
-            missing = regression.rest() if way == "chaos" else None
-            gain = GAIN if missing is None else 0.0  # what an expansion misses in tails is at few of the points
-            tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
-            ways.append(cls(way, _samples(goal, estimates, (of, _left_of_std(data.values, missed[way])), tails, gain)))
-        return min(ways, key=lambda way: way.samples)
+def _outlook(found: Expanded, goal: Goal, *, gradients: bool) -> tuple[Control, int]:
+    """Predict the control variate with which quasi-Monte Carlo takes least, and the samples, from an expansion."""
+    regression, centre = found.regression, found.centre
+    inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
+    std = np.asarray(estimates["std"])
+    left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
+    missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
+    if gradients:
+        missed["tangent"] = data.values - (centre.middle + centre.predicted(data.points))
+        left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
+    outside = regression.beyond(inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))).share
+    ways: dict[Control, int] = {}
+    for way, of in left.items():
+        missing = regression.rest() if way == "chaos" else None
+        gain = GAIN if missing is None else 0.0  # what an expansion misses in tails is at few of the points
+        tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
+        ways[way] = _samples(goal, estimates, (of, _left_of_std(data.values, missed[way])), tails, gain)
+    return min(ways.items(), key=lambda way: way[1])
 
 
 def _left_of_std(values: FloatArray, missed: FloatArray) -> FloatArray:
