@@ -17,7 +17,6 @@ from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
-from uq.estimators.estimate import Variables
 from uq.estimators.indices import Analysis
 from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
@@ -353,7 +352,12 @@ def expansion_dataset(
             "range_upper": (("parameter",), upper),
         }
     )
-    dataset = dataset.assign(_of_joint(basis))
+    if basis.joint is not None:  # what else is needed to evaluate functions of draws
+        dataset = dataset.assign(
+            coordinate_mixing=(("parameter", "coordinate"), basis.coordinates.mixing),
+            joint_index=(("function", "joint_parameter"), basis.joint.indices),
+            joint_inverse=(("joint_product", "function"), basis.joint.inverse),
+        )
     if probabilities:
         dataset = _distribution(dataset, seed, probabilities, regression)
     add(dataset, *regression.doubts(evaluate.outputs))
@@ -376,17 +380,6 @@ def expansion_dataset(
             "extrapolates them to where the model has no answer"
         )
     return dataset
-
-
-def _of_joint(basis: Basis) -> Variables:
-    """Return what else is needed to evaluate functions of draws."""
-    if basis.joint is None:
-        return {}
-    return {
-        "coordinate_mixing": (("parameter", "coordinate"), basis.coordinates.mixing),
-        "joint_index": (("function", "joint_parameter"), basis.joint.indices),
-        "joint_inverse": (("joint_product", "function"), basis.joint.inverse),
-    }
 
 
 def _distribution(

@@ -239,7 +239,7 @@ class Scrambles(Sets):
         Also what a control hides (m,): the part of the errors that is in no scatter.
         """
         found, ok = self._by_scatter(each, known), self.ok[:, :each]
-        values, controlled = self.outputs[:, :each][ok], self._left(found, each, known and known[0])
+        values, controlled = self.outputs[:, :each][ok], known and self.controlled(found, each)
         plain = values - values.mean(axis=0)
         found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(ok.any(axis=1).sum()))
         tails = counted(found, self._inputs, values, controlled)
@@ -389,14 +389,10 @@ class Scrambles(Sets):
 
     def controlled(self, found: Estimates, each: int) -> Pair | None:
         """Samples (n, m) of both moments, the first of them that have an answer, with controls."""
-        known = self._controls(each)
-        return None if known is None else self._left(found, each, known[0])
-
-    def _left(self, found: Estimates, each: int, controls: Pair | None) -> Pair | None:
-        if controls is None:
+        known, ok = self._controls(each), self.ok[:, :each]
+        if known is None:
             return None
-        ok = self.ok[:, :each]
-        C, D = (control[ok] for control in controls)
+        C, D = (control[ok] for control in known[0])
         first = self.outputs[:, :each][ok] - self._centre.outputs
         return first - found.coefficient * C, first**2 - found.second_coefficient * D
 
