@@ -33,7 +33,6 @@ from uq.surrogates.basis import (
     Basis,
     candidates_of,
     gauss,
-    orthonormal,
     rows_of,
     whole,
 )
@@ -201,11 +200,10 @@ class Chaos(Amount):
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
             bases = candidates_of(inputs, self.order, int(min(limit * rows, most)), dictionary)
-        largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
             fields = Projections(
-                largest, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
+                bases.basis, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
             )
         found: list[Evaluations] = []
         count, target = 0, min(limit, first_samples(inputs, gradients=gradients)) if open_ended else limit
@@ -219,7 +217,7 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            regression = Regression.fitted(inputs, bases, largest, data)
+            regression = Regression.fitted(inputs, bases, data)
             if self.max_order is None and not projection and not expand_fields:
                 regression = regression.higher()
             yield Expanded(centre, evaluations, regression)
@@ -330,7 +328,7 @@ def expansion_dataset(
     if evaluations.sketches is not None and fields:
         field = regression_of_field(regression, evaluations.sketches)
         terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
-    indices = regression.largest.indices[terms]
+    indices = regression.candidates.basis.indices[terms]
     coefficients = among(terms, fit.chosen.which, fit.coefficients)
     dataset = dataset.assign(
         {

@@ -24,7 +24,7 @@ from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, on_group
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
+from uq.surrogates.basis import Basis, candidates_of, rows_of
 from uq.surrogates.gate import Trial, repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation
@@ -157,11 +157,10 @@ def fit_deviations(
         If the model has no answer at too many of the points for an expansion of order 1.
     """
     candidates = candidates_of(inputs, max_order, len(points) * rows_of(inputs, gradients=True), FIELD_DICTIONARY)
-    largest = orthonormal(inputs, candidates.all)
-    wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    wanted = Projections(candidates.basis, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    regression = Regression.fitted(inputs, candidates, largest, data)
+    regression = Regression.fitted(inputs, candidates, data)
     return deviations(regression.higher() if wanted is None else regression, evaluations, centre)
 
 
@@ -232,7 +231,7 @@ def regression_of_field(outputs: Regression, sketches: FloatArray) -> Regression
     same = replace(outputs.fit.chosen, sparse=False)
     for sets in ((same,), outputs.candidates.sets):
         try:
-            fit = fit_best(replace(outputs.candidates, sets=sets), outputs.largest, data)
+            fit = fit_best(replace(outputs.candidates, sets=sets), data)
         except SolveError:
             continue  # not determined without some of the samples
         fits.append(replace(outputs, data=data, fit=fit))
@@ -245,7 +244,7 @@ def errors_of_indices(regression: Regression) -> dict[str, FloatArray]:
 
     NaN if the fit explains nothing.
     """
-    fit, largest = regression.fit, regression.largest.indices
+    fit, largest = regression.fit, regression.candidates.basis.indices
     alone = np.eye(largest.shape[1], dtype=bool)
 
     def of(coefficients: FloatArray, indices: NDArray[np.int64]) -> FloatArray:

@@ -59,8 +59,8 @@ class Regression:
     ----------
     inputs
         The parameters.
-    candidates, largest
-        The sets of functions that were tried, and the basis of all of them.
+    candidates
+        The sets of functions that were tried.
     data
         The samples that have an answer.
     fit
@@ -69,14 +69,13 @@ class Regression:
 
     inputs: Inputs
     candidates: Candidates
-    largest: Basis
     data: Data
     fit: Fit
 
     @classmethod
-    def fitted(cls, inputs: Inputs, candidates: Candidates, largest: Basis, data: Data) -> Regression:
+    def fitted(cls, inputs: Inputs, candidates: Candidates, data: Data) -> Regression:
         """Fit data with the best of these sets; errors as in `of`."""
-        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+        return cls(inputs, candidates, data, fit_best(candidates, data))
 
     @classmethod
     def of(
@@ -91,13 +90,12 @@ class Regression:
         """
         data = Data.at(points, values, tangents, inputs)
         rows = len(points) * rows_of(inputs, gradients=tangents is not None)
-        candidates = candidates_of(inputs, max_order or ORDER, rows, DICTIONARY)
-        found = cls.fitted(inputs, candidates, orthonormal(inputs, candidates.all), data)
+        found = cls.fitted(inputs, candidates_of(inputs, max_order or ORDER, rows, DICTIONARY), data)
         return found if max_order else found.higher()
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as in `of`."""
-        return Regression.fitted(self.inputs, self.candidates, self.largest, self.data.some(slice(count)))
+        return Regression.fitted(self.inputs, self.candidates, self.data.some(slice(count)))
 
     def higher(self) -> Regression:
         """Return the fit of half as high an order again, as long as the highest is chosen, and it explains far more.
@@ -109,8 +107,7 @@ class Regression:
         rows = len(data.points) * rows_of(self.inputs, gradients=data.slopes is not None)
         while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
             order = min(found.candidates.limit * 3 // 2, HIGHEST)
-            candidates = candidates_of(self.inputs, order, rows, DICTIONARY)
-            again = Regression.fitted(self.inputs, candidates, orthonormal(self.inputs, candidates.all), data)
+            again = Regression.fitted(self.inputs, candidates_of(self.inputs, order, rows, DICTIONARY), data)
             if EXPLAINS * again.fit.relative.max() > found.fit.relative.max():
                 break
             found = again
@@ -124,7 +121,7 @@ class Regression:
     @property
     def basis(self) -> Basis:
         """The P functions of the fit."""
-        return self.largest.subset(self.fit.chosen.which)
+        return self.candidates.basis.subset(self.fit.chosen.which)
 
     def estimates(self, of: Analysis | None = None) -> dict[str, FloatArray]:
         """Return estimates from the coefficients, by output, with standard errors.
@@ -144,7 +141,7 @@ class Regression:
         assert draws is not None
         if len(draws.names) > MOST:
             return self._estimates(moments, missing, missing)
-        of = Shapley.of(self.largest, draws)
+        of = Shapley.of(self.candidates.basis, draws)
         found = self._estimates(of.analysis, missing, missing)
         of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
@@ -278,7 +275,7 @@ class Regression:
 
         Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
         """
-        fit, largest = self.fit, self.largest.indices
+        fit, largest = self.fit, self.candidates.basis.indices
         indices = largest[fit.chosen.which]
         central = of(fit.coefficients.T, indices)
         left_out = of(np.swapaxes(fit.without, 1, 2), largest)
@@ -364,7 +361,7 @@ class Regression:
 
     def _unseen_samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Samples (n, m) of both moments of deviations from values (m,), each with the fit without it as control."""
-        fit, data, largest = self.fit, self.data, self.largest.indices
+        fit, data, largest = self.fit, self.data, self.candidates.basis.indices
         offset = data.values.mean(axis=0)
         constant = (largest == 0).all(axis=1)
         mean = (fit.without[:, constant].sum(axis=1) - offset)[fit.held]
