@@ -141,8 +141,8 @@ class Chosen:
         c (N, m) at all points, as deviations.
     rest, cheap
         Summands of mean and variance: (ψ_0 − c)/λ of the chosen (2, c, m), and those of c (2, N, m).
-    rows, expected
-        Places of the chosen (c,) among all points, and their λ.
+    pooled
+        What it is estimated from.
     left
         Variance (m,) of what a plain sample leaves of model 0 beside its tangent.
     """
@@ -152,8 +152,7 @@ class Chosen:
     predicted: FloatArray
     rest: FloatArray
     cheap: FloatArray
-    rows: NDArray[np.intp]
-    expected: FloatArray
+    pooled: Pooled
     left: FloatArray
 
 
@@ -259,8 +258,7 @@ class Pooled:
             predicted + middle,
             np.array([rest[0], rest[1] - 2 * mean * rest[0]]),
             np.array([cheap[0], cheap[1] - 2 * mean * cheap[0]]),
-            self.rows,
-            self.expected,
+            self,
             left,
         )
 

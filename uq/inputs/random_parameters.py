@@ -106,6 +106,11 @@ class Inputs:
         return np.array([marginal.support is None for marginal in self.marginals.values()], dtype=bool)
 
     @property
+    def tails(self) -> NDArray[np.bool_]:
+        """Which parameters (d,) have values beyond those of samples: unbounded, or given by draws, which are many."""
+        return self.unbounded | np.isin(np.arange(len(self.marginals)), self.joint)
+
+    @property
     def joint(self) -> range:
         """Places of the parameters that are given by draws."""
         return range(len(self.own), len(self.marginals))

@@ -25,7 +25,6 @@ from uq.estimators.tails import concentration, with_tails
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Fidelities, Taken
 from uq.methods.fidelity_ways import FEWEST, UNLIMITED, Way
-from uq.surrogates.regression import tails_of
 
 TRIED = 60  # numbers of full solves
 UNSEEN = 4.0  # times the variance that a pilot predicts, where it has seen no tail
@@ -84,16 +83,12 @@ class ByChoice(Way):
         t = team.members[0].centre.coordinates.of(taken.points)
         return Pool(deviations[:, 1:], t, chosen, deviations[chosen, 0])
 
-    def _pooled(self) -> Pooled:
-        pools = [one.pool for one in self._pools]
+    def _estimate(self) -> None:
+        team, pools = self._team, [one.pool for one in self._pools]
         if self._counts or not pools:
             pools = [self._pilot.pool, *pools]
-        return Pooled(pools, self._team.slopes, self._team.inputs.correlation, self._known)
-
-    def _estimate(self) -> None:
-        team, pooled = self._team, self._pooled()
-        found = pooled.estimated(team.offsets[0])
-        parts = found.rest[1] * len(found.rows), found.cheap[1] * len(found.cheap[1])
+        found = Pooled(pools, team.slopes, team.inputs.correlation, self._known).estimated(team.offsets[0])
+        parts = found.rest[1] * len(found.pooled.rows), found.cheap[1] * len(found.cheap[1])
         moved = [one - one.mean(axis=0) for one in parts]
         values = team.offsets[0] + found.predicted
         self.estimates = with_tails(found.estimates, team.inputs, moved, values, of=1)
@@ -109,13 +104,13 @@ class ByChoice(Way):
 
     def best(self, cost: float) -> Amounts:
         """Return how many full solves and points of a pool are best for a cost."""
-        team, found, pooled = self._team, self.found, self._pooled()
+        team, found, pooled = self._team, self.found, self.found.pooled
         design = self._design()
         d = design.differences(pooled.cheap)
         size = np.hypot(FLOOR * np.sqrt((d**2).mean()) or 1.0, d)
-        errors = found.rest[0] * found.expected[:, None]
+        errors = found.rest[0] * pooled.expected[:, None]
         # Variance of a full solve by the choice, and of a point of the pool.
-        rest = (errors**2 / (size[found.rows] * found.expected)[:, None]).sum(axis=0) * size.mean()
+        rest = (errors**2 / (size[pooled.rows] * pooled.expected)[:, None]).sum(axis=0) * size.mean()
         cheap = found.cheap[0].var(axis=0) * len(pooled.cheap) ** 2
         counts = bool(self._counts or self._pools)
         before, points = counts * ratio(rest, (found.rest[0] ** 2).sum(axis=0)), counts * len(pooled.cheap)
@@ -138,9 +133,9 @@ class ByChoice(Way):
         Of bounded parameters points show the differences d: if the models miss as much as they differ, even full solves
         have the variance E[d²], and these E[d]².
         """
-        if tails_of(self._team.inputs).any():
+        if self._team.inputs.tails.any():
             return UNSEEN
-        return concentration(self._design().differences(self._pooled().cheap), 0.0)
+        return concentration(self._design().differences(self.found.pooled.cheap), 0.0)
 
     def needed(self, target: float) -> float:
         """Predict what has to be spent for a largest relative variance."""
@@ -172,8 +167,7 @@ class ByChoice(Way):
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs."""
-        pooled = self._pooled()
-        return quantiles_of_chosen(pooled, self.found, self._team.offsets[0], probabilities)
+        return quantiles_of_chosen(self.found, self._team.offsets[0], probabilities)
 
     def blocks(self) -> list[Block]:
         """What was taken: of each pool the points that were chosen, and the others."""
@@ -193,14 +187,14 @@ class ByChoice(Way):
             sum(f(one) for one in self._pools) for f in (lambda p: p.chosen.sum(), lambda p: len(p.chosen))
         )
         labels = [team.members[k].label for k in self._pair]
-        least, most = (f(found.expected) / len(found.predicted) for f in (np.min, np.max))
+        least, most = (f(found.pooled.expected) / len(found.predicted) for f in (np.min, np.max))
         yield Finding(
             "solves-chosen",
             "note",
             {"chosen": chosen, "points": points, "least": least, "most": most, "first": labels[0], "second": labels[1]},
         )
         values = team.offsets[0] + found.predicted
-        moved = found.rest[1] * len(found.rows)
+        moved = found.rest[1] * len(found.pooled.rows)
         relative = ratio(found.estimates.std_error, found.estimates.std)
         yield from of_tails(team.evaluate.outputs, values, relative, moved - moved.mean(axis=0))
 

@@ -26,7 +26,6 @@ from uq.surrogates.field_regression import Deviations
 from uq.surrogates.gate import wrong
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.outside_samples import Beyond, beyond, drawn_beyond
-from uq.surrogates.regression import tails_of
 from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 
 Found = TypeVar("Found")
@@ -327,7 +326,7 @@ class Scrambles(Sets):
         first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
         middle = found.mean - self._centre.outputs
         sizes, norm = None, np.zeros_like(found.std)
-        if not tails_of(self._inputs).any():  # in tails what no sample shows is in other claims, and has no limit
+        if not self._inputs.tails.any():  # in tails what no sample shows is in other claims, and has no limit
             left = controlled[0] - controlled[0].mean(axis=0)
             sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
         of_std = ratio(wrong(second - 2 * middle * first, sizes), 2 * found.std)
@@ -339,14 +338,13 @@ class Scrambles(Sets):
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""
-        tails = tails_of(self._inputs)
         match control.polynomials:
             case Held(basis, lower, upper):
-                return beyond(self._inputs, basis, control.outputs, points, tails, (lower, upper))
+                return beyond(self._inputs, basis, control.outputs, points, (lower, upper))
             case Basis() as basis:
-                return beyond(self._inputs, basis, control.outputs, points, tails)
+                return beyond(self._inputs, basis, control.outputs, points)
             case polynomials:
-                return drawn_beyond(self._inputs, polynomials.values, control.outputs, points, tails)
+                return drawn_beyond(self._inputs, polynomials.values, control.outputs, points)
 
     @_once
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:

@@ -159,7 +159,7 @@ class Regression:
         samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
         then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
         """
-        tails = tails_of(self.inputs)
+        tails = self.inputs.tails
         if not tails.any():
             return None
         joint = np.isin(np.arange(tails.size), self.inputs.joint)
@@ -177,7 +177,7 @@ class Regression:
         regression they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and
         t²/(2σ). For t stands the most that the residuals allow, see `missing`.
         """
-        tails, basis, data, fit = tails_of(self.inputs), self.basis, self.data, self.fit
+        tails, basis, data, fit = self.inputs.tails, self.basis, self.data, self.fit
         if self.inputs.draws is not None:
             return missing
         varying = (basis.indices != 0).any(axis=1)
@@ -203,7 +203,7 @@ class Regression:
         what is left of ψ is known everywhere, and its mean and its product with the expansion are integrals.
         """
         inputs, basis, fit = self.inputs, self.basis, self.fit
-        bounded, first = ~tails_of(inputs), basis.indices.sum(axis=1) == 1
+        bounded, first = ~inputs.tails, basis.indices.sum(axis=1) == 1
         if not bounded.any():
             return np.zeros((2, fit.loo.size))
         directions, asked = towards_ends(bounded, basis.indices[first], fit.coefficients[first])
@@ -390,7 +390,7 @@ class Regression:
     def beyond(self, points: FloatArray | None = None) -> Beyond:
         """Return what the fit has in tails beyond its samples, or beyond points (n, d)."""
         points = self.data.points if points is None else points
-        return beyond(self.inputs, self.basis, self.fit.coefficients, points, tails_of(self.inputs))
+        return beyond(self.inputs, self.basis, self.fit.coefficients, points)
 
     @property
     def controlled(self) -> BoolArray:
@@ -423,8 +423,3 @@ class Regression:
                 influences(first, second)[:, which],
                 expanded=True,
             )
-
-
-def tails_of(inputs: Inputs) -> BoolArray:
-    """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
-    return inputs.unbounded | np.isin(np.arange(len(inputs.names)), inputs.joint)
