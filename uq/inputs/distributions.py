@@ -6,14 +6,11 @@ from functools import cached_property
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from annotated_types import Gt
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from forward.model import FloatArray
 from uq.inputs.quadrature import Cut, panels
 from uq.inputs.univariate import Bounded, Chaospy, Univariate
-
-PositiveFloat = Annotated[float, Gt(0)]
 
 
 class Uniform(Bounded):

@@ -371,14 +371,13 @@ class Regression:
 
     def _left_of_following(self, places: IntArray) -> FloatArray:
         """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
-        basis, (q, _) = self.basis, self._columns
+        basis = self.basis
         degrees = basis.indices[:, places]
         powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
         powers[:, np.arange(places.size), places] = following, following + 1
         functions, norms = lacking(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
-        columns = self.data.left(functions).reshape(len(q), -1)
-        found = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0)
+        _, found = self._taken_up(self.data.left(functions))
         found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
         next_one, after = found.reshape(2, places.size, 1)
         # An odd function, or one beside a slope, has no even powers, and lacks the one after the next.
