@@ -14,7 +14,7 @@ of error after n samples in R scrambles, for a standard deviation (Sobol' points
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import comb
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -31,7 +31,7 @@ from uq.inputs.sampling import power_of_two, sobol_points
 from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded
 from uq.methods.method import UNASKED, Method, Probability
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
-from uq.surrogates.field_regression import Deviations, deviations
+from uq.surrogates.field_regression import deviations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,32 +101,39 @@ class Automatic(Method):
             The results of the method that was chosen; its attribute `chosen` says which, and why.
         """
         recorder = Recorder(evaluate)
-        pilot = self._pilot(inputs, recorder, goal)
-        solves, reasons = recorder.solves, [pilot.reason]
-        if pilot.control is None and pilot.found is not None:
-            chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, pilot.found)
+        control, why, found = self._pilot(inputs, recorder, goal)
+        solves, reasons = recorder.solves, [why]
+        if control is None and found is not None:
+            chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, found)
         else:
-            chosen, left = "quasi-monte-carlo", replace(goal, most=max(goal.most - solves, 2))
+            control, left = control or "none", replace(goal, most=max(goal.most - solves, 2))
+            chosen, reasons = "quasi-monte-carlo", [f"Quasi-Monte Carlo {IN_WORDS[control]}: {why}."]
             method = QuasiMonteCarlo(
                 samples=SCRAMBLES * power_of_two(LIMITLESS // SCRAMBLES),  # the goal says how many
                 scrambles=SCRAMBLES,
-                control=pilot.control or "none",
+                control=control,
                 seed=self.seed,
                 quantiles=self.quantiles,
                 fields=self.fields,
             )
-            dataset = method.until(inputs, recorder, left, pilot.expanded)
+            expanded = None
+            if control == "chaos" and found is not None:
+                expanded = deviations(found.regression, found.evaluations, found.centre)
+            dataset = method.until(inputs, recorder, left, expanded)
             if solves:
                 reasons.append(f"In all {recorder.solves:,} solves, {solves:,} of them to find out.")
         dataset.attrs["chosen"] = json.dumps({"method": chosen, "reasons": reasons}, ensure_ascii=False)
         return dataset
 
-    def _pilot(self, inputs: Inputs, evaluate: Recorder, goal: Goal) -> _Pilot:
-        """Expand until the claims are those of the goal, or something else takes less."""
+    def _pilot(self, inputs: Inputs, evaluate: Recorder, goal: Goal) -> tuple[Control | None, str, Expanded | None]:
+        """Expand until the claims are those of the goal, or something else takes less.
+
+        Returns the control of quasi-Monte Carlo, if this is to follow; why, in words; the expansion, if there is one.
+        """
         gradients = evaluate.differentiable
         plain: Control = "tangent" if gradients else "none"
         if inputs.correlations:
-            return _Pilot(plain, "there are no expansions in parameters that are correlated")
+            return plain, "there are no expansions in parameters that are correlated", None
         chaos = self._chaos(inputs, goal)
         trail: list[tuple[int, float]] = []
         found: Expanded | None = None
@@ -148,7 +155,7 @@ class Automatic(Method):
                     break
         except SolveError as error:
             if found is None:
-                return _Pilot(plain, error.reason)
+                return plain, error.reason, None
             raise
         assert found is not None
         (first, before), (count, last) = trail[0], trail[-1]
@@ -158,12 +165,12 @@ class Automatic(Method):
         between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
         if last <= 1 or not samples or goal.most - count < WORTH * count:
             what = "fitted to values and gradients" if gradients else "fitted to values"
-            return _Pilot(None, f"Polynomial chaos {what}: {fell}{between}.", found)
+            return None, f"Polynomial chaos {what}: {fell}{between}.", found
         reason = (
             f"about {samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
             f"{fell}{between}"
         )
-        return _Pilot(control, reason, found)
+        return control, reason, found
 
     def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
         return Chaos(
@@ -173,37 +180,6 @@ class Automatic(Method):
             quantiles=self.quantiles,
             fields=self.fields,
         )
-
-
-@dataclass(frozen=True)
-class _Pilot:
-    """What first solves have shown.
-
-    Attributes
-    ----------
-    control
-        That of quasi-Monte Carlo, if this is to follow.
-    why
-        In words.
-    found
-        The expansion, if there is one.
-    """
-
-    control: Control | None
-    why: str
-    found: Expanded | None = None
-
-    @property
-    def reason(self) -> str:
-        """Why this is the way, in a sentence."""
-        return self.why if self.control is None else f"Quasi-Monte Carlo {IN_WORDS[self.control]}: {self.why}."
-
-    @property
-    def expanded(self) -> Deviations | None:
-        """The expansion as a control variate."""
-        if self.control != "chaos" or self.found is None:
-            return None
-        return deviations(self.found.regression, self.found.evaluations, self.found.centre)
 
 
 def order_for(dimension: int) -> int:
