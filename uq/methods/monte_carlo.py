@@ -132,6 +132,14 @@ class MonteCarlo(Amount):
         stopped = f"{amount}: {error}" if goal else self.why_stopped(reached, error, count, limit, amount)
         return self._results(inputs, evaluate, centre, evaluations, scalars, stopped)
 
+    def _field_moments(self, evaluations: Evaluations, inputs: Inputs, centre: Linearisation) -> Moments:
+        n, control = int(evaluations.ok.sum()), self._control
+        if control is None or len(centre.slopes) == 0:
+            return estimate(evaluations.fields, n, centre.state)
+        slopes = centre.state_slopes
+        variance = np.einsum("iu,ij,ju->u", slopes, inputs.correlation, slopes)
+        return estimate(evaluations.fields, n, centre.state_middle, variance, *control)
+
     def _results(
         self,
         inputs: Inputs,
@@ -161,7 +169,7 @@ class MonteCarlo(Amount):
                 }
             )
         if evaluations.fields.size:
-            field, count = _field_moments(evaluations, inputs, centre, control), evaluate.displacements
+            field, count = self._field_moments(evaluations, inputs, centre), evaluate.displacements
             dataset = dataset.assign(by_node(field, count))
             powers = evaluations.fields if len(evaluations.fields) == len(POWERS) else evaluations.fields[POWERS]
             relative, volumes = field.relative_std_error[:count], evaluate.node_volumes
@@ -256,20 +264,6 @@ def _controlled(evaluations: Evaluations, centre: Linearisation, found: Estimate
     first = evaluations.outputs[ok] - centre.middle
     predicted = centre.predicted(evaluations.points[ok])
     return first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2
-
-
-def _field_moments(
-    evaluations: Evaluations,
-    inputs: Inputs,
-    centre: Linearisation,
-    control: tuple[Coefficient, SecondMoment] | None,
-) -> Moments:
-    n = int(evaluations.ok.sum())
-    if control is None or len(centre.slopes) == 0:
-        return estimate(evaluations.fields, n, centre.state)
-    slopes = centre.state_slopes
-    variance = np.einsum("iu,ij,ju->u", slopes, inputs.correlation, slopes)
-    return estimate(evaluations.fields, n, centre.state_middle, variance, *control)
 
 
 def by_node(field: Estimates, displacements: int) -> Variables:
