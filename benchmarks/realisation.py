@@ -16,7 +16,7 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
-from uq.surrogates.basis import orthonormal, whole
+from uq.surrogates.basis import whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise
@@ -126,8 +126,8 @@ def require_same(state: FloatArray, expected: FloatArray) -> None:
 def expanded(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, order: int, solves: int) -> StateExpansion:
     """Expand the state, fitted to so many solves with their gradients."""
     bases = whole(inputs, order)
-    basis = orthonormal(inputs, bases.all)
+    basis = bases.basis
     points = inputs.points(sobol_points(0, 0, 0, solves, len(inputs.names)))
     sums = Projections(basis, centre.state, True, None, None)
     found = evaluate(Request(points, tangents=True, fields=sums, start=centre.prediction))
-    return StateExpansion.fitted(basis, fit_best(bases, basis, Data.of(found, inputs, None)), found.fields, centre)
+    return StateExpansion.fitted(basis, fit_best(bases, Data.of(found, inputs, None)), found.fields, centre)

@@ -177,7 +177,4 @@ def settled(dataset: xr.Dataset, units: Mapping[str, str]) -> None:
     if names:
         withdraw(dataset, names)
         be = "is" if len(names) == 1 else "are"
-        add(
-            dataset,
-            Finding("only-rounding", "note", {"be": be}, about=entries(names)),
-        )
+        add(dataset, Finding("only-rounding", "note", {"be": be}, about=entries(names)))

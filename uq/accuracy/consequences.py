@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.indices import coefficient_moments, pair_variances, partial_variances, shares
+from uq.estimators.indices import partial_variances, shares, sobol_indices
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion
 
@@ -85,16 +85,8 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
             return np.asarray(edges[i] + (powers @ fitted).T)
 
         yield Consequence("density_edge", 0, moved, _in_units, in_units=True)
-    if not inputs.independent:
-        return
-    last = {**dict.fromkeys(GROUPED, ("group",)), PAIRED: ("parameter", "partner")}
-    every = (*SINGLE, *GROUPED, PAIRED, *BOUNDS)
-    names = [name for name in every if has(dataset, name, "output", *last.get(name, ("parameter",)))]
-    if names:
-        projected = _Projected.on(dataset, inputs, points)
-        for name in names:
-            analysis = projected.analysis(dataset, name)
-            yield Consequence(name, 0, analysis, _relative if name in BOUNDS else _share)
+    if inputs.independent:
+        yield from _of_projections(dataset, inputs, points)
 
 
 def has(dataset: xr.Dataset, name: str, *dims: str) -> bool:
@@ -116,77 +108,40 @@ def _relative(values: FloatArray, rho: float, _: float) -> FloatArray:
     return np.asarray(np.abs(values) * (2 * rho + rho**2))
 
 
-@dataclass(frozen=True)
-class _Projected:
-    """Polynomials at points (n, d) of the distribution, on which outputs are projected.
+def _of_projections(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Iterator[Consequence]:
+    """Find indices and bounds: they are looked at in polynomials, on which outputs are projected."""
+    last = {**dict.fromkeys(GROUPED, ("group",)), PAIRED: ("parameter", "partner")}
+    every = (*SINGLE, *GROUPED, PAIRED, *BOUNDS)
+    names = [name for name in every if has(dataset, name, "output", *last.get(name, ("parameter",)))]
+    if not names:
+        return
+    basis, members = _polynomials(dataset, inputs), np.zeros((0, len(inputs.names)), dtype=bool)
+    if has(dataset, "group_members", "group", "parameter"):
+        members = np.asarray(dataset["group_members"].to_numpy(), dtype=bool)
+    rows, some = basis.values(points), points[:SLOPES]
 
-    Attributes
-    ----------
-    basis
-        The polynomials.
-    rows
-        Their values (n, P).
-    points
-        Some of the points, where derivatives are looked at.
-    members
-        Which parameters (G, d) each group has.
-    """
+    def coefficients(of: FloatArray) -> FloatArray:
+        """Return coefficients (c, P) of values (n, c)."""
+        return np.asarray(np.linalg.lstsq(rows, of, rcond=None)[0].T)
 
-    basis: Basis
-    rows: FloatArray
-    points: FloatArray
-    members: NDArray[np.bool_]
+    def indices(name: str, of: FloatArray, _: int) -> FloatArray:
+        return sobol_indices(coefficients(of), basis.indices, members, pairs=name == PAIRED)[name]
 
-    @classmethod
-    def on(cls, dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> _Projected:
-        """Take the polynomials of an expansion, or as many of a low order as the points can tell."""
-        basis = _polynomials(dataset, inputs)
-        return cls(basis, basis.values(points), points[:SLOPES], _members(dataset, len(inputs.names)))
+    def bounds(name: str, of: FloatArray, i: int) -> FloatArray:
+        """Return mean squared derivatives (c, d), or these over the variance for bounds of total indices.
 
-    def analysis(self, dataset: xr.Dataset, name: str) -> Callable[[FloatArray, int], FloatArray]:
-        """Return the function (values (n, c), output) → a variable (c, …), for a `Consequence`."""
-        if name not in BOUNDS:
-            return lambda of, _: self._indices(of, name)
-        stated = dataset[name].to_numpy()
-
-        def scaled(of: FloatArray, i: int) -> FloatArray:
-            found = self._bounds(of, name)
-            return np.asarray(stated[i] * np.divide(found, found[0], out=np.ones_like(found), where=found[0] > 0))
-
-        return scaled
-
-    def _coefficients(self, of: FloatArray) -> FloatArray:
-        """Coefficients (P, c) of values (n, c)."""
-        return np.asarray(np.linalg.lstsq(self.rows, of, rcond=None)[0])
-
-    def _indices(self, of: FloatArray, name: str) -> FloatArray:
-        coefficients, indices = self._coefficients(of).T, self.basis.indices
-        if name in SINGLE:
-            return coefficient_moments(coefficients, indices)[name]
-        squares = coefficients**2
-        variance, first, total = partial_variances(squares, indices, self.members)
-        if name in GROUPED:
-            return shares(first if name == GROUPED[0] else total, variance[..., None])
-        return shares(pair_variances(squares, indices), variance[..., None, None])
-
-    def _bounds(self, of: FloatArray, name: str) -> FloatArray:
-        """Mean squared derivatives (c, d), over the variance for bounds of total indices; by the coordinates.
-
-        Only their ratios count: constants of the distributions are the same with and without the error.
+        Only their ratios by the coordinates count: constants of distributions are the same with and without the error.
         """
-        coefficients = self._coefficients(of)
-        slopes = np.einsum("nip,pc->nic", self.basis.derivatives(self.points), coefficients)
-        squares: FloatArray = (slopes**2).mean(axis=0).T
-        if name == "dgsm":
-            return squares
-        return shares(squares, partial_variances(coefficients.T**2, self.basis.indices, self.members)[0][:, None])
+        c = coefficients(of)
+        found = (np.einsum("nip,pc->nic", basis.derivatives(some), c.T) ** 2).mean(axis=0).T
+        if name != "dgsm":
+            found = shares(found, partial_variances(c**2, basis.indices, members)[0][:, None])
+        stated = dataset[name].to_numpy()[i]
+        return np.asarray(stated * np.divide(found, found[0], out=np.ones_like(found), where=found[0] > 0))
 
-
-def _members(dataset: xr.Dataset, dimension: int) -> NDArray[np.bool_]:
-    """Which parameters (G, d) each group has."""
-    if not has(dataset, "group_members", "group", "parameter"):
-        return np.zeros((0, dimension), dtype=bool)
-    return np.asarray(dataset["group_members"].to_numpy(), dtype=bool)
+    for name in names:
+        of, missed = (bounds, _relative) if name in BOUNDS else (indices, _share)
+        yield Consequence(name, 0, partial(of, name), missed)
 
 
 def _polynomials(dataset: xr.Dataset, inputs: Inputs) -> Basis:

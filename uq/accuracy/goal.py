@@ -72,10 +72,7 @@ class Goal:
         """Return the errors (2, m) by source, and in all, over the tolerance: 1 is as much as is allowed."""
         mean, mean_error, std, std_error = (np.asarray(found[name], dtype=float) for name in ESTIMATES)
         allowed = self.tolerance * self.sizes(mean, std)
-        errors = {
-            "sampling": half_width * np.array([mean_error, std_error]),
-            "mesh": Z * self.mesh,
-        }
+        errors = {"sampling": half_width * np.array([mean_error, std_error]), "mesh": Z * self.mesh}
         # Where all is zero, so is the error.
         shares = {name: np.divide(e, allowed, out=np.zeros_like(e), where=e != 0) for name, e in errors.items()}
         shares["solver"] = np.full_like(allowed, self.solver / self.tolerance)

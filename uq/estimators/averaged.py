@@ -14,13 +14,13 @@ import numpy as np
 
 from forward.model import FloatArray
 from uq.estimators.indices import shares
+from uq.estimators.moments import ESTIMATES
 from uq.findings import add, findings
 
 if TYPE_CHECKING:
     import xarray as xr
 
-FIELDS = ("field_mean", "field_mean_error", "field_std", "field_std_error")
-KEPT = ("mean", "mean_error", "std", "std_error")
+FIELDS = tuple(f"field_{name}" for name in ESTIMATES)
 
 
 def averaged(found: Mapping[str, xr.Dataset], probabilities: Sequence[float], errors: Sequence[float]) -> xr.Dataset:
@@ -38,11 +38,11 @@ def averaged(found: Mapping[str, xr.Dataset], probabilities: Sequence[float], er
     p, unsure = np.asarray(probabilities), np.asarray(errors)
     first = next(iter(found.values()))
     by, each = ("output",), ("candidate", "output")
-    outputs = {name: np.array([one[name].to_numpy() for one in found.values()]) for name in KEPT}
-    whole = average(p, unsure, *(outputs[name] for name in KEPT))
+    outputs = {name: np.array([one[name].to_numpy() for one in found.values()]) for name in ESTIMATES}
+    whole = average(p, unsure, *(outputs[name] for name in ESTIMATES))
     dataset = xr.Dataset(
         {
-            **{name: (by, whole[name]) for name in (*KEPT, "within", "between")},
+            **{name: (by, whole[name]) for name in (*ESTIMATES, "within", "between")},
             **{f"candidate_{name}": (each, values) for name, values in outputs.items()},
             "candidate_probability": (("candidate",), p),
             "candidate_probability_error": (("candidate",), unsure),
@@ -51,7 +51,7 @@ def averaged(found: Mapping[str, xr.Dataset], probabilities: Sequence[float], er
     )
     if all("field_mean" in one for one in found.values()):
         fields = average(p, unsure, *(np.array([one[name].to_numpy() for one in found.values()]) for name in FIELDS))
-        of_nodes = {f"field_{name}": (("node", "component"), fields[name]) for name in (*KEPT, "between")}
+        of_nodes = {f"field_{name}": (("node", "component"), fields[name]) for name in (*ESTIMATES, "between")}
         dataset = dataset.assign_coords(component=["x", "y", "z"]).assign(of_nodes)
     for name, one in found.items():
         add(dataset, *(finding.of(f"Candidate '{name}'") for finding in findings(one)))

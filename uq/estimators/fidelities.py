@@ -18,15 +18,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.blue import Group, Problem, informations, weights
-from uq.estimators.moments import Estimates, Term, Z, combine, ratio, student, term
-from uq.estimators.tails import influences
+from uq.estimators.blue import Group, informations, weights
+from uq.estimators.moments import Estimates, Z, combine, ratio, student, term
+from uq.estimators.tails import influences, kurtosis
 
 FOLDS = 10  # parts into which the samples of all models are cut
 ROUNDS = 4  # in which the mean stands for answers of model 0 that are missing
@@ -84,29 +83,25 @@ class Fitted:
         β, and γ and δ (K, 3).
     covariances
         Of the remainders r, and of the influences r' − 2⟨r⟩r on the variance (2, K, K).
-    means
-        ⟨r⟩ (K,).
     """
 
     slopes: FloatArray
     covariances: FloatArray
-    means: FloatArray
 
     @classmethod
     def of(cls, w: FloatArray, squares: FloatArray, T: FloatArray, V: float) -> Fitted:
         """Fit deviations w and w² (n, K) of all models, with the control T (n,) and its variance V."""
         n, K = w.shape
-        slopes, parts = np.zeros((K, 3)), np.empty((2, n, K))
+        slopes = np.zeros((K, 3))
         if T.any():  # without a control there is nothing to fit
             for k in range(K):
                 slopes[k, 0] = _slopes(w[:, k], T[:, None])[0]
                 slopes[k, 1:] = _slopes(squares[:, k], np.column_stack([T, T**2 - V]))
         first, second = remainders(w, squares, T, V, slopes)
-        means = first.mean(axis=0)
-        parts = np.array([first, second - 2 * means * first])
+        parts = np.array([first, second - 2 * first.mean(axis=0) * first])
         used = (slopes != 0).sum(axis=1).max()
         parts = parts - parts.mean(axis=1, keepdims=True)
-        return cls(slopes, np.einsum("ank,anl->akl", parts, parts) / max(n - 1 - used / 2, 1), means)
+        return cls(slopes, np.einsum("ank,anl->akl", parts, parts) / max(n - 1 - used / 2, 1))
 
 
 def _slopes(y: FloatArray, x: FloatArray) -> FloatArray:
@@ -137,8 +132,6 @@ class Found:
     ----------
     estimates
         Of mean and standard deviation, by output; errors with Student's factor.
-    terms
-        The part of each group in both moments.
     moved
         By how much each sample (n, m) of each group moves the variance.
     fitted
@@ -148,7 +141,6 @@ class Found:
     """
 
     estimates: Estimates
-    terms: tuple[Term, ...]
     moved: tuple[FloatArray, ...]
     fitted: tuple[Fitted, ...]
     relative: FloatArray
@@ -158,27 +150,17 @@ class Found:
         """Covariances (m, K, K) of the remainders, by output."""
         return np.array([one.covariances[0] for one in self.fitted])
 
-    def problem(self, groups: Sequence[Group], costs: FloatArray, taken: FloatArray, sizes: FloatArray) -> Problem:
-        """Return how to choose numbers of samples for means, whose errors count relative to sizes (m,)."""
-        some = [(one, size) for one, size in zip(self.fitted, sizes, strict=True) if one.covariances[0, 0, 0] > 0]
-        told = [informations(groups, one.covariances[0] / size**2) for one, size in some]
-        return Problem(np.array(told), costs, taken)
 
+def folds(whole: Samples, *, inner: bool) -> list[tuple[NDArray[np.bool_], float]]:
+    """Cut the samples of all models into parts, each of which the others weigh; if they count in the estimate.
 
-class Fold(NamedTuple):
-    """Which samples (n,) of all models tell weights, and the share of the estimate that these are for."""
-
-    kept: NDArray[np.bool_]
-    share: float
-
-
-def folds(whole: Samples, *, inner: bool) -> list[Fold]:
-    """Cut the samples of all models into parts, each of which the others weigh; if they count in the estimate."""
+    Returns which samples (n,) tell weights, and the share of the estimate that these are for.
+    """
     n = whole.count
     if not inner:
-        return [Fold(np.ones(n, dtype=bool), 1.0)]
+        return [(np.ones(n, dtype=bool), 1.0)]
     part = np.arange(n) % min(FOLDS, n)
-    return [Fold(part != f, size / n) for f, size in enumerate(np.bincount(part))]
+    return [(part != f, size / n) for f, size in enumerate(np.bincount(part))]
 
 
 def estimated(
@@ -206,13 +188,13 @@ def estimated(
         first, second = (
             [one.mean(axis=0) + (one - one.mean(axis=0)) / answered for one in parts] for parts in (first, second)
         )
-    terms = tuple(term(a, b) for a, b in zip(first, second, strict=True))
+    terms = [term(a, b) for a, b in zip(first, second, strict=True)]
     found = combine(offset, terms)
     mean = np.sum([one.first for one in terms], axis=0)
     moved = tuple(influences(a, b, mean) for a, b in zip(first, second, strict=True))
     factors, relative = zip(*(uncertainty(parts) for parts in (first, moved)), strict=True)
     estimates = replace(found, mean_error=found.mean_error * factors[0], std_error=found.std_error * factors[1])
-    return Found(estimates, terms, moved, tuple(fitted), np.array(relative))
+    return Found(estimates, moved, tuple(fitted), np.array(relative))
 
 
 def _combined(
@@ -228,7 +210,8 @@ def _combined(
     fitted = []
     for j in range(m):
         V = float(variances[j])
-        middle = _middle(groups, known, j)
+        # About where deviations and their squares are: from there weights vary with little effect.
+        middle = [pooled_means(groups, [one[which][:, :, j] for one in known]) for which in range(2)]
         parts = of_all[:, :, j], squares_of_all[:, :, j], whole.controls[:, j]
         for kept, share in cut:
             fit = Fitted.of(parts[0][kept], parts[1][kept], parts[2][kept], V)
@@ -246,18 +229,12 @@ def _combined(
     return first, second, fitted
 
 
-def _middle(
-    groups: Sequence[Group], known: Sequence[tuple[FloatArray, FloatArray]], j: int
-) -> tuple[FloatArray, FloatArray]:
-    """About where the deviations of output j and their squares are (K,): from there weights vary with little effect."""
-    count = known[0][0].shape[1]
-    found = np.zeros((2, count))
-    for k in range(count):
-        for row, which in zip(found, range(2), strict=True):
-            row[k] = np.concatenate(
-                [one[which][:, k, j] for one, g in zip(known, groups, strict=True) if k in g]
-            ).mean()
-    return found[0], found[1]
+def pooled_means(groups: Sequence[Group], values: Sequence[FloatArray]) -> FloatArray:
+    """Return the means (K, …) of each model over all samples of groups that have it, from values (n, K, …) of each."""
+    by_model = (
+        [one[:, k] for one, group in zip(values, groups, strict=True) if k in group] for k in range(values[0].shape[1])
+    )
+    return np.array([np.concatenate(one).mean(axis=0) for one in by_model])
 
 
 def uncertainty(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -265,11 +242,8 @@ def uncertainty(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     squares, spread, freedom = [], [], []
     for one in parts:
         n = len(one)
-        centred = one - one.mean(axis=0)
-        second = (centred**2).mean(axis=0)
-        squares.append((centred**2).sum(axis=0) / (n - 1) / n)
-        kurtosis = ratio((centred**4).mean(axis=0), second**2, empty=3.0)
-        spread.append(squares[-1] ** 2 * np.maximum(kurtosis - 1, 0) / n)
+        squares.append(((one - one.mean(axis=0)) ** 2).sum(axis=0) / (n - 1) / n)
+        spread.append(squares[-1] ** 2 * np.maximum(kurtosis(one) - 1, 0) / n)
         freedom.append(squares[-1] ** 2 / (n - 1))
     total = np.sum(squares, axis=0)
     degrees = np.maximum(ratio(total**2, np.sum(freedom, axis=0), empty=1e6), FREE)

@@ -33,7 +33,7 @@ With g(T) = Σ_{W ⊂ T} m(W), each m(W) is shared by W ∪ U in equal parts (J.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -99,6 +99,20 @@ def coefficient_moments(coefficients: FloatArray, indices: NDArray[np.int64]) ->
     }
 
 
+def sobol_indices(
+    coefficients: FloatArray, indices: NDArray[np.int64], members: NDArray[np.bool_], *, pairs: bool
+) -> dict[str, FloatArray]:
+    """Return `coefficient_moments`, and indices of groups (…, G) of `members` (G, d), and of pairs (…, d, d)."""
+    found, squares = coefficient_moments(coefficients, indices), coefficients**2
+    variance, first, total = partial_variances(squares, indices, members)
+    if len(members):
+        found["sobol_group_first"] = shares(first, variance[..., None])
+        found["sobol_group_total"] = shares(total, variance[..., None])
+    if pairs:
+        found["sobol_second"] = shares(pair_variances(squares, indices), variance[..., None, None])
+    return found
+
+
 def moments(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
     """Mean and standard deviation (…) of coefficients (…, P): what dependent parameters have too."""
     constant = (indices == 0).all(axis=1)
@@ -157,7 +171,7 @@ class RowProducts:
         parts = [row, ((A**2 + B**2) / 2)[None], B * (AB - A), (A - AB) ** 2 / 2]
         if self.pairs:
             BA = row[2 + self.groups :]
-            parts += [(A * B)[None], *((BA[i] * AB[j])[None] for i, j in self._couples())]
+            parts += [(A * B)[None], *((BA[i] * AB[j])[None] for i, j in combinations(range(self.pairs), 2))]
         return np.concatenate(parts)
 
     def variances(self, means: FloatArray) -> ExchangedVariances:
@@ -172,13 +186,10 @@ class RowProducts:
         if self.pairs:
             rest = means[K + 1 + 2 * G :]
             second = np.zeros((self.pairs, self.pairs, *centre.shape))
-            for (i, j), product in zip(self._couples(), rest[1:], strict=True):
+            for (i, j), product in zip(combinations(range(self.pairs), 2), rest[1:], strict=True):
                 together = product - rest[0] - centre * (BA[i] + AB[j] - A - B)
                 second[i, j] = second[j, i] = together - first[i] - first[j]
         return ExchangedVariances(square - ((A + B) / 2) ** 2, first, total, second)
-
-    def _couples(self) -> list[tuple[int, int]]:
-        return [(i, j) for i in range(self.pairs) for j in range(i + 1, self.pairs)]
 
 
 @dataclass(frozen=True)
@@ -278,7 +289,9 @@ class Shapley:
         assert basis.joint is not None
         start = int(basis.joint.members[0])
         most = int((basis.indices[:, :start] > 0).sum(axis=1).max(initial=0)) if start else 0
-        joint = Basis(basis.coordinates, basis.alpha, basis.beta, _alone(basis), basis.joint)
+        alone = np.zeros((len(basis.joint.indices), basis.indices.shape[1]), dtype=np.int64)
+        alone[:, basis.joint.members] = basis.joint.indices
+        joint = replace(basis, indices=alone)
         points = np.ones((len(draws.values), start + len(draws.names)))
         points[:, start:] = draws.values
         phi, x = joint.values(points), draws.standardised(draws.values)
@@ -324,14 +337,6 @@ class Shapley:
         """Return standard errors (…, d) of the effects because draws are few: the jackknife over parts of them."""
         left = np.array([self.effects(coefficients, indices, form) for form in range(1, len(self.forms))])
         return jackknife_error(left)
-
-
-def _alone(basis: Basis) -> NDArray[np.int64]:
-    """Multi-indices (Q, d) of the functions of draws alone."""
-    assert basis.joint is not None
-    indices = np.zeros((len(basis.joint.indices), basis.indices.shape[1]), dtype=np.int64)
-    indices[:, basis.joint.members] = basis.joint.indices
-    return indices
 
 
 def _forms(

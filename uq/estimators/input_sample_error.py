@@ -18,6 +18,7 @@ import numpy as np
 
 from forward.findings import Finding, entries
 from forward.model import FloatArray
+from uq.estimators.indices import shares
 from uq.estimators.quantiles import Quantiles, quantiles
 from uq.estimators.tails import kurtosis
 from uq.findings import add
@@ -97,12 +98,7 @@ def findings_of_source(inputs: Inputs) -> Iterator[Finding]:
 def findings_of_few(draws: Draws, *whose: str) -> Iterator[Finding]:
     """Say that draws, of these specimens if any, are worth few."""
     if draws.effective < FEW:
-        values = {
-            "n": len(draws.values),
-            "names": ", ".join(draws.names),
-            "worth": draws.effective,
-            "fewest": FEW,
-        }
+        values = {"n": len(draws.values), "names": ", ".join(draws.names), "worth": draws.effective, "fewest": FEW}
         yield Finding("draws-few-of" if whose else "draws-few", "warning", values, about=entries(whose))
 
 
@@ -114,8 +110,7 @@ def _share(inputs: Inputs, points: FloatArray, values: FloatArray) -> FloatArray
     t = inputs.coordinates.of(points)[:, :own]
     columns = np.column_stack([np.ones(len(t)), t])
     left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
-    variance = values.var(axis=0)
-    return np.where(variance > 0, left.var(axis=0) / np.where(variance > 0, variance, 1.0), 0.0)
+    return shares(left.var(axis=0), values.var(axis=0))
 
 
 def _values(

@@ -170,17 +170,9 @@ def controlled(
     return first, np.where(_helps(_scatter(left - moved), _scatter(second - moved), n), left, second)
 
 
-def combine(
-    offset: FloatArray,
-    terms: Sequence[Term],
-    coefficient: float | FloatArray = 1.0,
-    second_coefficient: float | FloatArray = 1.0,
-) -> Estimates:
-    """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each with its own samples.
-
-    The coefficients β₁ and β₂ of the terms are for the record.
-    """
-    return _estimated(offset, _sums(terms), coefficient, second_coefficient)
+def combine(offset: FloatArray, terms: Sequence[Term]) -> Estimates:
+    """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each with its own samples."""
+    return _estimated(offset, _sums(terms), 1.0, 1.0)
 
 
 def _sums(terms: Sequence[Term]) -> Sums:
@@ -288,11 +280,10 @@ def estimate(
         _helps(_scatter_of_variance(reduced(beta1, beta2)), _scatter_of_variance(reduced(beta1, zero)), n), beta2, 0.0
     )
     one = reduced(beta1, beta2)
-    _, mean_variance, _, scatter = _sums([one])
-    found = combine(offset, [one], beta1, beta2)
-
+    found = _sums([one])
+    _, mean_variance, _, scatter = found
     return Moments(
-        **vars(found),
+        **vars(_estimated(offset, found, beta1, beta2)),
         variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
         std_variance_ratio=ratio(
             _scatter_of_variance(plain), n * _error_of_variance(scatter, mean_variance) ** 2, empty=1.0

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
-from uq.estimators.fidelities import ROUNDS, Samples, folds, share_answered
+from uq.estimators.fidelities import ROUNDS, Samples, folds, pooled_means, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
-from uq.estimators.subsampled_difference import Chosen, Pooled
+from uq.estimators.subsampled_difference import Chosen
 from uq.findings import add
 
 if TYPE_CHECKING:
@@ -266,15 +266,14 @@ def quantiles_of_groups(
     return _of_thresholds(known, offset, probabilities)
 
 
-def quantiles_of_chosen(
-    pooled: Pooled, found: Chosen, offset: FloatArray, probabilities: tuple[float, ...]
-) -> Quantiles:
+def quantiles_of_chosen(found: Chosen, offset: FloatArray, probabilities: tuple[float, ...]) -> Quantiles:
     """Return quantiles of the outputs of model 0, of pools of which some points were chosen.
 
     How they are chosen: `uq.estimators.subsampled_difference`.
 
     The share below a threshold is that of the predictions, and what the chosen points say they miss.
     """
+    pooled = found.pooled
     ok = np.isfinite(pooled.values).all(axis=1)
 
     def known(j: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -352,12 +351,7 @@ def _parts(
 ) -> list[FloatArray]:
     """Return the summands (n, t) of the shares by group, from indicators (n, K, t) and the weights of each fold."""
     parts = [np.zeros((len(one), one.shape[2])) for one in indicators]
-    middle = np.array(
-        [
-            np.concatenate([i[:, k] for i, group in zip(indicators, groups, strict=True) if k in group]).mean(axis=0)
-            for k in range(indicators[0].shape[1])
-        ]
-    )
+    middle = pooled_means(groups, indicators)
     for kept, share, a in cut:
         for g, (found, values) in enumerate(zip(parts, indicators, strict=True)):
             of_fold = g == 0 and inner

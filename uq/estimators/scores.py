@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
+from uq.estimators.indices import jackknife_error
 from uq.estimators.moments import ratio
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def rate(solves: FloatArray, errors: FloatArray) -> tuple[float, float]:
         return np.nan, np.nan
     centred = np.log(solves) - np.log(solves).mean()
     slopes = centred @ np.log(mean_squares) / 2 / (centred @ centred)
-    return float(slopes[0]), float(np.sqrt((R - 1) / R * ((slopes[1:] - slopes[1:].mean()) ** 2).sum()))
+    return float(slopes[0]), float(jackknife_error(slopes[1:]))
 
 
 def plain_samples(dataset: xr.Dataset, estimated: str) -> xr.DataArray:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.fidelities import FOLDS, FREE, ROUNDS, uncertainty
-from uq.estimators.moments import Estimates, Term, Z, combine, student, term
+from uq.estimators.moments import Estimates, Z, combine, student, term
 
 FLOOR = 0.5  # a over the root mean square of d
 PER_FEATURE = 10  # points of the pools for each polynomial that is taken off
@@ -135,28 +135,24 @@ class Chosen:
     ----------
     estimates
         Of mean and standard deviation, by output; errors with Student's factor.
-    terms
-        The part of each pool in both moments.
     relative
         Relative variances (2, m) of the squared errors of mean and variance, as estimates of these.
     predicted
         c (N, m) at all points, as deviations.
     rest, cheap
         Summands of mean and variance: (ψ_0 − c)/λ of the chosen (2, c, m), and those of c (2, N, m).
-    rows, expected
-        Places of the chosen (c,) among all points, and their λ.
+    pooled
+        What it is estimated from.
     left
         Variance (m,) of what a plain sample leaves of model 0 beside its tangent.
     """
 
     estimates: Estimates
-    terms: tuple[Term, ...]
     relative: FloatArray
     predicted: FloatArray
     rest: FloatArray
     cheap: FloatArray
-    rows: NDArray[np.intp]
-    expected: FloatArray
+    pooled: Pooled
     left: FloatArray
 
 
@@ -243,8 +239,7 @@ class Pooled:
         sums = cheap.copy()
         sums[:, self.rows] += rest
         parts = [sums[:, a:b] * (b - a) for a, b in pairwise(self.starts)]
-        terms = tuple(term(a, b) for a, b in parts)
-        found = combine(offset + middle, terms)
+        found = combine(offset + middle, [term(a, b) for a, b in parts])
         moved = [b - 2 * mean * a for a, b in parts]
         relative = np.array([uncertainty(one)[1] for one in ([a for a, _ in parts], moved)])
         factors = [
@@ -259,13 +254,11 @@ class Pooled:
             left[j] = (c - slope * T).var() + (rest[0, :, j] ** 2 / w).sum()
         return Chosen(
             found,
-            terms,
             relative,
             predicted + middle,
             np.array([rest[0], rest[1] - 2 * mean * rest[0]]),
             np.array([cheap[0], cheap[1] - 2 * mean * cheap[0]]),
-            self.rows,
-            self.expected,
+            self,
             left,
         )
 

@@ -154,7 +154,7 @@ def counted(
         controlled = deviations, deviations**2
     first, moved = controlled[0], influences(*controlled)
     further = np.maximum(of_influences(found, inputs, moved), unseen(inputs, values) * found.std)
-    of_mean = 0.0 if _end(inputs) else np.minimum(missed(first), first.std(axis=0))
+    of_mean = np.minimum(missed(first), first.std(axis=0)) if inputs.unbounded.any() else 0.0
     return replace(
         found,
         mean_error=np.hypot(found.mean_error * skewed(first), of_mean),
@@ -198,7 +198,7 @@ def of_influences(found: Estimates, inputs: Inputs, moved: FloatArray) -> FloatA
 
     Zero if no parameter has a tail: samples then reach the ends.
     """
-    if _end(inputs):
+    if not inputs.unbounded.any():
         return np.zeros_like(found.std)
     return ratio(np.minimum(missed(moved), found.std**2), 2 * found.std)
 
@@ -273,13 +273,9 @@ def unseen(inputs: Inputs, values: FloatArray) -> FloatArray:
     Zero if no parameter has a tail: samples then reach the ends.
     """
     n, m = values.shape
-    if _end(inputs):
+    if not inputs.unbounded.any():
         return np.zeros(m)
     return np.array([_share_beyond(s, n) / 2 if s > FROM else 0.0 for s in map(spread, values.T)])
-
-
-def _end(inputs: Inputs) -> bool:
-    return all(marginal.support is not None for marginal in inputs.marginals.values())
 
 
 def spread(values: FloatArray) -> float:

@@ -8,15 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from forward.model import (
-    WORK,
-    FloatArray,
-    ForwardModel,
-    Guess,
-    Solution,
-    SolveError,
-    gathered,
-)
+from forward.model import WORK, FloatArray, ForwardModel, Guess, Solution, SolveError, gathered
 from uq.evaluation.request import Evaluations, Failure, FieldSum, Request, audited, calibration
 
 TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
@@ -26,9 +18,7 @@ class BlockSolver:
     """Solves the blocks of one request on one group's model; collective over the group."""
 
     def __init__(self, model: ForwardModel, request: Request) -> None:
-        self._model = model
-        self._tangents, self._mesh_errors = request.tangents, request.mesh_errors
-        self._saturations = request.saturations
+        self._model, self._request = model, request
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = request.fields is not None and request.fields.compact
         self._joint = request.joint.on(model) if request.joint is not None else None
@@ -45,21 +35,13 @@ class BlockSolver:
         guess = self._guess(point)
         return replace(plain, state=guess.state, reference=guess.reference)
 
-    def _keep(self, rows: list[FloatArray], row: FloatArray) -> None:
-        """Add a row (k, U_local) to the sum, or to the rows of a compact one."""
-        if self._compact or not rows:
-            rows.append(row.copy())
-        else:
-            # In place: these are the largest arrays, and a new one for each sample takes longer.
-            rows[0] += row
-
     def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
         """Solve at points (n, d); the fields are complete on the group's first rank only."""
         model, n = self._model, len(points)
         m, d = len(model.outputs), len(model.parameters)
         outputs = np.full((n, m), np.nan)
-        tangents = np.full((n, m, d), np.nan) if self._tangents else None
-        of_meshes = _MeshErrors(n, m, saturations=self._saturations) if self._mesh_errors else None
+        tangents = np.full((n, m, d), np.nan) if self._request.tangents else None
+        of_meshes = _MeshErrors(n, m, self._request.saturations) if self._request.mesh_errors else None
         seconds, solving, finished = np.empty(n), np.zeros(n), _together(progress, model.together, n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
@@ -98,15 +80,15 @@ class BlockSolver:
             if self._joint is not None and (i + 1) % self._together == 0:
                 row = self._joint(np.array(states)) if len(states) == self._together else None
                 states = []
-            if row is not None:
-                self._keep(rows, row)
+            if row is not None and (self._compact or not rows):
+                rows.append(row.copy())
+            elif row is not None:
+                rows[0] += row  # in place: these are the largest arrays, and a new one for each sample takes longer
             seconds[i] = time.process_time() - begin - solving[i]
             finished(i + 1, len(failures))
         for some in (slice(i, i + model.together) for i in range(0, n, model.together)):
             seconds[some] += solving[some].mean()
-        fields = gathered(model, np.concatenate(rows)) if rows else np.zeros((0, 0))
-        if fields is None:
-            fields = np.zeros((0, 0))
+        fields = gathered(model, np.concatenate(rows)) if rows else None
         return Evaluations(
             points,
             outputs,
@@ -117,7 +99,7 @@ class BlockSolver:
             residuals,
             converged,
             stability,
-            fields,
+            np.zeros((0, 0)) if fields is None else fields,
             mesh_errors=None if of_meshes is None else of_meshes.errors,
             saturations=None if of_meshes is None else of_meshes.saturations,
         )
@@ -126,10 +108,10 @@ class BlockSolver:
 class _MeshErrors:
     """Errors of the mesh (n, m) of solutions, and what calibrates them (n,) where it is asked for."""
 
-    def __init__(self, n: int, m: int, *, saturations: float | None) -> None:
+    def __init__(self, n: int, m: int, spare: float | None) -> None:
         self.errors = np.full((n, m), np.nan)
-        self.saturations = np.full(n, np.nan, calibration(m)) if saturations is not None else None
-        self._spare = saturations
+        self.saturations = np.full(n, np.nan, calibration(m)) if spare is not None else None
+        self._spare = spare
 
     def take(self, i: int, solution: Solution) -> None:
         """Take those of one; collective. Errors that cannot be calibrated remain estimates.

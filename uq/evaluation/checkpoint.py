@@ -23,7 +23,7 @@ import numpy as np
 from forward.errors import Error
 from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
-from uq.evaluation.hdf5 import creation, image, in_memory
+from uq.evaluation.hdf5 import image, in_memory
 from uq.evaluation.request import ON_REQUEST, ROWS, Evaluations, Failure
 
 T = TypeVar("T")
@@ -62,7 +62,7 @@ class Plain:
 
     def image(self, note: str) -> bytes:
         """Return the bytes of its file."""
-        with in_memory(creation(HEAD)) as file:
+        with in_memory(HEAD) as file:
             file.attrs["note"] = note
             file["found"] = np.frombuffer(self.data, dtype=np.uint8)
             return image(file)
@@ -193,7 +193,7 @@ def _feed(digest: Any, value: object) -> None:
 
 def _image(blocks: Mapping[str, Evaluations], note: str = "") -> bytes:
     """Return the bytes of a file of evaluations, each in the group of its name, without the head."""
-    with in_memory(creation(HEAD)) as file:
+    with in_memory(HEAD) as file:
         for name, block in blocks.items():
             group = file.require_group(name)
             write(group, block)

@@ -20,8 +20,16 @@ OF_FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_Netcdf4Dimid
 ENCODED = {"scale_factor", "add_offset", "missing_value", "calendar"}  # attributes of numbers that are not as written
 
 
-def in_memory(creation: Any = None) -> h5py.File:
-    """Return a new HDF5 file in memory; `creation` is its property list."""
+def in_memory(head: int, *, ordered: bool = False) -> h5py.File:
+    """Return a new HDF5 file in memory with `head` bytes before those of HDF5, and without time stamps.
+
+    `ordered` files keep the order of creation, which netCDF-4 needs.
+    """
+    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    if head:
+        creation.set_userblock(head)
+    if ordered:
+        creation = _ordered(creation)
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
     access.set_fapl_core(2**20, backing_store=False)
@@ -32,17 +40,6 @@ def image(file: h5py.File) -> bytes:
     """Return the bytes of a file in memory, without those left free by `head`."""
     file.flush()
     return bytes(file.id.get_file_image())
-
-
-def creation(head: int = 0, *, ordered: bool = False) -> Any:
-    """Return the property list of a file with `head` bytes before those of HDF5, and without time stamps.
-
-    `ordered` files keep the order of creation, which netCDF-4 needs.
-    """
-    properties = h5py.h5p.create(h5py.h5p.FILE_CREATE)
-    if head:
-        properties.set_userblock(head)
-    return _ordered(properties) if ordered else properties
 
 
 def netcdf(
@@ -62,7 +59,7 @@ def netcdf(
     more
         Writes data that are not netCDF into groups of the file.
     """
-    with in_memory(creation(head, ordered=True)) as file:
+    with in_memory(head, ordered=True) as file:
         _write(file, dataset)
         for name, part in (groups or {}).items():
             made = h5py.h5g.create(file.id, name.encode(), gcpl=_ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE)))

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass, replace
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -33,14 +34,6 @@ T = TypeVar("T")
 SECONDS_BETWEEN_STRETCHES = 10.0  # of answers that are written together
 OWN = {"forward", "inverse", "uq"}
 OF_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
-
-
-@dataclass(frozen=True)
-class _Block:
-    """What determines a block."""
-
-    label: str
-    asked: object
 
 
 @dataclass(frozen=True)
@@ -72,15 +65,11 @@ class Kept:
 
         Collective over the group, as `compute` is.
         """
-        key = self.checkpoint.key(_Block(self.label, asked))
-        self.keys.append(key)
-        first = self.group.rank == 0
-        block: Evaluations | None = self.group.bcast(self.checkpoint.find(key, read) if first else None)
+        block = self._find(asked, read)
         if block is not None:
             return block, False
         block = compute()
-        if first:
-            self.checkpoint.save(key, block)
+        self._save(asked, block)
         return block, True
 
     def value(self, name: str, compute: Callable[[], T]) -> tuple[T, bool]:
@@ -88,29 +77,25 @@ class Kept:
 
         New or not, it is what can be read from disk, to the layout of its arrays, which sums may depend on.
         """
-        data = self._step(name)
+        data = self._find(_step(name), Plain.read)
         new = data is None
         if data is None:
             data = pickle.dumps(compute())
-            self._save(name, data)
+            self._save(_step(name), Plain(data))
         return _Reader(BytesIO(data)).load(), new
 
     def rows(self, name: str) -> Rows:
         """Return the answers that were kept under a name; collective."""
         return Rows(self, name)
 
-    def _step(self, name: str) -> bytes | None:
-        self.keys.append(self._key(name))
-        found = self.checkpoint.find(self.keys[-1], Plain.read) if self.group.rank == 0 else None
-        data: bytes | None = self.group.bcast(found)
-        return data
+    def _find(self, asked: object, read: Callable[[Path], T]) -> T | None:
+        self.keys.append(self.checkpoint.key((self.label, asked)))
+        found: T | None = self.group.bcast(self.checkpoint.find(self.keys[-1], read) if self.group.rank == 0 else None)
+        return found
 
-    def _save(self, name: str, data: bytes) -> None:
+    def _save(self, asked: object, block: Evaluations | Plain) -> None:
         if self.group.rank == 0:
-            self.checkpoint.save(self._key(name), Plain(data))
-
-    def _key(self, name: str) -> str:
-        return self.checkpoint.key(_Block(self.label, ("step", name)))
+            self.checkpoint.save(self.checkpoint.key((self.label, asked)), block)
 
     def forget(self) -> None:
         """Remove the blocks, once their results are stored."""
@@ -119,13 +104,18 @@ class Kept:
         self.keys.clear()
 
 
+def _step(name: str) -> tuple[str, str]:
+    """What determines a step."""
+    return "step", name
+
+
 class Rows:
     """Answers of a few numbers to questions that are asked in the same order by every run, kept in stretches."""
 
     def __init__(self, kept: Kept, name: str) -> None:
         self._kept, self._name, self._stretches = kept, name, 0
         self._known: list[tuple[bytes, Any]] = []
-        while (data := kept._step(self._stretch)) is not None:
+        while (data := kept._find(self._stretch, Plain.read)) is not None:
             self._known += _Reader(BytesIO(data)).load()
             self._stretches += 1
         self._known.reverse()
@@ -133,8 +123,8 @@ class Rows:
         self._saved = time.monotonic()
 
     @property
-    def _stretch(self) -> str:
-        return f"{self._name}, stretch {self._stretches}"
+    def _stretch(self) -> tuple[str, str]:
+        return _step(f"{self._name}, stretch {self._stretches}")
 
     def __call__(self, asked: FloatArray, answer: Callable[[], T]) -> T:
         """Return the answer, plain data, to numbers that determine it."""
@@ -147,7 +137,7 @@ class Rows:
         made = answer()
         self._new.append((question, made))
         if time.monotonic() - self._saved > SECONDS_BETWEEN_STRETCHES:
-            self._kept._save(self._stretch, pickle.dumps(self._new))
+            self._kept._save(self._stretch, Plain(pickle.dumps(self._new)))
             self._stretches += 1
             self._new, self._saved = [], time.monotonic()
         return made

@@ -15,15 +15,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import (
-    WORK,
-    FloatArray,
-    ForwardModel,
-    Guess,
-    ReferenceSolution,
-    Solution,
-    scattered,
-)
+from forward.model import WORK, FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, scattered
 from uq.inputs.coordinates import Coordinates
 
 OWN = ""  # name of the first model of an evaluation
@@ -31,18 +23,9 @@ COMPANY, FEW = 16, 16  # points in a block that begin from predictions, and bloc
 AUDITED, ENOUGH = 0.005, 64  # share of samples whose path is followed; from how many samples on at least one is
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
-
 ON_REQUEST = ("tangents", "mesh_errors", "saturations")
-ROWS = (
-    "points",
-    "outputs",
-    "seconds",
-    "work",
-    "residuals",
-    "converged",
-    "stability",
-    *ON_REQUEST,
-)  # one for each point
+# Arrays with a row for each point.
+ROWS = ("points", "outputs", "seconds", "work", "residuals", "converged", "stability", *ON_REQUEST)
 
 
 def calibration(outputs: int) -> np.dtype[Any]:

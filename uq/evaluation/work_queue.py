@@ -40,8 +40,9 @@ class WorkQueue:
 
     def __init__(self, world: Any, group: Any, index: int, progress: Progress, counters: Sequence[Counter]) -> None:
         self._world, self._group, self._index = world, group, index
-        self._turn, *tallied = counters
-        self._tally = _Tally(tallied, progress if world.rank == 0 else None)
+        self._progress = progress
+        self._turn, *self._counters = counters
+        self._told = [0, 0]  # solves of all groups, and those that failed, of which the progress knows
         self._drain: Callable[[], None] = lambda: None  # on rank 0: receive what has arrived
 
     @classmethod
@@ -53,9 +54,13 @@ class WorkQueue:
 
     def count(self, done: int, failed: int) -> None:
         """Count solves on the first rank of a group; rank 0 is told at its own next count."""
-        if self._group.rank == 0:
-            self._tally(done, failed)
-            self._drain()
+        if self._group.rank > 0:
+            return
+        now = [counter.add(count) + count for counter, count in zip(self._counters, (done, failed), strict=True)]
+        if self._world.rank == 0:
+            new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
+            self._progress(*new)
+        self._drain()
 
     def drain(self) -> None:
         """Rank 0: receive the results that have arrived."""
@@ -118,7 +123,7 @@ class WorkQueue:
         """Take pieces until none is left."""
         group = self._group
         while True:
-            turn = self._turn.take() if group.rank == 0 else 0
+            turn = self._turn.add(1) if group.rank == 0 else 0
             if group.size > 1:
                 turn = group.bcast(turn)
             if turn >= len(pending):
@@ -144,10 +149,6 @@ class Counter:
         self._window.Put(zero, 0)
         self._window.Unlock(0)
 
-    def take(self) -> int:
-        """Return the number and increase it by one."""
-        return self.add(1)
-
     def add(self, count: int) -> int:
         """Increase the number by a count, and return the previous one."""
         value = np.empty(1, dtype=np.int64)
@@ -161,22 +162,6 @@ class Counter:
 
     def __exit__(self, *_: object) -> None:
         self._window.Free()
-
-
-class _Tally:
-    """Solves of all groups, in rank 0's memory; rank 0 tells its progress what the others have added."""
-
-    def __init__(self, counters: Sequence[Counter], progress: Progress | None) -> None:
-        self._counters = counters
-        self._progress = progress
-        self._told = [0, 0]
-
-    def __call__(self, done: int, failed: int) -> None:
-        """Count solves of this group."""
-        now = [counter.add(count) + count for counter, count in zip(self._counters, (done, failed), strict=True)]
-        if self._progress is not None:
-            new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
-            self._progress(*new)
 
 
 @contextmanager

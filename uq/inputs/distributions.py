@@ -6,14 +6,11 @@ from functools import cached_property
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from annotated_types import Gt
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from forward.model import FloatArray
 from uq.inputs.quadrature import Cut, panels
 from uq.inputs.univariate import Bounded, Chaospy, Univariate
-
-PositiveFloat = Annotated[float, Gt(0)]
 
 
 class Uniform(Bounded):
@@ -188,8 +185,8 @@ class TruncatedNormal(Bounded):
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
         """As for every distribution."""
-        cut = self._cut
-        return cut.origin, cut.unit * cut.nodes, cut.weights
+        nodes, weights, _ = self._cut.rule
+        return self._cut.origin, self._cut.unit * nodes, weights
 
     @property
     def _frame(self) -> tuple[float, float]:

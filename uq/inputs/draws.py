@@ -114,12 +114,22 @@ class Draws:
         return np.asarray(self.standardised(self.values) @ np.linalg.inv(self.mixing))
 
     @cached_property
-    def _tree(self) -> _Tree:
-        return _Tree.of(self.coordinates, self.weights)
+    def _tree(self) -> tuple[list[tuple[IntArray, FloatArray, IntArray]], IntArray]:
+        return _halved(self.coordinates, self.weights)
 
     def points(self, uniforms: FloatArray) -> FloatArray:
-        """Map points (n, k) of the unit cube to draws (n, k)."""
-        return np.asarray(self.values[self._tree.leaf(uniforms)])
+        """Map points (n, k) of the unit cube to draws (n, k): those in whose boxes they lie."""
+        u, rows = np.array(uniforms, dtype=float), np.arange(len(uniforms))
+        levels, draw = self._tree
+        part = np.zeros(len(u), dtype=np.int64)
+        for axes, cuts, children in levels:
+            axis, share = axes[part], cuts[part]
+            at = u[rows, axis]
+            first = (at < share) | (share == 1.0)  # rounding may bring a coordinate to 1
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of the half that is not taken
+                u[rows, axis] = np.where(first, at / share, (at - share) / (1 - share))
+            part = children[part] + ~first
+        return np.asarray(self.values[draw[part]])
 
     def in_turn(self, seed: int | tuple[int, ...], start: int, stop: int) -> FloatArray:
         """Return the draws number `start` to `stop` of an endless sequence in which all come once, again and again.
@@ -207,68 +217,42 @@ class Empirical:
         return {"kind": "draws", "digest": self.digest, "mean": self.moments[0], "std": self.moments[1]}
 
 
-@dataclass(frozen=True, eq=False)
-class _Level:
-    """The parts of one level of a tree: across which coordinate each is halved, where, and number of the first half."""
+def _halved(t: FloatArray, weights: FloatArray) -> tuple[list[tuple[IntArray, FloatArray, IntArray]], IntArray]:
+    """Halve draws t (N, k), with weights (N,), across the widest coordinate of each part until all are apart.
 
-    axis: IntArray
-    share: FloatArray
-    child: IntArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Tree:
-    """Halves of halves of draws, down to draws: `draw` are those of the parts of the last level."""
-
-    levels: list[_Level]
-    draw: IntArray
-
-    @classmethod
-    def of(cls, t: FloatArray, weights: FloatArray) -> _Tree:
-        """Halve draws t (N, k), with weights (N,), across the widest coordinate of each part until all are apart."""
-        order = np.flatnonzero(weights > 0)
-        # Equal draws are one with their weights together, the first.
-        _, first, inverse = np.unique(t[order], axis=0, return_index=True, return_inverse=True)
-        weight = np.bincount(inverse.ravel(), weights=weights[order])
-        order = order[first]
-        starts = np.array([0])
-        levels: list[_Level] = []
-        while len(starts) < len(order):
-            sizes = np.diff(np.append(starts, len(order)))
-            part = np.repeat(np.arange(len(starts)), sizes)
-            total = np.add.reduceat(weight, starts)
-            mean = np.add.reduceat(weight[:, None] * t[order], starts) / total[:, None]
-            spread = np.add.reduceat(weight[:, None] * (t[order] - mean[part]) ** 2, starts)
-            axis = spread.argmax(axis=1)
-            sort = np.lexsort((t[order, axis[part]], part))
-            order, weight = order[sort], weight[sort]
-            below = np.cumsum(weight)
-            below = (below - (below[starts] - weight[starts])[part]) / total[part]
-            last = starts + sizes - 1
-            distance = np.abs(below - 0.5)
-            distance[last] = np.where(sizes > 1, np.inf, 0.0)
-            least = np.minimum.reduceat(distance, starts)
-            candidates = np.flatnonzero(distance <= least[part])
-            cut = candidates[np.searchsorted(candidates, starts)]
-            alone = sizes == 1
-            share = np.where(alone, 1.0, below[cut])
-            children = np.where(alone, 1, 2)
-            levels.append(_Level(axis, share, np.cumsum(children) - children))
-            starts = np.sort(np.concatenate([starts, cut[~alone] + 1]))
-        return cls(levels, order)
-
-    def leaf(self, uniforms: FloatArray) -> IntArray:
-        """Return the draw (n,) in whose box each point (n, k) of the cube lies."""
-        u, rows = np.array(uniforms, dtype=float), np.arange(len(uniforms))
-        part = np.zeros(len(u), dtype=np.int64)
-        for level in self.levels:
-            axis, share = level.axis[part], level.share[part]
-            at = u[rows, axis]
-            first = (at < share) | (share == 1.0)  # rounding may bring a coordinate to 1
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of the half that is not taken
-                u[rows, axis] = np.where(first, at / share, (at - share) / (1 - share))
-            part = level.child[part] + ~first
-        return np.asarray(self.draw[part])
+    Returns, for each level, across which coordinate its parts are halved, where, and the numbers of their first halves;
+    and the draw of each part of the last level.
+    """
+    order = np.flatnonzero(weights > 0)
+    # Equal draws are one with their weights together, the first.
+    _, first, inverse = np.unique(t[order], axis=0, return_index=True, return_inverse=True)
+    weight = np.bincount(inverse.ravel(), weights=weights[order])
+    order = order[first]
+    starts = np.array([0])
+    levels = []
+    while len(starts) < len(order):
+        sizes = np.diff(np.append(starts, len(order)))
+        part = np.repeat(np.arange(len(starts)), sizes)
+        total = np.add.reduceat(weight, starts)
+        mean = np.add.reduceat(weight[:, None] * t[order], starts) / total[:, None]
+        spread = np.add.reduceat(weight[:, None] * (t[order] - mean[part]) ** 2, starts)
+        axis = spread.argmax(axis=1)
+        sort = np.lexsort((t[order, axis[part]], part))
+        order, weight = order[sort], weight[sort]
+        below = np.cumsum(weight)
+        below = (below - (below[starts] - weight[starts])[part]) / total[part]
+        last = starts + sizes - 1
+        distance = np.abs(below - 0.5)
+        distance[last] = np.where(sizes > 1, np.inf, 0.0)
+        least = np.minimum.reduceat(distance, starts)
+        candidates = np.flatnonzero(distance <= least[part])
+        cut = candidates[np.searchsorted(candidates, starts)]
+        alone = sizes == 1
+        share = np.where(alone, 1.0, below[cut])
+        children = np.where(alone, 1, 2)
+        levels.append((axis, share, np.cumsum(children) - children))
+        starts = np.sort(np.concatenate([starts, cut[~alone] + 1]))
+    return levels, order
 
 
 def effective(values: FloatArray, chains: FloatArray | None = None) -> float:

@@ -55,7 +55,8 @@ class Cut:
     upper: float
 
     @cached_property
-    def _rule(self) -> tuple[FloatArray, FloatArray, float]:
+    def rule(self) -> tuple[FloatArray, FloatArray, float]:
+        """Points u of a rule that integrates smooth functions, its weights (of sum 1), and ln of what they had."""
         # exp(−NOTHING) is reached at u with u (t + u/2) = NOTHING.
         reach = 2 * NOTHING / (self.t + np.sqrt(self.t**2 + 2 * NOTHING))
         lower, upper = max(self.lower, -reach), min(self.upper, reach)
@@ -63,21 +64,11 @@ class Cut:
         weights = weights * np.exp(-nodes * (self.t + nodes / 2))
         return nodes, weights / weights.sum(), float(np.log(weights.sum()))
 
-    @property
-    def nodes(self) -> FloatArray:
-        """Points of a rule that integrates smooth functions."""
-        return self._rule[0]
-
-    @property
-    def weights(self) -> FloatArray:
-        """Its weights, of sum 1."""
-        return self._rule[1]
-
     def log_density(self, u: FloatArray) -> FloatArray:
         """Ln of the density of u."""
         slack = 1e-12 * (self.upper - self.lower)
         inside = (u >= self.lower - slack) & (u <= self.upper + slack)
-        return np.where(inside, -u * (self.t + u / 2) - self._rule[2], -np.inf)
+        return np.where(inside, -u * (self.t + u / 2) - self.rule[2], -np.inf)
 
     def cumulative(self, u: FloatArray) -> FloatArray:
         """Distribution function of u."""

@@ -100,6 +100,16 @@ class Inputs:
         """Whether no two parameters are correlated, or given by the same draws."""
         return not any(rho for *_, rho in self.correlations) and len(self.joint) < 2
 
+    @cached_property
+    def unbounded(self) -> NDArray[np.bool_]:
+        """Which parameters (d,) have distributions with tails."""
+        return np.array([marginal.support is None for marginal in self.marginals.values()], dtype=bool)
+
+    @property
+    def tails(self) -> NDArray[np.bool_]:
+        """Which parameters (d,) have values beyond those of samples: unbounded, or given by draws, which are many."""
+        return self.unbounded | np.isin(np.arange(len(self.marginals)), self.joint)
+
     @property
     def joint(self) -> range:
         """Places of the parameters that are given by draws."""

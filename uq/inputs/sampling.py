@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +73,9 @@ def _table() -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
 
     To import scipy.stats takes longer than many a study, and to unpack the table longer than most solves of a point.
     """
-    scipy = find_spec("scipy")
-    assert scipy is not None
-    assert scipy.origin is not None
-    with np.load(Path(scipy.origin).parent / "stats" / "_sobol_direction_numbers.npz") as table:
+    import scipy
+
+    with np.load(Path(scipy.__file__).parent / "stats" / "_sobol_direction_numbers.npz") as table:
         return table["poly"].astype(np.uint64), table["vinit"].astype(np.uint64)
 
 

@@ -14,7 +14,7 @@ of error after n samples in R scrambles, for a standard deviation (Sobol' points
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import comb
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -28,10 +28,10 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import power_of_two, sobol_points
-from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded, Probability
-from uq.methods.method import UNASKED, Method
+from uq.methods.chaos import AGAIN, LARGEST, LEAST_GROWTH, Chaos, Expanded
+from uq.methods.method import UNASKED, Method, Probability
 from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
-from uq.surrogates.field_regression import Deviations, deviations
+from uq.surrogates.field_regression import deviations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,36 +101,43 @@ class Automatic(Method):
             The results of the method that was chosen; its attribute `chosen` says which, and why.
         """
         recorder = Recorder(evaluate)
-        pilot = self._pilot(inputs, recorder, goal)
-        solves, reasons = recorder.solves, [pilot.reason]
-        if pilot.control is None and pilot.found is not None:
-            chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, pilot.found)
+        control, why, found = self._pilot(inputs, recorder, goal)
+        solves, reasons = recorder.solves, [why]
+        if control is None and found is not None:
+            chosen, dataset = "chaos", self._chaos(inputs, goal).reported(recorder, found)
         else:
-            chosen, left = "quasi-monte-carlo", replace(goal, most=max(goal.most - solves, 2))
+            control, left = control or "none", replace(goal, most=max(goal.most - solves, 2))
+            chosen, reasons = "quasi-monte-carlo", [f"Quasi-Monte Carlo {IN_WORDS[control]}: {why}."]
             method = QuasiMonteCarlo(
                 samples=SCRAMBLES * power_of_two(LIMITLESS // SCRAMBLES),  # the goal says how many
                 scrambles=SCRAMBLES,
-                control=pilot.control or "none",
+                control=control,
                 seed=self.seed,
                 quantiles=self.quantiles,
                 fields=self.fields,
             )
-            dataset = method.until(inputs, recorder, left, pilot.expanded)
+            expanded = None
+            if control == "chaos" and found is not None:
+                expanded = deviations(found.regression, found.evaluations, found.centre)
+            dataset = method.until(inputs, recorder, left, expanded)
             if solves:
                 reasons.append(f"In all {recorder.solves:,} solves, {solves:,} of them to find out.")
         dataset.attrs["chosen"] = json.dumps({"method": chosen, "reasons": reasons}, ensure_ascii=False)
         return dataset
 
-    def _pilot(self, inputs: Inputs, evaluate: Recorder, goal: Goal) -> _Pilot:
-        """Expand until the claims are those of the goal, or something else takes less."""
+    def _pilot(self, inputs: Inputs, evaluate: Recorder, goal: Goal) -> tuple[Control | None, str, Expanded | None]:
+        """Expand until the claims are those of the goal, or something else takes less.
+
+        Returns the control of quasi-Monte Carlo, if this is to follow; why, in words; the expansion, if there is one.
+        """
         gradients = evaluate.differentiable
         plain: Control = "tangent" if gradients else "none"
         if inputs.correlations:
-            return _Pilot(plain, "there are no expansions in parameters that are correlated")
+            return plain, "there are no expansions in parameters that are correlated", None
         chaos = self._chaos(inputs, goal)
         trail: list[tuple[int, float]] = []
         found: Expanded | None = None
-        other: _Outlook | None = None
+        control, samples = plain, 0  # of quasi-Monte Carlo, as predicted
 
         def wanted() -> float:
             return trail[-1][0] + ENOUGH * _further(trail) if len(trail) >= AGAIN else np.inf
@@ -141,14 +148,14 @@ class Automatic(Method):
                 trail.append((found.count, reached))
                 if reached <= 1 and len(trail) >= AGAIN:
                     break
-                other = _Outlook.of(found, goal, gradients=gradients)
+                control, samples = _outlook(found, goal, gradients=gradients)
                 weight = WITH_DERIVATIVES if gradients else 1.0
                 spent, further = weight * found.count, weight * _further(trail)
-                if len(trail) >= ROUNDS and spent > PATIENCE * other.samples and further > WORTH * other.samples:
+                if len(trail) >= ROUNDS and spent > PATIENCE * samples and further > WORTH * samples:
                     break
         except SolveError as error:
             if found is None:
-                return _Pilot(plain, error.reason)
+                return plain, error.reason, None
             raise
         assert found is not None
         (first, before), (count, last) = trail[0], trail[-1]
@@ -156,14 +163,14 @@ class Automatic(Method):
             f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
         )
         between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
-        if last <= 1 or other is None or goal.most - count < WORTH * count:
+        if last <= 1 or not samples or goal.most - count < WORTH * count:
             what = "fitted to values and gradients" if gradients else "fitted to values"
-            return _Pilot(None, f"Polynomial chaos {what}: {fell}{between}.", found)
+            return None, f"Polynomial chaos {what}: {fell}{between}.", found
         reason = (
-            f"about {other.samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
+            f"about {samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
             f"{fell}{between}"
         )
-        return _Pilot(other.control, reason, found)
+        return control, reason, found
 
     def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
         return Chaos(
@@ -173,37 +180,6 @@ class Automatic(Method):
             quantiles=self.quantiles,
             fields=self.fields,
         )
-
-
-@dataclass(frozen=True)
-class _Pilot:
-    """What first solves have shown.
-
-    Attributes
-    ----------
-    control
-        That of quasi-Monte Carlo, if this is to follow.
-    why
-        In words.
-    found
-        The expansion, if there is one.
-    """
-
-    control: Control | None
-    why: str
-    found: Expanded | None = None
-
-    @property
-    def reason(self) -> str:
-        """Why this is the way, in a sentence."""
-        return self.why if self.control is None else f"Quasi-Monte Carlo {IN_WORDS[self.control]}: {self.why}."
-
-    @property
-    def expanded(self) -> Deviations | None:
-        """The expansion as a control variate."""
-        if self.control != "chaos" or self.found is None:
-            return None
-        return deviations(self.found.regression, self.found.evaluations, self.found.centre)
 
 
 def order_for(dimension: int) -> int:
@@ -224,33 +200,24 @@ def _further(trail: Sequence[tuple[int, float]]) -> float:
     return float(max(min(enough) - count, (LEAST_GROWTH - 1) * count))
 
 
-@dataclass(frozen=True)
-class _Outlook:
-    """Quasi-Monte Carlo as it is predicted: the control variate that takes least, and the samples."""
-
-    control: Control
-    samples: int
-
-    @classmethod
-    def of(cls, found: Expanded, goal: Goal, *, gradients: bool) -> _Outlook:
-        """Predict it from an expansion and its samples."""
-        regression, centre = found.regression, found.centre
-        inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
-        std = np.asarray(estimates["std"])
-        left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
-        missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
-        if gradients:
-            missed["tangent"] = data.values - (centre.middle + centre.predicted(data.points))
-            left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
-        points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
-        outside = regression.beyond(points).share
-        ways = []
-        for way, of in left.items():
-            missing = regression.rest() if way == "chaos" else None
-            gain = GAIN if missing is None else 0.0  # what an expansion misses in tails is at few of the points
-            tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
-            ways.append(cls(way, _samples(goal, estimates, (of, _left_of_std(data.values, missed[way])), tails, gain)))
-        return min(ways, key=lambda way: way.samples)
+def _outlook(found: Expanded, goal: Goal, *, gradients: bool) -> tuple[Control, int]:
+    """Predict the control variate with which quasi-Monte Carlo takes least, and the samples, from an expansion."""
+    regression, centre = found.regression, found.centre
+    inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
+    std = np.asarray(estimates["std"])
+    left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
+    missed: dict[Control, FloatArray] = {"none": data.values - data.values.mean(axis=0), "chaos": fit.unseen}
+    if gradients:
+        missed["tangent"] = data.values - (centre.middle + centre.predicted(data.points))
+        left["tangent"] = np.minimum(missed["tangent"].std(axis=0), std)
+    outside = regression.beyond(inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))).share
+    ways: dict[Control, int] = {}
+    for way, of in left.items():
+        missing = regression.rest() if way == "chaos" else None
+        gain = GAIN if missing is None else 0.0  # what an expansion misses in tails is at few of the points
+        tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
+        ways[way] = _samples(goal, estimates, (of, _left_of_std(data.values, missed[way])), tails, gain)
+    return min(ways.items(), key=lambda way: way[1])
 
 
 def _left_of_std(values: FloatArray, missed: FloatArray) -> FloatArray:

@@ -17,7 +17,6 @@ from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
-from uq.estimators.estimate import Variables
 from uq.estimators.indices import Analysis
 from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
@@ -26,7 +25,7 @@ from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods.method import Amount
+from uq.methods.method import Amount, Probability, refuse
 from uq.surrogates.basis import (
     DICTIONARY,
     FULL,
@@ -34,7 +33,6 @@ from uq.surrogates.basis import (
     Basis,
     candidates_of,
     gauss,
-    orthonormal,
     rows_of,
     whole,
 )
@@ -57,7 +55,6 @@ if TYPE_CHECKING:
 
     from uq.accuracy.goal import Goal
 
-Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up by default
 GROWTH, LEAST_GROWTH = 1.5, 1.1  # growth of the design between checks of the tolerance
 AGAIN = 2  # rounds: the first samples are explained by what was chosen by them, until others show more
@@ -188,9 +185,7 @@ class Chaos(Amount):
         The samples are those of a scramble of the Sobol' points. After each round `wanted` may say how many there
         should be next, at most half as many more. Errors as in `run`.
         """
-        refusal = self.objection(inputs)
-        if refusal is not None:
-            raise ValueError(refusal)
+        refuse(self.objection(inputs))
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         projection, open_ended = self.fit == "projection", self.open_ended or limit is not None
@@ -205,11 +200,10 @@ class Chaos(Amount):
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
             bases = candidates_of(inputs, self.order, int(min(limit * rows, most)), dictionary)
-        largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
             fields = Projections(
-                largest, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
+                bases.basis, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
             )
         found: list[Evaluations] = []
         count, target = 0, min(limit, first_samples(inputs, gradients=gradients)) if open_ended else limit
@@ -223,7 +217,7 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            regression = Regression.fitted(inputs, bases, largest, data)
+            regression = Regression.fitted(inputs, bases, data)
             if self.max_order is None and not projection and not expand_fields:
                 regression = regression.higher()
             yield Expanded(centre, evaluations, regression)
@@ -334,7 +328,7 @@ def expansion_dataset(
     if evaluations.sketches is not None and fields:
         field = regression_of_field(regression, evaluations.sketches)
         terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
-    indices = regression.largest.indices[terms]
+    indices = regression.candidates.basis.indices[terms]
     coefficients = among(terms, fit.chosen.which, fit.coefficients)
     dataset = dataset.assign(
         {
@@ -356,7 +350,12 @@ def expansion_dataset(
             "range_upper": (("parameter",), upper),
         }
     )
-    dataset = dataset.assign(_of_joint(basis))
+    if basis.joint is not None:  # what else is needed to evaluate functions of draws
+        dataset = dataset.assign(
+            coordinate_mixing=(("parameter", "coordinate"), basis.coordinates.mixing),
+            joint_index=(("function", "joint_parameter"), basis.joint.indices),
+            joint_inverse=(("joint_product", "function"), basis.joint.inverse),
+        )
     if probabilities:
         dataset = _distribution(dataset, seed, probabilities, regression)
     add(dataset, *regression.doubts(evaluate.outputs))
@@ -379,17 +378,6 @@ def expansion_dataset(
             "extrapolates them to where the model has no answer"
         )
     return dataset
-
-
-def _of_joint(basis: Basis) -> Variables:
-    """Return what else is needed to evaluate functions of draws."""
-    if basis.joint is None:
-        return {}
-    return {
-        "coordinate_mixing": (("parameter", "coordinate"), basis.coordinates.mixing),
-        "joint_index": (("function", "joint_parameter"), basis.joint.indices),
-        "joint_inverse": (("joint_product", "function"), basis.joint.inverse),
-    }
 
 
 def _distribution(

@@ -29,7 +29,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.chaos import Chaos
-from uq.methods.method import SAMPLING, Amount, Method
+from uq.methods.method import SAMPLING, Amount, Method, refuse
 from uq.methods.trials import Memory, Trial, trial_of
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
@@ -80,9 +80,6 @@ class Given(Method):
         """Return the known values; errors as for every method."""
         import xarray as xr
 
-        missing = [name for name in evaluate.outputs if name not in self.values]
-        if missing:
-            raise ValueError(f"the reference gives no values of {', '.join(missing)}, expected those of every output")
         values = [self.values[name] for name in evaluate.outputs]
         return xr.Dataset({name: ("output", [dict(known)[name] for known in values]) for name in ESTIMATES})
 
@@ -294,9 +291,7 @@ class Compare(Method):
             The reference (`mean`, `mean_error`, …) by output; all estimates by row (a method at a budget) and repeat;
             true errors and costs by row; see docs/results.md. All but `TIMES` is the same after a restart.
         """
-        objection = self.objection(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refuse(self.objection(inputs))
         memory = Memory(evaluate)
         centre = linearise(inputs, memory)
         floors = self._floors(inputs, evaluate, memory, centre)

@@ -55,8 +55,8 @@ from uq.inputs.distributions import (
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two
 from uq.inputs.univariate import Chaospy
-from uq.methods.method import Amount
-from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
+from uq.methods.method import Amount, Probability, refuse
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, failure_note
 from uq.methods.scrambles import Sets
 from uq.surrogates.basis import FULL, gauss, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
@@ -138,9 +138,7 @@ class DerivativeBased(Amount):
             Measures, bounds, and the active subspace by output with standard errors; total indices from an expansion
             fitted to the same samples; moments; see docs/results.md.
         """
-        objection = self.objection(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refuse(self.objection(inputs))
         if not evaluate.differentiable:
             raise ModelError("the model has no derivatives, expected one that has for method.kind = 'derivative-based'")
         evaluate = Recorder(evaluate)

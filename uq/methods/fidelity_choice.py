@@ -8,7 +8,7 @@ points a pool gets and how many of them are chosen, such that the largest relati
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,6 @@ from uq.estimators.tails import concentration, with_tails
 from uq.inputs.sampling import random_points
 from uq.methods.fidelity_team import PILOT, Block, Fidelities, Taken
 from uq.methods.fidelity_ways import FEWEST, UNLIMITED, Way
-from uq.surrogates.regression import tails_of
 
 TRIED = 60  # numbers of full solves
 UNSEEN = 4.0  # times the variance that a pilot predicts, where it has seen no tail
@@ -38,19 +37,6 @@ class Amounts(NamedTuple):
     full: int
     points: int
     variance: float
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """A pool, and all that was answered in it."""
-
-    pool: Pool
-    taken: Taken
-
-    @property
-    def chosen(self) -> NDArray[np.bool_]:
-        """Which points (n,) are."""
-        return np.isin(np.arange(self.pool.count), self.pool.chosen)
 
 
 class ByChoice(Way):
@@ -70,11 +56,11 @@ class ByChoice(Way):
         self._all = team.groups.index(tuple(range(1, len(team.members))))
         g = PILOT if PILOT in team.taken else 0
         first = team.taken[g]
-        self._pilot, self._counts = _Taken(self._pool(first, np.arange(len(first.points))), first), g == 0
+        self._pilot, self._counts = (self._pool(first, np.arange(len(first.points))), first), g == 0
         follows = (correlations(pilot.covariance)[:, 1:] ** 2).mean(axis=0)
         best = np.argsort(-follows, kind="stable")[:2] + 1
         self._pair = (int(best[0]), int(best[1]))
-        self._pools: list[_Taken] = []
+        self._pools: list[tuple[Pool, Taken]] = []  # and all that was answered in them
         self._estimate()
 
     def _pool(self, taken: Taken, chosen: NDArray[np.intp]) -> Pool:
@@ -84,16 +70,13 @@ class ByChoice(Way):
         t = team.members[0].centre.coordinates.of(taken.points)
         return Pool(deviations[:, 1:], t, chosen, deviations[chosen, 0])
 
-    def _pooled(self) -> Pooled:
-        pools = [one.pool for one in self._pools]
-        if self._counts or not pools:
-            pools = [self._pilot.pool, *pools]
-        return Pooled(pools, self._team.slopes, self._team.inputs.correlation, self._known)
-
     def _estimate(self) -> None:
-        team, pooled = self._team, self._pooled()
+        team, pools = self._team, self._pools
+        if self._counts or not pools:
+            pools = [self._pilot, *pools]
+        pooled = Pooled([pool for pool, _ in pools], team.slopes, team.inputs.correlation, self._known)
         found = pooled.estimated(team.offsets[0])
-        parts = found.rest[1] * len(found.rows), found.cheap[1] * len(found.cheap[1])
+        parts = found.rest[1] * len(found.pooled.rows), found.cheap[1] * len(found.cheap[1])
         moved = [one - one.mean(axis=0) for one in parts]
         values = team.offsets[0] + found.predicted
         self.estimates = with_tails(found.estimates, team.inputs, moved, values, of=1)
@@ -109,13 +92,13 @@ class ByChoice(Way):
 
     def best(self, cost: float) -> Amounts:
         """Return how many full solves and points of a pool are best for a cost."""
-        team, found, pooled = self._team, self.found, self._pooled()
+        team, found, pooled = self._team, self.found, self.found.pooled
         design = self._design()
         d = design.differences(pooled.cheap)
         size = np.hypot(FLOOR * np.sqrt((d**2).mean()) or 1.0, d)
-        errors = found.rest[0] * found.expected[:, None]
+        errors = found.rest[0] * pooled.expected[:, None]
         # Variance of a full solve by the choice, and of a point of the pool.
-        rest = (errors**2 / (size[found.rows] * found.expected)[:, None]).sum(axis=0) * size.mean()
+        rest = (errors**2 / (size[pooled.rows] * pooled.expected)[:, None]).sum(axis=0) * size.mean()
         cheap = found.cheap[0].var(axis=0) * len(pooled.cheap) ** 2
         counts = bool(self._counts or self._pools)
         before, points = counts * ratio(rest, (found.rest[0] ** 2).sum(axis=0)), counts * len(pooled.cheap)
@@ -138,9 +121,9 @@ class ByChoice(Way):
         Of bounded parameters points show the differences d: if the models miss as much as they differ, even full solves
         have the variance E[d²], and these E[d]².
         """
-        if tails_of(self._team.inputs).any():
+        if self._team.inputs.tails.any():
             return UNSEEN
-        return concentration(self._design().differences(self._pooled().cheap), 0.0)
+        return concentration(self._design().differences(self.found.pooled.cheap), 0.0)
 
     def needed(self, target: float) -> float:
         """Predict what has to be spent for a largest relative variance."""
@@ -160,47 +143,43 @@ class ByChoice(Way):
         if not 0 < full < count:
             return
         design, number = self._design(), len(self._pools)
-        taken = team.drawn(self._all, sum(len(one.taken.points) for one in self._pools), count)
+        taken = team.drawn(self._all, sum(pool.count for pool, _ in self._pools), count)
         pool = self._pool(taken, np.empty(0, dtype=int))
         start = float(random_points((team.seed, len(team.groups) + 1), number, number + 1, 1)[0, 0])
         floor, intensity, rows = choice(design, pool.cheap, full, start)
         taken.values[rows, 0] = team.solved(0, taken.points[rows], taken.reasons)
         values = taken.values[rows, 0] - team.offsets[0]
         pool = replace(pool, chosen=rows, values=values, design=design, floor=floor, intensity=intensity)
-        self._pools.append(_Taken(pool, taken))
+        self._pools.append((pool, taken))
         self._estimate()
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs."""
-        pooled = self._pooled()
-        return quantiles_of_chosen(pooled, self.found, self._team.offsets[0], probabilities)
+        return quantiles_of_chosen(self.found, self._team.offsets[0], probabilities)
 
     def blocks(self) -> list[Block]:
         """What was taken: of each pool the points that were chosen, and the others."""
         team = self._team
-        found = [Block(team.groups[0], self._pilot.taken, pilot=not self._counts)]
-        for one in self._pools:
-            for group, rows in ((team.groups[0], one.chosen), (team.groups[self._all], ~one.chosen)):
-                found.append(
-                    Block(group, Taken(one.taken.points[rows], one.taken.values[rows], one.taken.reasons), chosen=True)
-                )
+        found = [Block(team.groups[0], self._pilot[1], pilot=not self._counts)]
+        for pool, taken in self._pools:
+            chosen = np.isin(np.arange(pool.count), pool.chosen)
+            for group, rows in ((team.groups[0], chosen), (team.groups[self._all], ~chosen)):
+                found.append(Block(group, Taken(taken.points[rows], taken.values[rows], taken.reasons), chosen=True))
         return found
 
     def doubts(self) -> Iterator[Finding]:
         """Say how full solves were chosen, and find what a few of them decide."""
         team, found = self._team, self.found
-        chosen, points = (
-            sum(f(one) for one in self._pools) for f in (lambda p: p.chosen.sum(), lambda p: len(p.chosen))
-        )
+        chosen, points = sum(len(pool.chosen) for pool, _ in self._pools), sum(pool.count for pool, _ in self._pools)
         labels = [team.members[k].label for k in self._pair]
-        least, most = (f(found.expected) / len(found.predicted) for f in (np.min, np.max))
+        least, most = (f(found.pooled.expected) / len(found.predicted) for f in (np.min, np.max))
         yield Finding(
             "solves-chosen",
             "note",
             {"chosen": chosen, "points": points, "least": least, "most": most, "first": labels[0], "second": labels[1]},
         )
         values = team.offsets[0] + found.predicted
-        moved = found.rest[1] * len(found.rows)
+        moved = found.rest[1] * len(found.pooled.rows)
         relative = ratio(found.estimates.std_error, found.estimates.std)
         yield from of_tails(team.evaluate.outputs, values, relative, moved - moved.mean(axis=0))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.model import FloatArray, SolveError
-from uq.estimators.blue import Problem
+from uq.estimators.blue import Problem, informations
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated
 from uq.estimators.moments import Estimates, Z, combine, controlled, either, estimate, monomials, ratio, student, term
@@ -21,7 +21,7 @@ from uq.methods.fidelity_team import PILOT, Block, Fidelities
 from uq.surrogates.field_regression import Deviations, deviations
 from uq.surrogates.gate import wrong
 from uq.surrogates.outside_samples import beyond
-from uq.surrogates.regression import Regression, tails_of
+from uq.surrogates.regression import Regression
 from uq.surrogates.taylor import Control, expansion
 
 FEWEST = 8  # samples of a group that gets any
@@ -36,9 +36,12 @@ class Way:
     ----------
     estimates
         Mean and standard deviation.
+    pilot
+        What a pilot tells.
     """
 
     estimates: Estimates
+    pilot: Found
 
     def __init__(self, team: Fidelities) -> None:
         self._team = team
@@ -48,8 +51,9 @@ class Way:
         return self._team.blocks()
 
     def _values(self) -> FloatArray:
-        """Outputs (n, m) of the study's model, or what stands for them."""
-        return own_values(self._team)
+        """Outputs (n, m) of the study's model in samples in which it has an answer, or what stands for them."""
+        values = np.concatenate([one.taken.values[:, 0] for one in self._team.blocks() if 0 in one.group])
+        return np.asarray(values[np.isfinite(values).all(axis=1)])
 
     @abstractmethod
     def _relative(self) -> FloatArray:
@@ -63,20 +67,14 @@ class Way:
             gain = ratio(variance, error**2 * cost, empty=1.0)
             yield gain, gain * np.sqrt(relative + 4 * ratio(e.std_error, e.std) ** 2)
 
-
-class OfPilot(Way):
-    """A way by samples of groups, of which a pilot tells something (`pilot`)."""
-
-    pilot: Found
-
     @property
     def plain(self) -> tuple[FloatArray, FloatArray]:
         """Variances (m,) of plain samples, and of those that have the tangent as control."""
-        plain = np.asarray(own_values(self._team).var(axis=0, ddof=1))
+        plain = np.asarray(self._values().var(axis=0, ddof=1))
         return plain, np.einsum("mkk->mk", self.pilot.covariance)[:, 0]
 
 
-class ByModels(OfPilot):
+class ByModels(Way):
     """Groups of models that share their samples.
 
     Attributes
@@ -108,17 +106,18 @@ class ByModels(OfPilot):
         team = self._team
         samples, apart = self._samples()
         found = estimated(samples, team.offsets[0], team.variances, apart)
-        self.estimates = with_tails(found.estimates, team.inputs, found.moved, own_values(team))
+        self.estimates = with_tails(found.estimates, team.inputs, found.moved, self._values())
         self.found = replace(found, estimates=self.estimates)
 
     def _relative(self) -> FloatArray:
         return self.found.relative
 
     def _problem(self) -> Problem | None:
-        """How to choose numbers; None if controls leave nothing."""
-        team = self._team
-        found = self.found.problem(team.groups, team.costs, team.counts(), self.estimates.size)
-        return found if len(found.told) else None
+        """How to choose numbers of samples for means, relative to their sizes; None if controls leave nothing."""
+        team, fitted = self._team, zip(self.found.fitted, self.estimates.size, strict=True)
+        known = [(one.covariances[0], size) for one, size in fitted if one.covariances[0, 0, 0] > 0]
+        told = [informations(team.groups, covariance / size**2) for covariance, size in known]
+        return Problem(np.array(told), team.costs, team.counts()) if told else None
 
     def expected(self, cost: float) -> float:
         """Predict the largest relative variance of a mean once so much more is spent."""
@@ -172,7 +171,7 @@ def _share(found: Found, i: int) -> FloatArray:
     return ratio(errors[i], errors.sum(axis=0))
 
 
-class ByExpansion(OfPilot):
+class ByExpansion(Way):
     """An expansion fitted to the pilot, and samples of the study's model that correct what it leaves.
 
     Attributes
@@ -212,7 +211,7 @@ class ByExpansion(OfPilot):
         )
 
     def _relative(self) -> FloatArray:
-        return np.full((1, self.left.size), 2 / len(own_values(self._team)))
+        return np.full((1, self.left.size), 2 / len(self._values()))
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Quantiles:
         """Return quantiles of the outputs, of the samples of the study's model alone."""
@@ -248,7 +247,7 @@ class ByExpansion(OfPilot):
         team.take(self._own, count)
         found, moved = self._controlled()
         # Without the control, the samples that it was fitted to count as well.
-        own = own_values(team)
+        own = self._values()
         plain: Estimates = estimate(monomials(own - team.offsets[0], None).sum(axis=1), len(own), team.offsets[0])
         moved_plain = influences(own - team.offsets[0], (own - team.offsets[0]) ** 2)
         plain = with_tails(plain, team.inputs, (moved_plain,), own)
@@ -287,13 +286,13 @@ class ByExpansion(OfPilot):
                 np.broadcast_arrays(found.std_error * factor, of_std, self._unseen(points, first)), axis=0
             ),
         )
-        return with_tails(found, team.inputs, (moved,), own_values(team)), moved
+        return with_tails(found, team.inputs, (moved,), self._values()), moved
 
     def _unseen(self, points: FloatArray, left: FloatArray) -> FloatArray:
         """Error (m,) of the standard deviation from beyond all samples, which leaves so much of them (n, m)."""
         inputs, fitted = self._team.inputs, self._fitted
         points = np.concatenate([points, fitted.trial.points])
-        share = beyond(inputs, fitted.basis, fitted.outputs, points, tails_of(inputs)).share
+        share = beyond(inputs, fitted.basis, fitted.outputs, points).share
         norm = left.std(axis=0) / np.maximum(1 - share, 1 / len(points))
         return np.asarray(np.sqrt(share) * (norm if fitted.rest is None else np.maximum(norm, fitted.rest)))
 
@@ -303,9 +302,3 @@ class ByExpansion(OfPilot):
         values = self._alone()[1]
         relative = self.estimates.relative_std_error
         yield from of_tails(team.evaluate.outputs, values, relative, self._moved, expanded=True)
-
-
-def own_values(team: Fidelities) -> FloatArray:
-    """Outputs (n, m) of the study's model in samples in which it has an answer."""
-    values = np.concatenate([one.taken.values[:, 0] for one in team.blocks() if 0 in one.group])
-    return np.asarray(values[np.isfinite(values).all(axis=1)])

@@ -159,13 +159,7 @@ class Linear(CheapModel):
         return self.name or self.kind
 
     def of(self, spec: ModelSpec) -> ModelSpec:
-        """Return the linear model.
-
-        Raises
-        ------
-        ModelError
-            If it is no body.
-        """
+        """Return the linear model; a `ModelError` if it is no body."""
         return spec.linearised().solved_to(ROUGH)
 
     def predicted(self, unknowns: int, own: int) -> float:

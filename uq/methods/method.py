@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 MESH = "mesh "  # how the names of models begin that are the same on finer meshes, of which a report has a table
 UNASKED = "method.kind = 'automatic' needs a tolerance, expected accuracy.tolerance, such as 1e-3"
+Probability = Annotated[float, Field(gt=0, lt=1)]
 TEXTBOOK = 15  # ratio of the times of a solve from zero and a predicted one, at 10⁴ unknowns
 
 
@@ -134,6 +135,12 @@ class Method(Settings):
     def stream(self) -> tuple[Any, ...] | None:
         """Name the sequence of points that it uses, for methods that share it; None if the points are its own."""
         return None
+
+
+def refuse(objection: str | None) -> None:
+    """Raise a ValueError that says an objection, if there is one."""
+    if objection is not None:
+        raise ValueError(objection)
 
 
 # Those that estimate moments from a number of samples.

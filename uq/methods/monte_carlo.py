@@ -31,7 +31,7 @@ from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
-from uq.methods.method import Amount
+from uq.methods.method import Amount, Probability
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
 MOST_GROWTH = 4.0  # growth of the number of samples between checks
 FEW = 512  # samples, for fewer of which no better prediction is worth its making
 UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
-Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class MonteCarlo(Amount):
@@ -131,7 +130,61 @@ class MonteCarlo(Amount):
                 break
         amount, error = f"{count} samples", f"relative error {float(scalars.relative_error.max()):.3g}"
         stopped = f"{amount}: {error}" if goal else self.why_stopped(reached, error, count, limit, amount)
-        return _dataset(self, inputs, evaluate, centre, evaluations, scalars, control, stopped)
+        return self._results(inputs, evaluate, centre, evaluations, scalars, stopped)
+
+    def _field_moments(self, evaluations: Evaluations, inputs: Inputs, centre: Linearisation) -> Moments:
+        n, control = int(evaluations.ok.sum()), self._control
+        if control is None or len(centre.slopes) == 0:
+            return estimate(evaluations.fields, n, centre.state)
+        slopes = centre.state_slopes
+        variance = np.einsum("iu,ij,ju->u", slopes, inputs.correlation, slopes)
+        return estimate(evaluations.fields, n, centre.state_middle, variance, *control)
+
+    def _results(
+        self,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        centre: Linearisation,
+        evaluations: Evaluations,
+        scalars: Moments,
+        stopped: str,
+    ) -> xr.Dataset:
+        control, ok = self._control, evaluations.ok
+        of_quantiles = quantiles(evaluations.outputs[ok], self.quantiles)
+        dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
+        dataset = of_quantiles.on(dataset, self.quantiles).assign(
+            {
+                **scalars.variables(),
+                "points": (("sample", "parameter"), evaluations.points),
+                "values": (("sample", "output"), evaluations.outputs),
+                "ok": (("sample",), ok),
+            }
+        )
+        if control is not None:
+            plain = _scalar_moments(evaluations, inputs, centre, None)
+            dataset = dataset.assign(
+                {
+                    **scalars.variables("variance_ratio", "std_variance_ratio", "coefficient"),
+                    **{f"plain_{name}": found for name, found in plain.variables().items()},
+                }
+            )
+        if evaluations.fields.size:
+            field, count = self._field_moments(evaluations, inputs, centre), evaluate.displacements
+            dataset = dataset.assign(by_node(field, count))
+            powers = evaluations.fields if len(evaluations.fields) == len(POWERS) else evaluations.fields[POWERS]
+            relative, volumes = field.relative_std_error[:count], evaluate.node_volumes
+            add(dataset, *of_field_tails(powers[:, :count], int(ok.sum()), relative, volumes))
+        dataset.attrs["stopped"] = stopped
+        values, moved = evaluations.outputs[ok], None
+        if control is not None:
+            if control[1] == "quadratic":
+                add(dataset, *of_control(evaluate.outputs, "tangent", scalars))
+            moved = influences(*_controlled(evaluations, centre, scalars))
+        add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
+        if not ok.all():
+            which = "plain estimates" if control else "all estimates"
+            dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)
+        return dataset
 
 
 class SensitivityMonteCarlo(MonteCarlo):
@@ -211,70 +264,6 @@ def _controlled(evaluations: Evaluations, centre: Linearisation, found: Estimate
     first = evaluations.outputs[ok] - centre.middle
     predicted = centre.predicted(evaluations.points[ok])
     return first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2
-
-
-def _field_moments(
-    evaluations: Evaluations,
-    inputs: Inputs,
-    centre: Linearisation,
-    control: tuple[Coefficient, SecondMoment] | None,
-) -> Moments:
-    n = int(evaluations.ok.sum())
-    if control is None or len(centre.slopes) == 0:
-        return estimate(evaluations.fields, n, centre.state)
-    slopes = centre.state_slopes
-    variance = np.einsum("iu,ij,ju->u", slopes, inputs.correlation, slopes)
-    return estimate(evaluations.fields, n, centre.state_middle, variance, *control)
-
-
-def _dataset(
-    method: MonteCarlo,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    centre: Linearisation,
-    evaluations: Evaluations,
-    scalars: Moments,
-    control: tuple[Coefficient, SecondMoment] | None,
-    stopped: str,
-) -> xr.Dataset:
-    ok = evaluations.ok
-    of_quantiles = quantiles(evaluations.outputs[ok], method.quantiles)
-    dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
-    dataset = of_quantiles.on(dataset, method.quantiles).assign(
-        {
-            **scalars.variables(),
-            "points": (("sample", "parameter"), evaluations.points),
-            "values": (("sample", "output"), evaluations.outputs),
-            "ok": (("sample",), ok),
-        }
-    )
-    if control is not None:
-        plain = _scalar_moments(evaluations, inputs, centre, None)
-        dataset = dataset.assign(
-            {
-                **scalars.variables("variance_ratio", "std_variance_ratio", "coefficient"),
-                **{f"plain_{name}": found for name, found in plain.variables().items()},
-            }
-        )
-    if evaluations.fields.size:
-        field, count = _field_moments(evaluations, inputs, centre, control), evaluate.displacements
-        dataset = dataset.assign(by_node(field, count))
-        powers = evaluations.fields if len(evaluations.fields) == len(POWERS) else evaluations.fields[POWERS]
-        doubts = of_field_tails(
-            powers[:, :count], int(ok.sum()), field.relative_std_error[:count], evaluate.node_volumes
-        )
-        add(dataset, *doubts)
-    dataset.attrs["stopped"] = stopped
-    values, moved = evaluations.outputs[ok], None
-    if control is not None:
-        if control[1] == "quadratic":
-            add(dataset, *of_control(evaluate.outputs, "tangent", scalars))
-        moved = influences(*_controlled(evaluations, centre, scalars))
-    add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
-    if not ok.all():
-        which = "plain estimates" if control else "all estimates"
-        dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)
-    return dataset
 
 
 def by_node(field: Estimates, displacements: int) -> Variables:

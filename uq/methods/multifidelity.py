@@ -31,8 +31,8 @@ from uq.methods.fidelity_choice import ByChoice
 from uq.methods.fidelity_team import OWN_LABEL, PILOT, Fidelities
 from uq.methods.fidelity_ways import ByExpansion, ByModels
 from uq.methods.low_fidelity import CHEAP, CheapModel
-from uq.methods.method import MESH, Amount
-from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED, Probability
+from uq.methods.method import MESH, Amount, Probability
+from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
 from uq.surrogates.linearisation import local_dataset
 
 if TYPE_CHECKING:

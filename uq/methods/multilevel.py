@@ -167,6 +167,7 @@ class MultilevelMonteCarlo(Amount):
         levels, members, blocks = found.levels, meshes.members, meshes.blocks()
         dataset = local_dataset(meshes.inputs, members[-1].evaluate, members[-1].centre, fields=False)
         single, telescoped = [one.single for one in levels], found.by_mesh
+        *_, before, finest = telescoped
         counts, values = [len(one.ok) for one in blocks], [one.taken.values for one in blocks]
         plain, kurtosis = np.array([one.variance for one in levels]), np.array([one.kurtosis for one in levels])
         remaining = np.array([one.term.variance for one in levels])
@@ -180,8 +181,9 @@ class MultilevelMonteCarlo(Amount):
                 part("mean", "total"): (by_output, found.total_error),
                 "std_bias_error": (by_output, found.std_bias_error),
                 part("std", "total"): (by_output, np.hypot(found.estimates.std_error, found.std_bias_error)),
-                part("mean", "mesh"): (by_output, found.signs * found.bias_error),
-                part("std", "mesh"): (by_output, found.std_signs * found.std_bias_error),
+                # Finer meshes will raise or lower them as the last one did.
+                part("mean", "mesh"): (by_output, np.sign(found.differences[-1]) * found.bias_error),
+                part("std", "mesh"): (by_output, np.sign(finest.std - before.std) * found.std_bias_error),
                 "weak_rate": (by_output, rate(found.differences)),
                 "strong_rate": (by_output, rate(plain[1:])),
                 "cost_rate": ((), float(-rate(seconds[:, None])[0])),

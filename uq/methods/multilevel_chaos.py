@@ -29,9 +29,9 @@ from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Prediction, Request, Start
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods.chaos import Expanded, Probability, expansion_dataset, objection
-from uq.methods.method import Amount
-from uq.surrogates.basis import hyperbolic_count, orthonormal, whole
+from uq.methods.chaos import Expanded, expansion_dataset, objection
+from uq.methods.method import Amount, Probability, refuse
+from uq.surrogates.basis import hyperbolic_count, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise
@@ -139,13 +139,11 @@ class MultilevelChaos(Amount):
             (`level_residual`, `level_change`, …); see docs/results.md.
         """
         d = len(inputs.names)
-        for refusal in (self.objection(inputs), self.shortage(d)):
-            if refusal is not None:
-                raise ValueError(refusal)
+        refuse(self.objection(inputs) or self.shortage(d))
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         bases, n = whole(inputs, self.order), self.per_level(d)
-        basis = orthonormal(inputs, bases.all)
+        basis = bases.basis
         start = _start(centre, self.first)
         sums = (
             None
@@ -161,7 +159,7 @@ class MultilevelChaos(Amount):
             points = inputs.points(sobol_points(self.seed, len(levels), 0, n, d))
             found = evaluate(Request(points, fields=sums, start=start, iterations=iterations))
             data = Data.of(found, inputs, None)
-            fit = fit_best(bases, basis, data)
+            fit = fit_best(bases, data)
             states = None if start is None else StateExpansion.fitted(basis, fit, found.fields, centre)
             start = states
             expected, known = known, _of_expansion(basis, fit, states, evaluate.displacements)
@@ -185,7 +183,7 @@ class MultilevelChaos(Amount):
         error = f"moments changed by {change:.3g}, largest residual {largest:.2g}"
         count = f"{len(levels)} level{'s' if len(levels) > 1 else ''} of {n} samples"
         stopped = self.why_stopped(change, error, len(levels), self.max_levels, count)
-        expanded = Expanded(centre, found, Regression(inputs, bases, basis, data, fit), stopped)
+        expanded = Expanded(centre, found, Regression(inputs, bases, data, fit), stopped)
         dataset = expansion_dataset(evaluate, expanded, self.seed, self.quantiles, further, fields=self.fields)
         return dataset.assign(_by_level(levels)).assign(
             {

@@ -20,17 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from uq.estimators.moments import (
-    Estimates,
-    Moments,
-    Term,
-    combine,
-    controlled,
-    estimate,
-    monomials,
-    ratio,
-    term,
-)
+from uq.estimators.moments import Estimates, Moments, Term, combine, controlled, estimate, monomials, ratio, term
 from uq.estimators.tails import influences, kurtosis, with_tails
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import OWN
@@ -191,8 +181,6 @@ class Found:
         By how much each sample (n, m) of every mesh moves the variance on the finest one.
     differences
         E[Y_l] (L, m), l = 1 … L.
-    signs, std_signs
-        Whether the last meshes raise (1) or lower (−1) mean and standard deviation (m,): as finer ones will.
     bias_error, std_bias_error
         Estimated errors (m,) of mean and standard deviation on the finest mesh.
     consistency
@@ -203,8 +191,6 @@ class Found:
     by_mesh: tuple[Estimates, ...]
     moved: tuple[FloatArray, ...]
     differences: FloatArray
-    signs: FloatArray
-    std_signs: FloatArray
     bias_error: FloatArray
     std_bias_error: FloatArray
     consistency: FloatArray
@@ -229,8 +215,6 @@ class Found:
             by_mesh,
             moved,
             differences,
-            np.sign(differences[-1]),
-            np.sign(std_differences[-1]),
             bias(differences, alpha),
             bias(std_differences, alpha),
             consistency,

@@ -24,6 +24,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
 from uq.methods.chaos import objection, predictions
+from uq.methods.method import refuse
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, grown
 from uq.methods.scrambles import Scrambles
 from uq.surrogates.basis import FULL, ROWS_PER_TERM
@@ -129,8 +130,12 @@ class QuasiMonteCarlo(MonteCarlo):
         """Say why these parameters do not allow the control, or None."""
         return objection(inputs, "method.control = 'chaos'") if self.control == "chaos" else None
 
-    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Sample and estimate.
+    def until(
+        self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None, expanded: Deviations | None = None
+    ) -> xr.Dataset:
+        """Sample until errors are those of a goal; an expansion that is known already may be the control of "chaos".
+
+        Its samples must not be among those of the scrambles. Errors as in `run`.
 
         Returns
         -------
@@ -139,18 +144,7 @@ class QuasiMonteCarlo(MonteCarlo):
             (`variance_ratio`, `std_variance_ratio`) and the estimates from the first points of all scrambles
             (`running_mean`, `running_mean_error`); see docs/results.md.
         """
-        return self.until(inputs, evaluate, None)
-
-    def until(
-        self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None, expanded: Deviations | None = None
-    ) -> xr.Dataset:
-        """Sample until errors are those of a goal; an expansion that is known already may be the control of "chaos".
-
-        Its samples must not be among those of the scrambles. Results and errors as in `run`.
-        """
-        refusal = self.objection(inputs)
-        if refusal is not None:
-            raise ValueError(refusal)
+        refuse(self.objection(inputs))
         if self.control != "none" and expanded is None and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ModelError(message)

@@ -26,7 +26,6 @@ from uq.surrogates.field_regression import Deviations
 from uq.surrogates.gate import wrong
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.outside_samples import Beyond, beyond, drawn_beyond
-from uq.surrogates.regression import tails_of
 from uq.surrogates.taylor import Control, Held, expansion, held_expansion
 
 Found = TypeVar("Found")
@@ -51,12 +50,10 @@ class _FieldProducts(FieldSum):
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         state = scattered(model, self.state[None, :])[0]
         control = self.control
-        coefficients = None if control is None else scattered(model, control.state)
+        coefficients = np.empty((0, 0)) if control is None else scattered(model, control.state)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            controls = None
-            if control is not None and coefficients is not None:
-                controls = control.predict(control.features(parameters), coefficients)
+            controls = None if control is None else control.predict(control.features(parameters), coefficients)
             deviation = solution.state - state
             return np.concatenate([_products(deviation, controls), [deviation**3, deviation**4]])
 
@@ -241,7 +238,7 @@ class Scrambles(Sets):
         Also what a control hides (m,): the part of the errors that is in no scatter.
         """
         found, ok = self._by_scatter(each, known), self.ok[:, :each]
-        values, controlled = self.outputs[:, :each][ok], self._left(found, each, known and known[0])
+        values, controlled = self.outputs[:, :each][ok], known and self.controlled(found, each)
         plain = values - values.mean(axis=0)
         found = by_chance(found, influences(*(controlled or (plain, plain**2))), int(ok.any(axis=1).sum()))
         tails = counted(found, self._inputs, values, controlled)
@@ -329,7 +326,7 @@ class Scrambles(Sets):
         first, second = np.array([one - C for one, _ in others]), np.array([one - D for _, one in others])
         middle = found.mean - self._centre.outputs
         sizes, norm = None, np.zeros_like(found.std)
-        if not tails_of(self._inputs).any():  # in tails what no sample shows is in other claims, and has no limit
+        if not self._inputs.tails.any():  # in tails what no sample shows is in other claims, and has no limit
             left = controlled[0] - controlled[0].mean(axis=0)
             sizes, norm = self._fitted.trial.scaled(self.points[:, :each][self.ok[:, :each]], left)
         of_std = ratio(wrong(second - 2 * middle * first, sizes), 2 * found.std)
@@ -341,14 +338,13 @@ class Scrambles(Sets):
 
     def _beyond(self, control: Control, points: FloatArray) -> Beyond:
         """Return what a control has in tails beyond points (n, d)."""
-        tails = tails_of(self._inputs)
         match control.polynomials:
             case Held(basis, lower, upper):
-                return beyond(self._inputs, basis, control.outputs, points, tails, (lower, upper))
+                return beyond(self._inputs, basis, control.outputs, points, (lower, upper))
             case Basis() as basis:
-                return beyond(self._inputs, basis, control.outputs, points, tails)
+                return beyond(self._inputs, basis, control.outputs, points)
             case polynomials:
-                return drawn_beyond(self._inputs, polynomials.values, control.outputs, points, tails)
+                return drawn_beyond(self._inputs, polynomials.values, control.outputs, points)
 
     @_once
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
@@ -391,14 +387,10 @@ class Scrambles(Sets):
 
     def controlled(self, found: Estimates, each: int) -> Pair | None:
         """Samples (n, m) of both moments, the first of them that have an answer, with controls."""
-        known = self._controls(each)
-        return None if known is None else self._left(found, each, known[0])
-
-    def _left(self, found: Estimates, each: int, controls: Pair | None) -> Pair | None:
-        if controls is None:
+        known, ok = self._controls(each), self.ok[:, :each]
+        if known is None:
             return None
-        ok = self.ok[:, :each]
-        C, D = (control[ok] for control in controls)
+        C, D = (control[ok] for control in known[0])
         first = self.outputs[:, :each][ok] - self._centre.outputs
         return first - found.coefficient * C, first**2 - found.second_coefficient * D
 

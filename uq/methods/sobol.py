@@ -7,6 +7,7 @@ The formulas, and where they are from, are in `uq.estimators.indices`; exchanged
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -18,15 +19,15 @@ from pydantic.json_schema import SkipJsonSchema
 from forward.model import FloatArray, SolveError
 from forward.settings import nearest
 from uq.estimators.doubts import of_indices
-from uq.estimators.indices import Analysis, RowProducts, coefficient_moments, pair_variances, partial_variances, shares
+from uq.estimators.indices import Analysis, RowProducts, sobol_indices
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two
 from uq.methods.chaos import LARGEST, Chaos
-from uq.methods.method import Amount
-from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
+from uq.methods.method import Amount, Probability, refuse
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED
 from uq.methods.sobol_rows import DIMENSIONS, RUNNING, Rows, by_output, by_round, with_maps
 from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import linearise
@@ -159,9 +160,7 @@ class Sobol(Amount):
         FileNotFoundError
             If the source holds no results of this model and these parameters; otherwise as every method.
         """
-        objection = self.objection(inputs) or self.unknown(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refuse(self.objection(inputs) or self.unknown(inputs))
         dataset = {"chaos": self._expand, "saltelli": self._exchange, "given-data": self._take}[self.design](
             inputs, evaluate
         )
@@ -182,20 +181,7 @@ class Sobol(Amount):
 
     def _analysis(self, inputs: Inputs) -> Analysis:
         """What is asked of an expansion."""
-        members = self._members(inputs)
-
-        def of(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
-            found = coefficient_moments(coefficients, indices)
-            squares = coefficients**2
-            variance, first, total = partial_variances(squares, indices, members)
-            if len(members):
-                found["sobol_group_first"] = shares(first, variance[..., None])
-                found["sobol_group_total"] = shares(total, variance[..., None])
-            if self.second_order:
-                found["sobol_second"] = shares(pair_variances(squares, indices), variance[..., None, None])
-            return found
-
-        return of
+        return partial(sobol_indices, members=self._members(inputs), pairs=self.second_order)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         method = Chaos(

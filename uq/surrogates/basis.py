@@ -365,9 +365,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Sets of functions to choose from, of up to the order `limit`; `all` (P, d) is their union."""
+    """Sets of functions to choose from, of up to the order `limit`; `basis` is their union."""
 
-    all: IntArray
+    basis: Basis
     sets: tuple[Candidate, ...]
     limit: int = LARGEST_DEGREE
 
@@ -375,7 +375,7 @@ class Candidates:
 def whole(inputs: Inputs, order: int) -> Candidates:
     """Return the full basis of one order as the only choice."""
     indices = hyperbolic(len(inputs.names), order, 1.0)
-    return Candidates(indices, (Candidate(order, 1.0, np.arange(len(indices))),))
+    return Candidates(orthonormal(inputs, indices), (Candidate(order, 1.0, np.arange(len(indices))),))
 
 
 def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> Candidates:
@@ -407,7 +407,7 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
         Candidate(order, q, np.array([number[index.tobytes()] for index in indices]), sparse)
         for (sparse, _), (indices, order, q) in found.items()
     ]
-    return Candidates(union, tuple(sets), max_order)
+    return Candidates(orthonormal(inputs, union), tuple(sets), max_order)
 
 
 def lacking(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, FloatArray]:

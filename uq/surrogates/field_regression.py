@@ -24,7 +24,7 @@ from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, on_group
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.basis import Basis, candidates_of, orthonormal, rows_of
+from uq.surrogates.basis import Basis, candidates_of, rows_of
 from uq.surrogates.gate import Trial, repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation
@@ -122,8 +122,6 @@ class Deviations:
         Which samples (n,) had an answer and were fitted.
     prediction
         Of the state, from which the solver may start; None if the state was not requested.
-    reach
-        Lowest and highest coordinates (2, d) of the samples that were fitted.
     rest
         Norms (m,) of what the functions miss in the outputs, see `Regression.missing`; None if no parameter has a tail.
     trial
@@ -138,7 +136,6 @@ class Deviations:
     relative: FloatArray
     ok: NDArray[np.bool_]
     prediction: StateExpansion | None
-    reach: FloatArray
     rest: FloatArray | None
     trial: Trial
     repeats: tuple[Deviations, ...] = ()
@@ -160,11 +157,10 @@ def fit_deviations(
         If the model has no answer at too many of the points for an expansion of order 1.
     """
     candidates = candidates_of(inputs, max_order, len(points) * rows_of(inputs, gradients=True), FIELD_DICTIONARY)
-    largest = orthonormal(inputs, candidates.all)
-    wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    wanted = Projections(candidates.basis, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    regression = Regression.fitted(inputs, candidates, largest, data)
+    regression = Regression.fitted(inputs, candidates, data)
     return deviations(regression.higher() if wanted is None else regression, evaluations, centre)
 
 
@@ -175,17 +171,14 @@ def _deviating(basis: Basis, coefficients: FloatArray, outputs: FloatArray) -> F
 
 def deviations(regression: Regression, evaluations: Evaluations, centre: Linearisation) -> Deviations:
     """Return an expansion as one of deviations, with the state where `Projections` of it were summed."""
-    fit, basis, data = regression.fit, regression.basis, regression.data
+    fit, basis = regression.fit, regression.basis
     outputs = _deviating(basis, fit.coefficients, centre.outputs)
     state, prediction = np.zeros((len(outputs), 0)), None
     if evaluations.fields.size:
         state = solved(fit, evaluations.fields[fit.chosen.which])
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
-    t = regression.inputs.coordinates.of(data.points)
-    reach = np.array([t.min(axis=0), t.max(axis=0)])
-    rest = regression.missing()
-    trial = repeated(regression)
-    found = Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest, trial)
+    rest, trial = regression.missing(), repeated(regression)
+    found = Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, rest, trial)
     return replace(found, repeats=tuple(found.of(*one, centre.outputs) for one in trial.fits))
 
 
@@ -238,7 +231,7 @@ def regression_of_field(outputs: Regression, sketches: FloatArray) -> Regression
     same = replace(outputs.fit.chosen, sparse=False)
     for sets in ((same,), outputs.candidates.sets):
         try:
-            fit = fit_best(replace(outputs.candidates, sets=sets), outputs.largest, data)
+            fit = fit_best(replace(outputs.candidates, sets=sets), data)
         except SolveError:
             continue  # not determined without some of the samples
         fits.append(replace(outputs, data=data, fit=fit))
@@ -251,7 +244,7 @@ def errors_of_indices(regression: Regression) -> dict[str, FloatArray]:
 
     NaN if the fit explains nothing.
     """
-    fit, largest = regression.fit, regression.largest.indices
+    fit, largest = regression.fit, regression.candidates.basis.indices
     alone = np.eye(largest.shape[1], dtype=bool)
 
     def of(coefficients: FloatArray, indices: NDArray[np.int64]) -> FloatArray:

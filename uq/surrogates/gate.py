@@ -92,19 +92,19 @@ class Trial:
 
 def repeated(of: Regression) -> Trial:
     """Repeat a fit without each part of its samples in turn; where the others do not determine any, there is none."""
-    data = of.data
+    data, largest = of.data, of.candidates.basis
     part = np.arange(len(data.points)) % min(PARTS, len(data.points))
     errors = np.empty_like(data.values)
     fits: list[tuple[Basis, FloatArray]] = []
-    apart = np.zeros((PARTS, len(of.largest.indices), data.values.shape[1]))
+    apart = np.zeros((PARTS, len(largest.indices), data.values.shape[1]))
     for k in np.unique(part):
         rest, own = np.flatnonzero(part != k), np.flatnonzero(part == k)
         try:
-            fit = fit_best(of.candidates, of.largest, data.some(rest))
+            fit = fit_best(of.candidates, data.some(rest))
         except SolveError:
             errors[own] = data.values[own] - data.values[rest].mean(axis=0)
         else:
-            basis = of.largest.subset(fit.chosen.which)
+            basis = largest.subset(fit.chosen.which)
             errors[own] = data.values[own] - basis.values(data.points[own]) @ fit.coefficients
             apart[len(fits), fit.chosen.which] = fit.coefficients
             apart[len(fits), of.fit.chosen.which] -= of.fit.coefficients
@@ -112,7 +112,7 @@ def repeated(of: Regression) -> Trial:
     relative = np.sqrt(shares((errors**2).mean(axis=0), data.values.var(axis=0)))
     gained = shares(of.fit.relative, relative)
     used = np.flatnonzero(apart.any(axis=(0, 2)))
-    differences = of.largest.subset(used), apart[: len(fits)][:, used]
+    differences = largest.subset(used), apart[: len(fits)][:, used]
     whole = _moments(of.basis, of.fit.coefficients)
     return Trial(data.points, relative, tuple(fits), *differences, whole, gained)
 

@@ -73,9 +73,9 @@ class Growing(OfEvaluate):
     def _learning(self, request: Request) -> Evaluations:
         assert self._candidates is not None
         assert request.fields is not None
-        basis = orthonormal(self._inputs, self._candidates.all)
+        basis = self._candidates.basis
         found = self._evaluate(replace(request, fields=_Beside(basis, self._centre.state, request.fields)))
-        terms = len(self._candidates.all)
+        terms = len(basis.indices)
         self._seen.append(replace(found, fields=found.fields[:terms]))
         self._count += len(request.points)
         if self._count >= self._ends[0]:
@@ -89,13 +89,13 @@ class Growing(OfEvaluate):
         self._seen = [seen] if self._ends else []
         most = int(seen.ok.sum()) // ROWS_PER_TERM
         sets = tuple(one for one in largest.sets if one.which.size <= most)
-        basis, data = orthonormal(self._inputs, largest.all), Data.of(seen, self._inputs, None)
+        data = Data.of(seen, self._inputs, None)
         try:
-            fit = fit_best(replace(largest, sets=sets), basis, data)
+            fit = fit_best(replace(largest, sets=sets), data)
         except SolveError:
             return
         if self._better(fit, data):
-            chosen = orthonormal(self._inputs, largest.all[fit.chosen.which])
+            chosen = orthonormal(self._inputs, largest.basis.indices[fit.chosen.which])
             self._start = StateExpansion.fitted(chosen, fit, seen.fields, self._centre)
 
     def _better(self, fit: Fit, data: Data) -> bool:
@@ -140,4 +140,4 @@ def _candidates(inputs: Inputs, centre: Linearisation, planned: int) -> Candidat
     if len(counts) < 2:  # orders
         return None
     sets = tuple(Candidate(order, 1.0, np.arange(count)) for order, count in enumerate(counts, 1))
-    return Candidates(hyperbolic(d, len(counts), 1.0), sets)
+    return Candidates(orthonormal(inputs, hyperbolic(d, len(counts), 1.0)), sets)

@@ -173,7 +173,7 @@ class _Folds:
 
 
 @phase("fitting polynomials")
-def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
+def fit_best(candidates: Candidates, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 
     Outputs that no choice explains, such as what is zero by symmetry but for rounding, have no say in it if others do.
@@ -191,7 +191,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     held = np.arange(n) % min(n, FOLDS)
     order = np.argsort(held, kind="stable")
     data, held = data.some(order), held[order]
-    left, right = data.left(largest), data.right
+    left, right = data.left(candidates.basis), data.right
     products = _Products.of(left, held)
     scores, least = _scores(candidates, products, right, data, held, slice(None))
     # Few samples of what is rounding are explained by chance; outputs have many units, so it is known by size alone.
@@ -225,7 +225,7 @@ def _scores(
     Choices that the samples do not determine are left out.
     """
     n, rows, m = right.shape
-    d = candidates.all.shape[1]
+    d = candidates.basis.indices.shape[1]
     scores: _Scores = []
     least = np.full(m, np.inf)
     for candidate in candidates.sets:

@@ -123,22 +123,16 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     SolveError
         If the model has no answer at the point.
     """
-    centre = inputs.mean if point is None else point
-    return linearised(inputs, evaluate, evaluate(linearise_request(evaluate, centre)), point)
-
-
-def linearise_request(evaluate: Evaluate, point: FloatArray) -> Request:
-    """Return what `linearise` asks for at a point (d,)."""
-    derivatives = evaluate.differentiable
+    centre, derivatives = inputs.mean if point is None else point, evaluate.differentiable
     slopes = derivatives and len(evaluate.parameters) <= MANY
-    return Request(point[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes))
+    found = evaluate(Request(centre[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
+    return linearised(inputs, evaluate, found, point)
 
 
 def linearised(
     inputs: Inputs, evaluate: Evaluate, found: Evaluations, point: FloatArray | None = None
 ) -> Linearisation:
     """Return the result of `linearise` from its evaluations."""
-    centre = inputs.mean if point is None else point
     for failure in found.failures:
         message = (
             f"the model has no answer at {'the mean' if point is None else 'the given'} parameters: {failure.reason}"
@@ -148,7 +142,7 @@ def linearised(
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
     return Linearisation(
-        centre,
+        found.points[0],
         found.outputs[0],
         tangents,
         fields[0],
@@ -176,10 +170,7 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
             "derivative_per_std": (("output", "parameter"), centre.tangents * inputs.std),
             "derivative_per_range": (("output", "parameter"), centre.tangents * ranges),
         }
-    coordinates: dict[str, list[str]] = {
-        "output": list(evaluate.outputs),
-        "parameter": list(evaluate.parameters),
-    }
+    coordinates = {"output": list(evaluate.outputs), "parameter": list(evaluate.parameters)}
     if fields and centre.state.size:
         count = evaluate.displacements
         coordinates["component"] = ["x", "y", "z"]

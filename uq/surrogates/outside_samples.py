@@ -49,18 +49,13 @@ Box = tuple[FloatArray, FloatArray]  # lower and upper ends (d,) in coordinates,
 
 
 def beyond(
-    inputs: Inputs,
-    basis: Basis,
-    coefficients: FloatArray,
-    points: FloatArray,
-    which: NDArray[np.bool_],
-    held: Box | None = None,
+    inputs: Inputs, basis: Basis, coefficients: FloatArray, points: FloatArray, held: Box | None = None
 ) -> Beyond:
-    """Return what an expansion (P, m) has beyond the box of points (n, d), in those parameters (d,) `which` count.
+    """Return what an expansion (P, m) has in tails beyond the box of points (n, d).
 
     It may be `held` at the values that it has at the sides of another box.
     """
-    m = coefficients.shape[1]
+    m, which = coefficients.shape[1], inputs.tails
     if not which.any():
         return Beyond(np.zeros(m), np.zeros(m))
     t = basis.coordinates.of(points)
@@ -85,14 +80,10 @@ def beyond(
 
 
 def drawn_beyond(
-    inputs: Inputs,
-    functions: Callable[[FloatArray], FloatArray],
-    coefficients: FloatArray,
-    points: FloatArray,
-    which: NDArray[np.bool_],
+    inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
 ) -> Beyond:
     """Return the same of any functions, by draws: enough for those of a low order, which have little far out."""
-    m = coefficients.shape[1]
+    m, which = coefficients.shape[1], inputs.tails
     if not which.any():
         return Beyond(np.zeros(m), np.zeros(m))
     drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(which)))

@@ -59,8 +59,8 @@ class Regression:
     ----------
     inputs
         The parameters.
-    candidates, largest
-        The sets of functions that were tried, and the basis of all of them.
+    candidates
+        The sets of functions that were tried.
     data
         The samples that have an answer.
     fit
@@ -69,14 +69,13 @@ class Regression:
 
     inputs: Inputs
     candidates: Candidates
-    largest: Basis
     data: Data
     fit: Fit
 
     @classmethod
-    def fitted(cls, inputs: Inputs, candidates: Candidates, largest: Basis, data: Data) -> Regression:
+    def fitted(cls, inputs: Inputs, candidates: Candidates, data: Data) -> Regression:
         """Fit data with the best of these sets; errors as in `of`."""
-        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+        return cls(inputs, candidates, data, fit_best(candidates, data))
 
     @classmethod
     def of(
@@ -91,13 +90,12 @@ class Regression:
         """
         data = Data.at(points, values, tangents, inputs)
         rows = len(points) * rows_of(inputs, gradients=tangents is not None)
-        candidates = candidates_of(inputs, max_order or ORDER, rows, DICTIONARY)
-        found = cls.fitted(inputs, candidates, orthonormal(inputs, candidates.all), data)
+        found = cls.fitted(inputs, candidates_of(inputs, max_order or ORDER, rows, DICTIONARY), data)
         return found if max_order else found.higher()
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as in `of`."""
-        return Regression.fitted(self.inputs, self.candidates, self.largest, self.data.some(slice(count)))
+        return Regression.fitted(self.inputs, self.candidates, self.data.some(slice(count)))
 
     def higher(self) -> Regression:
         """Return the fit of half as high an order again, as long as the highest is chosen, and it explains far more.
@@ -109,8 +107,7 @@ class Regression:
         rows = len(data.points) * rows_of(self.inputs, gradients=data.slopes is not None)
         while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
             order = min(found.candidates.limit * 3 // 2, HIGHEST)
-            candidates = candidates_of(self.inputs, order, rows, DICTIONARY)
-            again = Regression.fitted(self.inputs, candidates, orthonormal(self.inputs, candidates.all), data)
+            again = Regression.fitted(self.inputs, candidates_of(self.inputs, order, rows, DICTIONARY), data)
             if EXPLAINS * again.fit.relative.max() > found.fit.relative.max():
                 break
             found = again
@@ -124,7 +121,7 @@ class Regression:
     @property
     def basis(self) -> Basis:
         """The P functions of the fit."""
-        return self.largest.subset(self.fit.chosen.which)
+        return self.candidates.basis.subset(self.fit.chosen.which)
 
     def estimates(self, of: Analysis | None = None) -> dict[str, FloatArray]:
         """Return estimates from the coefficients, by output, with standard errors.
@@ -144,7 +141,7 @@ class Regression:
         assert draws is not None
         if len(draws.names) > MOST:
             return self._estimates(moments, missing, missing)
-        of = Shapley.of(self.largest, draws)
+        of = Shapley.of(self.candidates.basis, draws)
         found = self._estimates(of.analysis, missing, missing)
         of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
@@ -162,7 +159,7 @@ class Regression:
         samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
         then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
         """
-        tails = tails_of(self.inputs)
+        tails = self.inputs.tails
         if not tails.any():
             return None
         joint = np.isin(np.arange(tails.size), self.inputs.joint)
@@ -180,7 +177,7 @@ class Regression:
         regression they are off by t R⁻¹Qᵀψ, and the standard deviation σ by t c·R⁻¹Qᵀψ/σ (without the constant) and
         t²/(2σ). For t stands the most that the residuals allow, see `missing`.
         """
-        tails, basis, data, fit = tails_of(self.inputs), self.basis, self.data, self.fit
+        tails, basis, data, fit = self.inputs.tails, self.basis, self.data, self.fit
         if self.inputs.draws is not None:
             return missing
         varying = (basis.indices != 0).any(axis=1)
@@ -206,7 +203,7 @@ class Regression:
         what is left of ψ is known everywhere, and its mean and its product with the expansion are integrals.
         """
         inputs, basis, fit = self.inputs, self.basis, self.fit
-        bounded, first = ~tails_of(inputs), basis.indices.sum(axis=1) == 1
+        bounded, first = ~inputs.tails, basis.indices.sum(axis=1) == 1
         if not bounded.any():
             return np.zeros((2, fit.loo.size))
         directions, asked = towards_ends(bounded, basis.indices[first], fit.coefficients[first])
@@ -278,7 +275,7 @@ class Regression:
 
         Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
         """
-        fit, largest = self.fit, self.largest.indices
+        fit, largest = self.fit, self.candidates.basis.indices
         indices = largest[fit.chosen.which]
         central = of(fit.coefficients.T, indices)
         left_out = of(np.swapaxes(fit.without, 1, 2), largest)
@@ -364,7 +361,7 @@ class Regression:
 
     def _unseen_samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Samples (n, m) of both moments of deviations from values (m,), each with the fit without it as control."""
-        fit, data, largest = self.fit, self.data, self.largest.indices
+        fit, data, largest = self.fit, self.data, self.candidates.basis.indices
         offset = data.values.mean(axis=0)
         constant = (largest == 0).all(axis=1)
         mean = (fit.without[:, constant].sum(axis=1) - offset)[fit.held]
@@ -374,14 +371,13 @@ class Regression:
 
     def _left_of_following(self, places: IntArray) -> FloatArray:
         """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
-        basis, (q, _) = self.basis, self._columns
+        basis = self.basis
         degrees = basis.indices[:, places]
         powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
         powers[:, np.arange(places.size), places] = following, following + 1
         functions, norms = lacking(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
-        columns = self.data.left(functions).reshape(len(q), -1)
-        found = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0)
+        _, found = self._taken_up(self.data.left(functions))
         found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
         next_one, after = found.reshape(2, places.size, 1)
         # An odd function, or one beside a slope, has no even powers, and lacks the one after the next.
@@ -393,7 +389,7 @@ class Regression:
     def beyond(self, points: FloatArray | None = None) -> Beyond:
         """Return what the fit has in tails beyond its samples, or beyond points (n, d)."""
         points = self.data.points if points is None else points
-        return beyond(self.inputs, self.basis, self.fit.coefficients, points, tails_of(self.inputs))
+        return beyond(self.inputs, self.basis, self.fit.coefficients, points)
 
     @property
     def controlled(self) -> BoolArray:
@@ -426,9 +422,3 @@ class Regression:
                 influences(first, second)[:, which],
                 expanded=True,
             )
-
-
-def tails_of(inputs: Inputs) -> BoolArray:
-    """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
-    bounded = [marginal.support is not None for marginal in inputs.marginals.values()]
-    return ~np.array(bounded, dtype=bool) | np.isin(np.arange(len(bounded)), inputs.joint)

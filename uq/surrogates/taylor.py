@@ -100,10 +100,11 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
     Beyond, the expansion is a guess that no sample supports, while E[φφᵀ] counts it in full. None if all parameters
     are bounded: samples then reach the ends.
     """
-    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    tails = inputs.unbounded
     if not tails.any():
         return None
-    lower, upper = fitted.reach
+    t = inputs.coordinates.of(fitted.trial.points)
+    lower, upper = t.min(axis=0), t.max(axis=0)
     more = MARGIN * (upper - lower)
     held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
     mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))

@@ -145,31 +145,18 @@ def history(directory: Path) -> dict[str, Any] | None:
     return written(directory.resolve() / FILE)
 
 
-class Found:
-    """The model at the mean of its parameters, and the error of its mesh at a few.
-
-    Attributes
-    ----------
-    centre, errors
-        Those.
-    dataset
-        Means and standard deviations by tangents, with these errors.
-    """
-
-    def __init__(
-        self, study: SamplingBlocks, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int
-    ) -> None:
-        fields = getattr(study.method, "fields", True) and centre.state.size > 0
-        seed = getattr(study.method, "seed", 0)
-        self.centre = centre
-        self.errors: MeshErrors = estimate(inputs, evaluate, centre, count, seed, fields=fields)
-        points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
-        drawn = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
-        zero = np.zeros(len(centre.outputs))
-        moments = zip(ESTIMATES, (drawn.mean(axis=0), zero, drawn.std(axis=0), zero), strict=True)
-        dataset = local_dataset(inputs, evaluate, centre, fields=False)
-        dataset = dataset.assign({name: (("output",), values) for name, values in moments})
-        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, study.told)
+def estimated(
+    study: SamplingBlocks, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int
+) -> tuple[MeshErrors, xr.Dataset]:
+    """Return the error of the mesh at so many parameters, and means and standard deviations by tangents, with it."""
+    fields = getattr(study.method, "fields", True) and centre.state.size > 0
+    errors = estimate(inputs, evaluate, centre, count, getattr(study.method, "seed", 0), fields=fields)
+    drawn = centre.middle + centre.predicted(inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names))))
+    zero = np.zeros(len(centre.outputs))
+    moments = zip(ESTIMATES, (drawn.mean(axis=0), zero, drawn.std(axis=0), zero), strict=True)
+    dataset = local_dataset(inputs, evaluate, centre, fields=False)
+    dataset = dataset.assign({name: (("output",), values) for name, values in moments})
+    return errors, with_mesh_errors(dataset, inputs, centre, errors, study.told)
 
 
 def doubts(dataset: xr.Dataset) -> FloatArray:
@@ -189,10 +176,10 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
             return error
         found = None
         with suppress(SolveError):
-            found = Found(study, inputs, recorder, centre, count)
+            found = estimated(study, inputs, recorder, centre, count)
         shares, close, relative, means = np.full((2, 1), np.inf), None, np.inf, list[tuple[str, float, float, float]]()
-        if found is not None and found.errors.evaluations.ok.sum() > 1:
-            asked, data = goal(study), found.dataset
+        if found is not None and found[0].evaluations.ok.sum() > 1:
+            asked, data = goal(study), found[1]
             sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
             errors = np.abs([estimate_of(data, name).mesh for name in ESTIMATED])
             known = doubts(data), np.nan_to_num(data["mesh_error_unknown"].to_numpy() * errors)
@@ -252,18 +239,19 @@ def within(
     unknown: tuple[Finding, ...] = ()
     if study.estimates and before is not None:
         try:
-            mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate), before["estimates"])
+            centre = linearise(inputs, evaluate)
+            mesh, by_tangents = estimated(study, inputs, evaluate, centre, before["estimates"])
         except SolveError as error:
             unknown = (failed(f"{error}"),)
         else:
-            estimates.append(mesh.errors.evaluations)
-            asked = replace(asked, mesh=doubts(mesh.dataset))
+            estimates.append(mesh.evaluations)
+            asked = replace(asked, mesh=doubts(by_tangents))
     for _ in range(ATTEMPTS):
         recorders["/"] = Recorder(evaluate)
         found = method.until(inputs, recorders["/"], asked)
         if mesh is None:
             break
-        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, study.told)
+        found = with_mesh_errors(found, inputs, centre, mesh, study.told)
         asked = replace(asked, mesh=doubts(found))
         if asked.reached(_moments(found), half_width(found)) <= 1:
             break

@@ -10,10 +10,10 @@ from forward.bodies.hexahedra import CORNERS
 from forward.bodies.mesh import TETRAHEDRA, surface_of
 from forward.hyperelastic import Hyperelastic
 from tests.forward.bodies.test_slits import CELLS, NAMES, block
-from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
-from uq.surrogates.linearisation import linearise_request
+from uq.surrogates.linearisation import linearise
 from workflows.studies.solves import crossings
 
 
@@ -76,15 +76,17 @@ def test_lips_that_are_pressed_are_seen(tmp_path):
     )
     inputs = Inputs({"loads.traction.size": Uniform(lower=-37, upper=-35)})
     model = spec.build(MPI.COMM_SELF, inputs.names)
-    evaluate = SerialEvaluate(model)
-    first = evaluate(linearise_request(evaluate, inputs.mean))
+    at_mean, at_six = Recorder(SerialEvaluate(model)), Recorder(SerialEvaluate(model))
+    linearise(inputs, at_mean)
+    first = at_mean.first
     nodes, (cells, _) = model.space.coordinates, model.space.cells()
     assert len(cells) == np.prod(CELLS)
     (said,) = crossings(first, inputs.mean[None], nodes, cells, "hexahedron")
     assert said.code == "passes-through-itself"
     assert "At the mean" in said.text
     assert "3.3 mm" in said.text
-    pulled = evaluate(linearise_request(evaluate, np.array([6.0])))
+    linearise(inputs, at_six, np.array([6.0]))
+    pulled = at_six.first
     assert not list(crossings(pulled, np.array([[6.0], [30.0]]), nodes, cells, "hexahedron"))
     (said,) = crossings(pulled, np.array([[6.0], [-36.0]]), nodes, cells, "hexahedron")
     assert "predicted to be largest" in said.text

@@ -40,7 +40,7 @@ def test_a_result_that_arrives_while_solves_are_counted(monkeypatch):
         SimpleNamespace(rank=0, size=1),
         0,
         lambda done, failed: None,
-        (SimpleNamespace(take=lambda: next(taken), reset=lambda: None), Solves(), SimpleNamespace(add=lambda count: 0)),
+        (SimpleNamespace(add=lambda _: next(taken), reset=lambda: None), Solves(), SimpleNamespace(add=lambda _: 0)),
     )
     one.lead([0, 1], lambda piece: "own", lambda *result: received.append(result))
     assert received == [(0, "own", False), (1, "theirs", True)]

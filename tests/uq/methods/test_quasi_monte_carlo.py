@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -449,9 +450,9 @@ def test_moments_of_what_is_held():
     }
     inputs = Inputs(marginals)
     basis_of = basis.orthonormal(inputs, basis.hyperbolic(4, 3, 1.0))
-    reach = np.array([[-1.0] * 4, [1.2] * 4])
+    ends = SimpleNamespace(points=inputs.coordinates.points(np.array([[-1.0] * 4, [1.2] * 4])))
     nothing = np.zeros((len(basis_of.indices), 0))
-    fitted = Deviations(basis_of, nothing, nothing, np.zeros(0), np.ones(4, dtype=bool), None, reach, None, None)
+    fitted = Deviations(basis_of, nothing, nothing, np.zeros(0), np.ones(4, dtype=bool), None, None, ends)
     control = taylor.held_expansion(inputs, fitted)
     features = control.features(inputs.points(remembered(1, 0, 0, 2**15, 4)))
     assert np.abs(features).max() < 60  # of the basis itself: thousands

@@ -20,7 +20,7 @@ def test_what_is_beyond_a_box_is_exact():
     coefficients = random.standard_normal((len(basis.indices), 2))
     points, drawn = (inputs.points(random.random((n, 3))) for n in (40, 200_000))
     tails = np.array([True, True, False])
-    found = beyond(inputs, basis, coefficients, points, tails)
+    found = beyond(inputs, basis, coefficients, points)
     outside = (((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails).any(axis=1)
     squares = (basis.values(drawn) @ coefficients - coefficients[(basis.indices == 0).all(axis=1)]) ** 2
     np.testing.assert_allclose(found.share, squares[outside].sum(axis=0) / squares.sum(axis=0), rtol=0.03)
