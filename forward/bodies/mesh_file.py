@@ -31,7 +31,7 @@ from forward.bodies.mesh import (
     divided,
     divided_contents,
     node_count,
-    surface_faces,
+    surface_of,
 )
 from forward.bodies.mesh_reading import digest_of, load
 from forward.findings import Finding
@@ -245,7 +245,7 @@ class MeshFile(Settings):
     def surface(self) -> FloatArray:
         """Corners (n, 3 or 4, 3) of all faces that belong to one cell (m)."""
         mesh = self.load()
-        return np.asarray(mesh.points[surface_faces(mesh.cells, mesh.cell)])
+        return np.asarray(mesh.points[surface_of(mesh.cells, mesh.cell)[0]])
 
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
