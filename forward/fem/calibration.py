@@ -138,6 +138,7 @@ class FinerMesh:
     def __init__(self, model: Body, spare: float = math.inf) -> None:
         self._model, self._spare = model, spare
         self._scalars = [i for i, path in enumerate(model.parameters) if path in model.spec.scalars]
+        self._names = tuple(model.parameters[i] for i in self._scalars)
 
     @cached_property
     def _finer(self) -> Finer | None:
@@ -154,10 +155,6 @@ class FinerMesh:
         """The same for one solution."""
         assert self._finer is not None
         return _once(self._model, self._finer.spec, self._names)
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return tuple(self._model.parameters[i] for i in self._scalars)
 
     @cached_property
     def _lifted(self) -> LoadedBody | None:

@@ -18,7 +18,6 @@ from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, ReferenceSolution, Work
-from forward.solvers.anderson import block_galerkin
 from forward.solvers.multigrid import minimised, smoothed
 
 ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
@@ -84,9 +83,7 @@ class EnrichedEquations:
         """Set parameters, loads and state to those of a solution of the body, or to a state (U⁺_local,) near it."""
         equations, key = self.equations, solution if at is None else at
         if equations.linearisation_point.solution is not key:
-            equations.set_parameters(solution.parameters, solution.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(self.up(solution.state) if at is None else at)
+            equations.set_to(solution.parameters, self.up(solution.state) if at is None else at, solution.stiffer)
             equations.linearisation_point.solution = key
         return equations
 
@@ -183,9 +180,7 @@ class EnrichedEquations:
         if self._blocks is None or not self._blocks[0].same(at):
             equations = self.equations
             kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
-            equations.set_parameters(at.parameters)
-            equations.at_load(1.0)
-            equations.set_state(self.up(at.state))
+            equations.set_to(at.parameters, self.up(at.state))
             self._blocks = (at, equations.preconditioner())
             equations.work = kept
         return self._blocks[1]
@@ -205,22 +200,13 @@ class EnrichedEquations:
         transpose: bool,
     ) -> FloatArray | None:
         """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
-        equations = self.equations
         if self._alone:
-            equations.release()
+            self.equations.release()
         known = ReferenceSolution(reference.parameters, self.up(reference.state))
         self._reference.prepare(known)
         R = self._reference.rotation(self.up(solution.state) if at is None else at)
         self.visit(solution, at)
-        return block_galerkin(
-            lambda x: equations.free_stiffness_times(x, transpose=transpose),
-            self._reference.inverse(R, transpose=transpose),
-            right,
-            equations.total,
-            equations.norms,
-            close,
-            ITERATIONS,
-        )
+        return self._reference.solve_near(R, right, close, ITERATIONS, transpose=transpose)
 
     def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
         equations, key = self.visit(solution, at), solution if at is None else at

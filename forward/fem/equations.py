@@ -191,6 +191,12 @@ class Discretisation(Sensitivities):
         self._load.value = fraction
         self._targets = fraction * self._full_targets
 
+    def set_to(self, parameters: FloatArray, state: FloatArray, stiffer: float = 1.0) -> None:
+        """Set parameters (d,), all of the load, and a state (U_local,); the factor as of `set_parameters`."""
+        self.set_parameters(parameters, stiffer)
+        self.at_load(1.0)
+        self.set_state(state)
+
     def on_target(self, u: FloatArray) -> FloatArray:
         """Return u (U_local,) with the prescribed unknowns at their targets."""
         v = np.array(u)

@@ -271,12 +271,10 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_form(self) -> Any:
-        """The symmetric part of the stiffness, in UFL; the stiffness itself if it is symmetric.
+        """The symmetric part of a stiffness that is not symmetric, in UFL.
 
         That of friction is the stiffness at pressures that stay: what slides has no other resistance along the tool.
         """
-        if self.symmetric:
-            return self._of_stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
         works = list(zip(self.spec.loads, self.virtual_works, strict=True))
         rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
@@ -293,7 +291,7 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_stiffness(self) -> Any:
-        return self._stiffness if self.symmetric else self._bilinear(self._symmetric_form)
+        return self._bilinear(self._symmetric_form)
 
     def new_factor(self) -> LinearSolver:
         """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own.
@@ -307,7 +305,7 @@ class Linearisation(Forms):
         return linear.DirectSolver(matrix)
 
     def new_symmetric_solver(self) -> LinearSolver:
-        """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""
+        """Return a solver for the symmetric part of a stiffness that is not symmetric, with a matrix of its own."""
         matrix = self._new_matrix(self._symmetric_stiffness, symmetric=True, blocked=self.linear != Linear.FACTOR)
         return self._solver_of(matrix, self._symmetric_form)
 
@@ -374,7 +372,7 @@ class Linearisation(Forms):
 
     def release(self) -> None:
         """Free the factor, if there is one."""
-        if "_solver" in vars(self) and self._solver.memory():
+        if self.linearisation_point.factorised is not None:
             self._solver.release()
         self.linearisation_point.factorised = None
 

@@ -22,7 +22,6 @@ from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
 from forward.phases import phase
-from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
 from forward.solvers.way import Way
@@ -60,8 +59,10 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self.reference = None if way is None else way.reference
-        self._rotation = None if way is None else way.rotation
+        # If Newton's method had to take over, the reference is too far away for the derivatives too.
+        near = way if way is not None and found.corrected else None
+        self.reference = None if near is None else near.reference
+        self._rotation = None if near is None else near.rotation
         self.visit()
         outputs = np.array([f.value() for f in model.functionals])
         self.outputs = self._seen(model.equations, self.state, lambda: outputs)
@@ -84,9 +85,7 @@ class FiniteElementSolution:
         """Return the equations, set to parameters and state of this solution."""
         equations = self._model.equations
         if equations.linearisation_point.solution is not self:
-            equations.set_parameters(self.parameters, self.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(self.state)
+            equations.set_to(self.parameters, self.state, self.stiffer)
             equations.linearisation_point.solution = self
         equations.work = self.work
         return equations
@@ -173,19 +172,10 @@ class FiniteElementSolution:
             # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
             first = turn(directions @ factor.slopes(), R)
             first[:, fixed] = 0
-        equations = self.visit()
+        self.visit()
         free = np.array(right)
         free[:, fixed] = 0
-        found = block_galerkin(
-            lambda x: equations.free_stiffness_times(x, transpose=transpose),
-            factor.inverse(R, transpose=transpose),
-            free,
-            equations.total,
-            equations.norms,
-            tolerance,
-            ITERATIONS,
-            first,
-        )
+        found = factor.solve_near(R, free, tolerance, ITERATIONS, transpose=transpose, first=first)
         if found is not None:
             found[:, fixed] = right[:, fixed]
         return found
@@ -366,7 +356,7 @@ class FiniteElementSolution:
         return found.reshape(*np.shape(weights)[:-1], -1)
 
 
-def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.0) -> FloatArray:
+def factors(seen: ArrayLike, more: ArrayLike, degree: int) -> FloatArray:
     """Return what errors seen in elements of one degree more are to be multiplied by, from what two degrees more see.
 
     Beside edges and corners, where stresses are singular, errors fall with a power of the degree p, C p^−β, and twice
@@ -380,14 +370,12 @@ def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.
         Errors (m,) as elements of one and of two degrees more see them.
     degree
         Of the body.
-    otherwise
-        The factor of what is too small beside the others to have one of its own.
     """
     one, two = np.atleast_1d(np.asarray(seen, dtype=float)), np.atleast_1d(np.asarray(more, dtype=float))
     p = float(degree)
     first = p**-RATES - (p + 1) ** -RATES
     ratios = ((p + 1) ** -RATES - (p + 2) ** -RATES) / first  # falls with β
-    found = np.full(one.shape, otherwise)
+    found = np.ones(one.shape)
     good = np.isfinite(one) & np.isfinite(two) & (one != 0)
     step = (two[good] - one[good]) / one[good]
     powers = np.interp(step, ratios[::-1], (p**-RATES / first)[::-1])

@@ -69,12 +69,6 @@ class Task(Generic[T]):
     resume: Callable[[int], None]
 
 
-def failed(error: SolveError) -> Steps[T]:
-    """Return a solver that has failed before it asks for anything."""
-    raise error
-    yield  # a generator
-
-
 def _moved(task: Task[T], answer: FloatArray | None, end: Callable[[T], None]) -> FloatArray | None:
     """Begin, or go on with an answer: return what is asked for next, or hand the result to `end` and return None."""
     task.resume(0 if answer is None else 1 if answer.ndim == 1 else len(answer))

@@ -128,10 +128,7 @@ class BoundaryBlocks:
         self._matrix.zeroEntries()
         fem.petsc.assemble_matrix(self._matrix, self._form)
         self._matrix.assemble()
-        rows, _, values = self._matrix.getValuesCSR()
-        first, last = self._matrix.getOwnershipRange()
-        assert len(values) == 3 * (last - first) == rows[-1]
-        return np.array(values).reshape(-1, 3, 3)
+        return _nodal_blocks(self._matrix)
 
 
 class SaddleBlocks:
@@ -220,7 +217,7 @@ class DirectSolver:
         self._stiffness = stiffness
         self._unknowns, self._symmetric = stiffness.unknowns, stiffness.symmetric
         self._room = ROOM
-        self._analysed = self._factorised = False
+        self._analysed = False
         self._ksp = self._new_ksp(stiffness.comm)
         self._right = stiffness.matrix.createVecLeft()
         self._solution = stiffness.matrix.createVecRight()
@@ -244,8 +241,7 @@ class DirectSolver:
             self._room *= 4
             self._renew()
         self._analysed = True
-        self._factorised = status >= 0
-        if self._factorised:
+        if status >= 0:
             return
         needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
         self._renew()  # or else PETSc would report this failure for ever
@@ -311,19 +307,12 @@ class DirectSolver:
     def release(self) -> None:
         """Free the factor."""
         self._renew()
-        self._factorised = False
 
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues; None for LU."""
         if not self._symmetric:
             return None
         return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))
-
-    def memory(self) -> int:
-        """Return the bytes of the last factor with its working memory on all ranks, in whole megabytes; 0 before."""
-        if not self._factorised:
-            return 0
-        return 10**6 * int(self._ksp.pc.getFactorMatrix().getMumpsInfog(22))
 
 
 class NodalBlocks:

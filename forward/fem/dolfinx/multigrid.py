@@ -6,8 +6,8 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
+from forward.fem import ranks
 from forward.fem.dolfinx.linear import StiffnessMatrix
 from forward.fem.dolfinx.spaces import Transfer
 from forward.model import FloatArray, SolveError
@@ -78,8 +78,7 @@ class MultigridSolver:
         return forces
 
     def _total(self, values: FloatArray) -> FloatArray:
-        comm = self._stiffness.comm
-        return values if comm.size == 1 else np.asarray(comm.allreduce(values))
+        return ranks.total(self._stiffness.comm, values)
 
     def _multiply(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
         K = self._stiffness.matrix
@@ -106,33 +105,20 @@ class MultigridSolver:
             rows = [self.solve(row, transpose=transpose, tolerance=tolerance) for row in right]
             return np.array(rows).reshape(right.shape)
         assert self._levels is not None, "factorise comes first"
-        levels, free = self._levels, np.array(right)
+        levels, free, definite = self._levels, np.array(right), self._stiffness.symmetric
         free[self._fixed] = 0  # rows and columns of the identity: nothing else depends on them
-        if self._stiffness.symmetric:
-            found = multigrid.conjugate_gradients(
+        if definite:
+            x, converged, definite = multigrid.conjugate_gradients(
                 levels.multiply, levels.cycle, free, self._total, tolerance, ITERATIONS
             )
-            x, converged = found.x, found.converged
-            if not found.definite:
-                x, converged = self._minimised(levels, free, tolerance, transpose=False)
-        else:
-            x, converged = self._minimised(levels, free, tolerance, transpose=transpose)
+        if not definite:
+            multiply = partial(self._multiply, transpose=transpose and not self._stiffness.symmetric)
+            scale = 1 / np.sqrt(np.abs(self._stiffness.matrix.getDiagonal().array_r))  # makes forces comparable
+            x, _, converged = minimised(multiply, levels.cycle, free, scale, self._total, tolerance, RESIDUALS)
         if not converged:
             raise NoConvergence(f"the linear solver did not converge to {tolerance:g}")
         x[self._fixed] = right[self._fixed]
         return x
-
-    def _minimised(
-        self, levels: Levels, right: FloatArray, tolerance: float, *, transpose: bool
-    ) -> tuple[FloatArray, bool]:
-        multiply = partial(self._multiply, transpose=transpose)
-        x, _, converged = minimised(multiply, levels.cycle, right, self._scale, self._total, tolerance, RESIDUALS)
-        return x, converged
-
-    @property
-    def _scale(self) -> FloatArray:
-        """One over the roots of the diagonal, which makes forces comparable."""
-        return np.asarray(1 / np.sqrt(np.abs(self._stiffness.matrix.getDiagonal().array_r)))
 
     def release(self) -> None:
         """Free the coarse factor."""
@@ -157,10 +143,3 @@ class MultigridSolver:
         if found is None:
             raise NoConvergence("the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero")
         return found
-
-    def memory(self) -> int:
-        """Return the bytes of the matrix and of the coarse factor on all ranks; 0 before `factorise`."""
-        if self._levels is None:
-            return 0
-        entries = self._stiffness.matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
-        return int(8 * entries) + self._coarse.memory()
