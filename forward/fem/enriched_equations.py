@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
+from forward.fem.dolfinx.linear import Preconditioner
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.equations import Discretisation
-from forward.fem.linearisation import Preconditioner
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.loaded import LoadedBody
@@ -119,7 +119,14 @@ class EnrichedEquations:
         if self.way == Way.SMOOTHING and at is None:  # where K(u_h) is near
             found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
-            found = self._solve_near(solution, solution.reference, right, close, at, transpose=transpose)
+            # With the factor of the enriched stiffness at the reference, unless that is too far away.
+            if self._alone:
+                self.equations.release()
+            known = ReferenceSolution(solution.reference.parameters, self.up(solution.reference.state))
+            factor = self._reference.at(known)
+            R = factor.rotation(self.up(solution.state) if at is None else at)
+            self.visit(solution, at)
+            found = factor.solve_near(R, right, close, ITERATIONS, transpose=transpose)
         if found is None:
             self._factorise(solution, at)
             found = self.equations.back_substitute(right, transpose=transpose)
@@ -188,25 +195,6 @@ class EnrichedEquations:
     @cached_property
     def _reference(self) -> ReferenceFactor:
         return ReferenceFactor(self.equations)
-
-    def _solve_near(
-        self,
-        solution: Linearised,
-        reference: ReferenceSolution,
-        right: FloatArray,
-        close: float,
-        at: FloatArray | None,
-        *,
-        transpose: bool,
-    ) -> FloatArray | None:
-        """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
-        if self._alone:
-            self.equations.release()
-        known = ReferenceSolution(reference.parameters, self.up(reference.state))
-        self._reference.prepare(known)
-        R = self._reference.rotation(self.up(solution.state) if at is None else at)
-        self.visit(solution, at)
-        return self._reference.solve_near(R, right, close, ITERATIONS, transpose=transpose)
 
     def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
         equations, key = self.visit(solution, at), solution if at is None else at

@@ -405,8 +405,7 @@ class Forms:
     def stresses_at_vertices(self) -> assembly.PointValues:
         """P (n_cells, 4 · 9) (Pa) at the vertices of this rank's tetrahedra, at the state that is set."""
         corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        stress = self._invariants.inserted(self.stress_of(self._potential))
-        return assembly.PointValues(stress, corners, self.space, self.comm)
+        return self.at(self.stress_of(self._potential), corners)
 
     @cached_property
     def gradients(self) -> assembly.NodalAverages:

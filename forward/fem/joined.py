@@ -215,16 +215,8 @@ class SpecimenModel(JoinedBodies):
 
         Parameters
         ----------
-        places
-            Points (n, 3) at which displacements are observed, in the undeformed body (m); those of other outputs do
-            not count.
-        axes
-            Their components (n,): 0, 1 or 2; 3 and more are the other outputs of the load case, in its order.
-        cases
-            Their load cases (n,) by number, in ascending order.
-        directions
-            Unit vectors (n, 3) along which the components are measured, by default the axes of the body; zeros of other
-            outputs.
+        places, axes, cases, directions
+            As of the class. Cases are in ascending order; directions are the axes of the body by default.
         names
             Names of the outputs; by default load case, number and component.
 

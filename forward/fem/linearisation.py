@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import ufl
@@ -65,21 +64,6 @@ class LinearisationPoint:
     def forget_parameters(self) -> None:
         """Fields have changed: the parameters must be set again next time, whatever they are."""
         self.parameters = self.solution = None
-
-
-class Preconditioner(NamedTuple):
-    """An approximate inverse of a stiffness.
-
-    Attributes
-    ----------
-    apply
-        Its product with forces (U_local,).
-    weights
-        What makes forces comparable (U_local,) where the stiffness is not definite; None where it is.
-    """
-
-    apply: Callable[[FloatArray], FloatArray]
-    weights: FloatArray | None
 
 
 class Linearisation(Forms):
@@ -170,7 +154,7 @@ class Linearisation(Forms):
         blocks[nodes, axes, axes] = 1
         return blocks if linear.positive(blocks) else None
 
-    def preconditioner(self) -> Preconditioner | None:
+    def preconditioner(self) -> linear.Preconditioner | None:
         """Return what a few steps at and near the state that is set are preconditioned by; collective.
 
         The 3×3 blocks of the nodes, from means of the moduli of the cells. With pressures a matrix is made, which does
@@ -178,13 +162,11 @@ class Linearisation(Forms):
         """
         if self.p is not None:
             self.work.assemblies += 1
-            saddle = linear.SaddleBlocks(
-                self._new_matrix(self._stiffness, symmetric=self.symmetric), self.nodes_owned, self.fixed
-            )
-            good = ranks.smallest(self.comm, float(saddle.good)) > 0
-            return Preconditioner(saddle.inverse(), saddle.weights) if good else None
+            matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
+            saddle = linear.saddle_blocks(matrix, self.nodes_owned, self.fixed)
+            return saddle if ranks.smallest(self.comm, float(saddle is not None)) > 0 else None
         blocks, fixed = self.nodal_blocks(), self.fixed
-        if ranks.smallest(self.comm, -1.0 if blocks is None else 1.0) < 0 or blocks is None:
+        if not ranks.smallest(self.comm, float(blocks is not None)) > 0 or blocks is None:
             return None
         kept = np.linalg.inv(blocks)
 
@@ -193,7 +175,7 @@ class Linearisation(Forms):
             z[fixed] = 0
             return z
 
-        return Preconditioner(apply, None)
+        return linear.Preconditioner(apply, None)
 
     def _prescribe(self) -> None:
         """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""

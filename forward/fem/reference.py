@@ -16,7 +16,7 @@ from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, SMOOTH, Rows, Screened, screen, screening_vectors
-from forward.solvers.steps import Steps, finished, through
+from forward.solvers.steps import Steps, finish, through
 from forward.solvers.system import ROUGH, TIGHT, LinearSolver
 from forward.solvers.way import MANY
 
@@ -195,8 +195,9 @@ class ReferenceFactor:
             free,
             equations.total,
         )
-        # Where the stiffness is not symmetric, its symmetric part has a factor of its own.
-        return steps if equations.symmetric else finished(steps, self._counted(self._definite()))
+        if equations.symmetric:
+            return (yield from steps)
+        return finish(steps, self._counted(self._definite()))  # its symmetric part has a factor of its own
 
     def definite(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Steps[bool]:
         """Whether the stiffness at a state u (U_local,) with its imbalance, rotated by R, is surely positive definite.

@@ -20,7 +20,7 @@ from forward.fem.body import Calibrating, DiscreteBody, not_estimated
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
-from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
+from forward.model import FloatArray, MeshError, Saturation, SolveError, Stability, Work
 from forward.phases import phase
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
@@ -141,44 +141,25 @@ class FiniteElementSolution:
 
         For tangents, `directions` (k, d) are given. By default the tolerance is that of derivatives.
         """
-        model = self._model
-        near = self.reference is not None and model.equations.linearisation_point.factorised is not self
-        if near and self.reference is not None and self._rotation is not None and len(right) <= FEW:
+        model, R = self._model, self._rotation
+        factored = model.equations.linearisation_point.factorised is self
+        if self.reference is not None and R is not None and not factored and len(right) <= FEW:
+            # With the factor at the reference, rotated as for the prediction, unless that is too far away.
+            factor, fixed, first = model.reference.at(self.reference), model.equations.fixed, None
+            if directions is not None and directions.shape[1] <= FEW:
+                # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
+                first = turn(directions @ factor.slopes(), R)
+                first[:, fixed] = 0
+            self.visit()
+            free = np.array(right)
+            free[:, fixed] = 0
             if tolerance is None:
                 tolerance = model.spec.solver.derivative_tolerance
-            found = self._solve_near(
-                right, self.reference, self._rotation, tolerance, transpose=transpose, directions=directions
-            )
+            found = factor.solve_near(R, free, tolerance, ITERATIONS, transpose=transpose, first=first)
             if found is not None:
+                found[:, fixed] = right[:, fixed]
                 return found
         return self.linearise().back_substitute(right, transpose=transpose)
-
-    def _solve_near(
-        self,
-        right: FloatArray,
-        reference: ReferenceSolution,
-        R: FloatArray,
-        tolerance: float,
-        *,
-        transpose: bool,
-        directions: FloatArray | None,
-    ) -> FloatArray | None:
-        """Solve with the factor at the reference, rotated as for its prediction; None if that is too far away."""
-        model = self._model
-        factor = model.reference.at(reference)
-        fixed = model.equations.fixed
-        first = None
-        if directions is not None and directions.shape[1] <= FEW:
-            # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
-            first = turn(directions @ factor.slopes(), R)
-            first[:, fixed] = 0
-        self.visit()
-        free = np.array(right)
-        free[:, fixed] = 0
-        found = factor.solve_near(R, free, tolerance, ITERATIONS, transpose=transpose, first=first)
-        if found is not None:
-            found[:, fixed] = right[:, fixed]
-        return found
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
