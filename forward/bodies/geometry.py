@@ -69,6 +69,11 @@ class _SixSided(Settings):
     """
 
     structured: ClassVar[bool] = True  # whether cells lie along edges of the body, and any number of them
+    boundaries: ClassVar[tuple[str, ...]] = tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
+    # There are no named regions, there is no file whose contents could be listed, and nothing is unusual about it.
+    regions: ClassVar[tuple[str, ...]] = ()
+    listed: ClassVar[dict[str, str]] = {}
+    findings: ClassVar[tuple[Finding, ...]] = ()
     kind: str
     cells: tuple[Count, Count, Count]
     cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
@@ -149,16 +154,6 @@ class _SixSided(Settings):
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
 
     @property
-    def boundaries(self) -> tuple[str, ...]:
-        """Names of the boundaries."""
-        return tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
-
-    @property
-    def regions(self) -> tuple[str, ...]:
-        """There are no named regions."""
-        return ()
-
-    @property
     def cell_count(self) -> int:
         """Number of cells."""
         a, b, c = self.cells
@@ -168,16 +163,6 @@ class _SixSided(Settings):
     def cells_in_words(self) -> str:
         """How many cells there are along each edge."""
         return " × ".join(f"{n}" for n in self.cells)
-
-    @property
-    def listed(self) -> dict[str, str]:
-        """Contents of a file, in words: there is no file."""
-        return {}
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Nothing is unusual about it."""
-        return ()
 
     @property
     def nodes(self) -> int:

@@ -188,18 +188,13 @@ class FromStart(OfOne):
             parts = here[0][1] if here else tuple(scattered(_meshed(model), rows) for model, rows in pairs)
             self.begun.append((parts, reason))
         begun, reason = self.begun[0]
-        unanswered = None if reason is None else SolveError(*reason)
-        if at_start and unanswered is not None:
-            raise unanswered
-        if at_start:  # where states were kept, this solve was not: it is done as it was begun
+        if reason is not None and (at_start or self.needed):
+            raise SolveError(*reason)
+        if at_start or reason is not None:  # where states were kept, this solve was not: it is done as it was begun
             return here[0][0] if here else self.model.solve(parameters)
-        if unanswered is None:
-            step = parameters - self.start
-            guesses = [Guess(rows[0] + step @ rows[1:] if len(rows) > 1 else rows[0]) for rows in begun]
-            return self.model.solve_each(parameters, guesses)
-        if self.needed:
-            raise unanswered
-        return self.model.solve(parameters)
+        step = parameters - self.start
+        guesses = [Guess(rows[0] + step @ rows[1:] if len(rows) > 1 else rows[0]) for rows in begun]
+        return self.model.solve_each(parameters, guesses)
 
     def _begin(self, start: FloatArray, here: list[tuple[CombinedSolution, tuple[FloatArray, ...]]]) -> Begun:
         """Solve at the start, for all to begin from; states are returned whole, and added with the rank's own part."""

@@ -243,7 +243,7 @@ class Forms:
 
     def at_points(self, expression: Any, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at the quadrature points."""
-        return self.at(expression, spaces.quadrature_points(self.space, self.spec.body.quadrature), often=often)
+        return self.at(expression, spaces.quadrature(self.space, self.spec.body.quadrature)[0], often=often)
 
     def at(self, expression: Any, points: FloatArray, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at points (q, 3) of the reference cell."""

@@ -119,7 +119,7 @@ class Linearisation(Forms):
     def _moduli(self) -> tuple[assembly.PointValues, FloatArray]:
         """∂P along `_along` (n_cells, 9 q) at a few points of the cells, and the weights (q,) of these."""
         changes = self._invariants.derivative_of(self.stress_of(self._potential), self.unknown, self._along)
-        points, weights = (of(self.space, OF_MODULI) for of in (spaces.quadrature_points, spaces.quadrature_weights))
+        points, weights = spaces.quadrature(self.space, OF_MODULI)
         return self.at(ufl.as_vector([changes[a, k] for a in range(3) for k in range(3)]), points, often=True), weights
 
     def moduli(self) -> FloatArray:

@@ -225,15 +225,7 @@ class DirectSolver:
         self._solution = stiffness.matrix.createVecRight()
 
     def factorise(self) -> None:
-        """Assemble and factorise.
-
-        Raises
-        ------
-        SolveError
-            If the matrix is singular or has entries that are not finite.
-        StopError
-            If there is no memory for the factor.
-        """
+        """Assemble and factorise; errors as of `LinearSolver`, also for entries that are not finite."""
         unknowns, ranks = self._stiffness.matrix.getSize()[0], self._ksp.comm.size
         if not self._analysed:  # the analysis crashes without memory
             hopeless = HOPELESS * self._stiffness.expected.bytes / ranks + SPARE

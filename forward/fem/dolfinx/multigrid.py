@@ -45,14 +45,9 @@ class MultigridSolver:
         self._levels: Levels | None = None
 
     def factorise(self) -> None:
-        """Assemble both stiffnesses, and factorise the coarse one.
+        """Assemble both stiffnesses, and factorise the coarse one; errors as of `LinearSolver`.
 
-        Raises
-        ------
-        SolveError
-            If that is singular, or a block on the diagonal, or entries are not finite.
-        StopError
-            If there is no memory for the coarse factor.
+        Also if a block on the diagonal is singular, or entries are not finite.
         """
         self._levels = None
         self._stiffness.assemble()
@@ -94,13 +89,7 @@ class MultigridSolver:
         return z
 
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
-        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides.
-
-        Raises
-        ------
-        NoConvergence
-            If it does not.
-        """
+        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides; errors as of `LinearSolver`."""
         if right.ndim == 2:
             rows = [self.solve(row, transpose=transpose, tolerance=tolerance) for row in right]
             return np.array(rows).reshape(right.shape)
@@ -126,13 +115,7 @@ class MultigridSolver:
         self._levels = None
 
     def negative_eigenvalues(self) -> int | None:
-        """Return how many negative eigenvalues are found, 0 only if there are none; None if unknown.
-
-        Raises
-        ------
-        NoConvergence
-            If the lowest eigenvalue cannot be told from zero.
-        """
+        """Return how many are found, 0 only if there are none; None if unknown; errors as of `LinearSolver`."""
         if not self._stiffness.symmetric or self._levels is None:
             return None
         below = self._coarse.negative_eigenvalues()

@@ -112,16 +112,10 @@ def point_rows(space: Any, points: FloatArray) -> tuple[NDArray[np.bool_], NDArr
     return every.argmin(axis=0) == comm.rank, some, np.asarray(values), every.min(axis=0)
 
 
-def quadrature_points(space: Any, degree: int) -> FloatArray:
-    """Reference points (q, 3) of the quadrature rule of the integrals."""
-    points, _ = basix.make_quadrature(version.cell_type(space), degree)
-    return np.asarray(points)
-
-
-def quadrature_weights(space: Any, degree: int) -> FloatArray:
-    """Weights (q,) of these points."""
-    _, weights = basix.make_quadrature(version.cell_type(space), degree)
-    return np.asarray(weights)
+def quadrature(space: Any, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Reference points (q, 3) of the quadrature rule of the integrals, and their weights (q,)."""
+    points, weights = basix.make_quadrature(version.cell_type(space), degree)
+    return np.asarray(points), np.asarray(weights)
 
 
 def constant(msh: Any, value: Any) -> Any:
