@@ -326,25 +326,15 @@ def divided_contents(found: Contents) -> Contents:
     middles of opposite edges, the squares of which are a quarter of the sum of those of the six edges. A quadrilateral
     has four, a hexahedron six.
     """
-    if found.cell == "hexahedron":
-        return found.model_copy(
-            update={
-                "vertices": found.vertices + found.edges + found.faces + found.cells,
-                "edges": 2 * found.edges + 4 * found.faces + 6 * found.cells,
-                "faces": 4 * found.faces + 12 * found.cells,
-                "cells": 8 * found.cells,
-                "longest_edge": found.longest_edge / 2,
-            }
-        )
-    return found.model_copy(
-        update={
-            "vertices": found.vertices + found.edges,
-            "edges": 2 * found.edges + 3 * found.faces + found.cells,
-            "faces": 4 * found.faces + 8 * found.cells,
-            "cells": 8 * found.cells,
-            "longest_edge": found.longest_edge / 2**0.5,
-        }
-    )
+    hexahedra = found.cell == "hexahedron"
+    changes = {
+        "vertices": found.vertices + found.edges + (found.faces + found.cells if hexahedra else 0),
+        "edges": 2 * found.edges + (4 * found.faces + 6 * found.cells if hexahedra else 3 * found.faces + found.cells),
+        "faces": 4 * found.faces + (12 if hexahedra else 8) * found.cells,
+        "cells": 8 * found.cells,
+        "longest_edge": found.longest_edge / (2 if hexahedra else 2**0.5),
+    }
+    return found.model_copy(update=changes)
 
 
 def contents(mesh: Loaded, digest: str) -> Contents:

@@ -11,7 +11,7 @@ import ufl
 from numpy.typing import NDArray
 
 from forward.bodies.inclusions import stiffness_factor
-from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
+from forward.fem.dolfinx import assembly, compile, meshes, spaces
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import PressuresAtVertices, VertexField
@@ -70,7 +70,7 @@ class Forms:
         found = meshes.mesh_body(comm, spec.body) if beside is None else (beside.mesh, beside.facets)
         self.mesh: Any = found[0]
         self.facets: dict[str, NDArray[np.int32]] = found[1]
-        self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
+        self.unknowns = spaces.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
         self.size = self.unknowns.size
         self.space = self.unknowns.displacement
         self.layout = Layout(self.space, comm, self.unknowns.pressure)

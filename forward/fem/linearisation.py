@@ -13,7 +13,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unknowns
+from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.items import Items
@@ -104,7 +104,7 @@ class Linearisation(Forms):
         """Return what solves with a matrix, of a form in UFL, at many states."""
         if self.linear == Linear.FACTOR:
             return linear.DirectSolver(matrix)
-        below = unknowns.Unknowns(self.mesh, 1, mixed=False)
+        below = spaces.Unknowns(self.mesh, 1, mixed=False)
         marks, held = self._held(below)
         ours, theirs = (self._variation, ufl.TrialFunction(self.unknowns.whole)), (below.test, below.trial)
         form = self._bilinear(ufl.replace(form, dict(zip(ours, theirs, strict=True))))
@@ -192,7 +192,7 @@ class Linearisation(Forms):
         self._targets = np.zeros(len(self.fixed))
         self._moves = False
 
-    def _held(self, of: unknowns.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
+    def _held(self, of: spaces.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
         """Marks for assembly of prescribed unknowns, and the path that moves each (if any), by node and axis."""
         moved: dict[tuple[int, int], str] = {}
         marks = []

@@ -18,8 +18,7 @@ from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for, signature
 from forward.fem.dolfinx.lanes import Kernel, Numbers
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
-from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_rows
-from forward.fem.dolfinx.unknowns import Unknowns
+from forward.fem.dolfinx.spaces import Unknowns, cell_element, constant, scalar_space, sum_rows
 from forward.model import FloatArray
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from petsc4py import PETSc
 from forward.fem.cost import BYTES_PER_NONZERO, SPARE, Factor
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
-from forward.fem.dolfinx.spaces import owned_nodes
-from forward.fem.dolfinx.unknowns import Unknowns
+from forward.fem.dolfinx.spaces import Unknowns, owned_nodes
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
 from forward.phases import phase
