@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field, replace
 from math import comb
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,12 @@ from forward.settings import Settings, nearest
 
 Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
+T = TypeVar("T", bound=np.generic)
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
 APART = 1e-6, 1e-3  # how far lips of closed slits are drawn apart, over that extent, and at most over the shortest edge
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])  # VTK's
+X_FIRST = [0, 1, 3, 2, 4, 5, 7, 6]  # these, x first, then y, then z
 FACES = {
     "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
     "hexahedron": [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [3, 2, 6, 7], [0, 3, 7, 4], [1, 2, 6, 5]],  # in circles
@@ -282,8 +284,7 @@ def _hexahedra_divided(mesh: Loaded, nearer: FloatArray) -> Loaded:
     on_faces = _at(points, circles[:, [0, 1, 3, 2]], (share(a, b) + share(d, c)) / 2, (share(a, d) + share(b, c)) / 2)
     along = [[(a, b) for a, b in np.ndindex(8, 8) if (CORNERS[b] - CORNERS[a] == unit).all()] for unit in np.eye(3)]
     inside = [np.mean([share(cells[:, p], cells[:, q]) for p, q in pairs], axis=0) for pairs in along]
-    lattice_of_corners = np.argsort(CORNERS @ [1, 2, 4])
-    whole = np.concatenate([points, on_edges, on_faces, _at(points, cells[:, lattice_of_corners], *inside)])
+    whole = np.concatenate([points, on_edges, on_faces, _at(points, cells[:, X_FIRST], *inside)])
 
     numbers = np.empty((len(cells), 3, 3, 3), dtype=np.int64)  # of the 27 points of each cell
     numbers[:, 1, 1, 1] = starts[2] + np.arange(len(cells))
@@ -364,10 +365,14 @@ def contents(mesh: Loaded, digest: str) -> Contents:
     )
 
 
+def fan(corners: NDArray[T]) -> NDArray[T]:
+    """Return the triangles (n (k − 2), 3, …) that facets (n, k, …) are divided into around their first corners."""
+    return np.concatenate([corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)])
+
+
 def area(corners: FloatArray) -> float:
     """Return the area of facets (n, 3 or 4, 3) together."""
-    around = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
-    a, b, c = np.moveaxis(corners[:, around], 2, 0)
+    a, b, c = np.moveaxis(fan(corners), 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
 
 

@@ -34,7 +34,7 @@ from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.layout import sorted_by_place
 from forward.fem.mesh_error_cost import Finer, finer
-from forward.fem.solution import FiniteElementSolution
+from forward.fem.solution import LEAST, MOST, FiniteElementSolution
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, Saturation, SolveError
 from forward.observables.observable import Functional
@@ -43,7 +43,6 @@ LOWEST, HIGHEST = 1.0, 4.0  # orders
 USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
 ORDERS = np.linspace(HIGHEST, LOWEST, 400)
 OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
-LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 THOROUGH = {False: 2e-3, True: 1e-4}  # nonlinearity left where one step is not enough, without pressures and with them
 
 

@@ -20,8 +20,8 @@ from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import Observation
 from forward.model import FloatArray, Guess, ReferenceSolution, Solution, SolveError, Work
 from forward.pointwise import OneByOne
-from forward.solvers.equilibrium import solve, solving
-from forward.solvers.steps import Steps, Task, finish_all
+from forward.solvers.equilibrium import solving
+from forward.solvers.steps import Steps, Task, finish, finish_all
 from forward.solvers.system import Found
 from forward.solvers.way import Way
 
@@ -89,8 +89,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         equations.work = Work()
         equations.set_parameters(parameters)
         with equations.time_limit(self.spec.solver.solve_seconds):
-            zero = np.zeros(equations.size)
-            found = solve(equations, self.spec.solver, zero, guess.state, way, guess.iterations, audit=guess.audit)
+            found = finish(self._steps(guess, way), equations.solve if way is None else way.solve)
             stiffer = 1.0
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)
@@ -113,6 +112,12 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         self.reference.prepare(guess.reference)
         screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
         return Way(self.equations, self.reference, guess.reference, parameters, screen=screen)
+
+    def _steps(self, guess: Guess, way: Way | None) -> Steps[Found]:
+        """Return what finds the equilibrium from a guess, at the parameters that are set."""
+        equations, settings = self.equations, self.spec.solver
+        zero = np.zeros(equations.size)
+        return solving(equations, settings, zero, guess.state, way, guess.iterations, audit=guess.audit)
 
     @cached_property
     def together(self) -> int:
@@ -139,13 +144,11 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
                     yield from super().solve_many(point[None], [guess])
 
     def _solve_together(self, starts: Iterable[tuple[FloatArray, Guess]]) -> Iterator[Solution | SolveError]:
-        equations, zero = self.equations, np.zeros(self.equations.size)
         begun: deque[tuple[FloatArray, Way, Work]] = deque()
 
         def steps(point: FloatArray, guess: Guess, way: Way) -> Steps[Found]:
             self.require_admissible(point)
-            settings, known = self.spec.solver, guess.iterations
-            return (yield from solving(equations, settings, zero, guess.state, way, known, audit=guess.audit))
+            return (yield from self._steps(guess, way))
 
         def tasks() -> Iterator[Task[Found]]:
             for point, guess in starts:
@@ -160,7 +163,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             return self.reference.solve_uncounted(right)
 
         for found in finish_all(tasks(), solve, self.together):
-            equations.linearisation_point.begin()  # the last factor may be that of any of them
+            self.equations.linearisation_point.begin()  # the last factor may be that of any of them
             point, way, work = begun.popleft()
             yield found if isinstance(found, SolveError) else FiniteElementSolution(self, point, found, work, way)
 
@@ -174,5 +177,5 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         while self.enters(found, stiffer):
             stiffer *= STIFFER
             equations.set_parameters(parameters, stiffer)
-            found = solve(equations, self.spec.solver, np.zeros(equations.size), found.state)
+            found = finish(self._steps(Guess(found.state), None), equations.solve)
         return found, stiffer

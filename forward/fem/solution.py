@@ -28,7 +28,7 @@ from forward.solvers.way import Way
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
-LEAST, MOST = 0.5, 3.0  # factors
+LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 # Where finding them takes too much memory: of linear elements, which see most, and of others at edges that are held.
 TYPICAL = {1: 1.1, 2: 1.35}
 RATES = np.geomspace(1e-3, 60.0, 2000)  # β

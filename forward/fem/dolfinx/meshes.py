@@ -11,6 +11,7 @@ from dolfinx import mesh
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
+from forward.bodies.mesh import X_FIRST
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import BYTES_PER_UNKNOWN, SPARE
 from forward.fem.dolfinx import version
@@ -40,8 +41,7 @@ def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int3
     points, cells, boundaries = np.zeros((0, 3)), np.zeros((0, corners), dtype=np.int64), None
     if loaded is not None:
         points, boundaries = loaded.points, loaded.boundaries
-        # From VTK's order of the corners.
-        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, [0, 1, 3, 2, 4, 5, 7, 6]])
+        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, X_FIRST])
     msh = version.mesh_of(comm, body.cell, cells, points)
     boundaries = comm.bcast(boundaries)
     msh.topology.create_entities(2)

@@ -254,9 +254,7 @@ class Transfer:
         from_nodes = version.nodes_of_cells(source, len(here.points))
         to_nodes = version.nodes_of_cells(target, len(there.points))
         owned = owned_nodes(target)
-        every = to_nodes.ravel()
-        first = np.empty(every.max(initial=-1) + 1, dtype=np.int64)
-        first[every[::-1]] = np.arange(len(every))[::-1]  # of several places the first is written last
+        _, first = np.unique(to_nodes, return_index=True)  # of the places of each node
         cells, places = np.divmod(first[:owned], to_nodes.shape[1])
         index_map = source.dofmap.index_map
         columns = from_nodes[cells]
