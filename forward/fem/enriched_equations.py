@@ -128,8 +128,13 @@ class EnrichedEquations:
             self.visit(solution, at)
             found = factor.solve_near(R, right, close, ITERATIONS, transpose=transpose)
         if found is None:
-            self._factorise(solution, at)
-            found = self.equations.back_substitute(right, transpose=transpose)
+            equations, key = self.visit(solution, at), solution if at is None else at
+            if equations.linearisation_point.factorised is not key:
+                if self._alone:
+                    self._reference.release()
+                equations.factorise(self.up(solution.state) if at is None else at)
+                equations.linearisation_point.factorised = equations.linearisation_point.solution = key
+            found = equations.back_substitute(right, transpose=transpose)
         return found
 
     def _solve_by_smoothing(
@@ -195,11 +200,3 @@ class EnrichedEquations:
     @cached_property
     def _reference(self) -> ReferenceFactor:
         return ReferenceFactor(self.equations)
-
-    def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
-        equations, key = self.visit(solution, at), solution if at is None else at
-        if equations.linearisation_point.factorised is not key:
-            if self._alone:
-                self._reference.release()
-            equations.factorise(self.up(solution.state) if at is None else at)
-            equations.linearisation_point.factorised = equations.linearisation_point.solution = key

@@ -159,10 +159,6 @@ class Items:
         """Rows (k, M) of what is kept on every rank; collective."""
         return np.asarray(self._equations.comm.bcast(kept))
 
-    def _here(self, kept: FloatArray) -> FloatArray:
-        """This rank's part (k, M_local) of such rows."""
-        return kept[:, : self.kept_size]
-
     def _by_past(self) -> csr_matrix:
         """Derivative (3n, M) of the forces by what was kept before."""
         each = zip(self._now(), self._counts, self._sizes, strict=True)
@@ -206,7 +202,8 @@ class Items:
         """
         by_state, by_past, by_number = self._derivatives()
         moved = np.array([self._taken(row) for row in states])
-        return self._here(moved @ by_state.T + self._everywhere(before) @ by_past.T + directions @ by_number.T)
+        found: FloatArray = moved @ by_state.T + self._everywhere(before) @ by_past.T + directions @ by_number.T
+        return found[:, : self.kept_size]
 
     def kept_adjoint(self, kept: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the transpose of `kept_along` for weights (k, M_local); collective.
@@ -216,7 +213,7 @@ class Items:
         by_state, by_past, by_number = self._derivatives()
         weights = self._everywhere(kept)
         states = np.array([self._given(row) for row in weights @ by_state])
-        return states, self._here(weights @ by_past), weights @ by_number
+        return states, (weights @ by_past)[:, : self.kept_size], weights @ by_number
 
 
 def _matrix(entries: Entries, rows: int, columns: int) -> csr_matrix:

@@ -344,8 +344,8 @@ class Linearisation(Forms):
     @cached_property
     def _expected_gaps(self) -> list[assembly.FacetValues]:
         """As `_gaps`, where the last step was to lead."""
-        every: list[tuple[Any, Any]] = [(load, at) for _, load, at in self._tools]
-        return [self.on_facets(load.expected_gap(at), load.on, load.degree) for load, at in every]
+        found: list[tuple[Any, Any, Any]] = list(self._tools)
+        return [self.on_facets(load.expected_gap(at), load.on, load.degree) for _, load, at in found]
 
     @cached_property
     def _beyond(self) -> assembly.VectorAssembler:

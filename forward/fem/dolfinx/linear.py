@@ -232,12 +232,12 @@ class DirectSolver:
         self._stiffness.assemble()
         while (status := self._try()) in TOO_LITTLE_ROOM and self._room < MOST_ROOM:
             self._room *= 4
-            self._renew()
+            self.release()
         self._analysed = True
         if status >= 0:
             return
         needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
-        self._renew()  # or else PETSc would report this failure for ever
+        self.release()  # or else PETSc would report this failure for ever
         if status == SINGULAR:
             raise SolveError("the stiffness is singular")
         if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
@@ -267,8 +267,8 @@ class DirectSolver:
             ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
         return ksp
 
-    def _renew(self) -> None:
-        """Start with a new factor, which is analysed again."""
+    def release(self) -> None:
+        """Free the factor; the next one is analysed again."""
         self._ksp.destroy()
         self._ksp = self._new_ksp(self._stiffness.comm)
         self._analysed = False
@@ -296,10 +296,6 @@ class DirectSolver:
         rights.destroy()
         solutions.destroy()
         return result
-
-    def release(self) -> None:
-        """Free the factor."""
-        self._renew()
 
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues; None for LU."""

@@ -43,6 +43,7 @@ class MultigridSolver:
         self._fixed, self._coarse_fixed = fixed, coarse_fixed
         self._in, self._out = stiffness.matrix.createVecs()
         self._levels: Levels | None = None
+        self._total = partial(ranks.total, stiffness.comm)
 
     def factorise(self) -> None:
         """Assemble both stiffnesses, and factorise the coarse one; errors as of `LinearSolver`.
@@ -71,9 +72,6 @@ class MultigridSolver:
         forces = random.standard_normal(self._stiffness.unknowns.size)
         forces[self._fixed] = 0
         return forces
-
-    def _total(self, values: FloatArray) -> FloatArray:
-        return ranks.total(self._stiffness.comm, values)
 
     def _multiply(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
         K = self._stiffness.matrix
