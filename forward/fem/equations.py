@@ -70,8 +70,7 @@ class Discretisation(Sensitivities):
         for i in self.scalars:  # the other numbers stay
             if (constant := self.constants.get(self.parameters[i])) is not None:
                 constant.value = parameters[i]
-        if self.movers:
-            self._full_targets = np.zeros(len(self.fixed))
+        self._full_targets = np.zeros(len(self.fixed))
         for path, mover in self.movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self.movers)

@@ -174,9 +174,7 @@ def minimised(
     directions, images = (np.empty((iterations, len(right))) for _ in range(2))
     triangle, parts = np.zeros((iterations, iterations)), np.zeros(iterations)  # of QR of the images, Qᵀb
     size = np.sqrt(total(np.array([r @ r]))[0])
-    if size == 0:
-        return np.zeros_like(right), np.array(right), True
-    found, k = False, 0
+    found, k = bool(size == 0), 0
     while k < iterations and not found:
         directions[k] = precondition(r / weights)
         image = weights * multiply(directions[k])
