@@ -22,9 +22,9 @@ from inverse.criticism.assumptions import Assumption, by_evaluation
 from inverse.data.measurements import Measurements
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
-from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs

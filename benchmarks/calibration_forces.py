@@ -19,9 +19,9 @@ from benchmarks.beams import CONFIG
 from forward.fem.finer import extrapolated
 from forward.model import FloatArray
 from inverse.data.measurements import Measurements
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
-from inverse.methods.record import Problem
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs

@@ -20,8 +20,8 @@ import numpy as np
 from mpi4py import MPI
 
 from inverse.criticism.assessment import quantiles
+from inverse.methods.infer import Problem
 from inverse.methods.invert_few import invert_few
-from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import parse

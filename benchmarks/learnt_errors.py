@@ -14,9 +14,11 @@ from mpi4py import MPI
 from forward.model import WORK, FloatArray, SolveError
 from forward.specimen import Specimen
 from inverse.criticism.assessment import answer
+from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.infer import infer
+from inverse.methods.infer import Problem, infer
+from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
 from inverse.methods.shared_expansion import shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
@@ -95,7 +97,9 @@ def expanded(strains: str, solves: int) -> AtOnce:
 def inverted(own: AtOnce, truth: Truth | None, data: FloatArray, sigma: FloatArray, seed: int) -> Any:
     """Invert data for the four unknowns."""
     posterior = Posterior(INPUTS, own, data, Noise(sigma))
-    return infer(posterior, lambda point: None, 256, starts=2, seed=seed, truth=truth)
+    given = Measurements.of(data, sigma, [0] * len(data), range(len(data)))
+    method = Invert(samples=256, starts=2, seed=seed)
+    return infer(posterior, Problem(given, method, finer=None, start=lambda point: None, truth=truth))
 
 
 # Of linear models with Gaussian errors: data, unknowns, patterns of the errors, size of the first over the noise, what

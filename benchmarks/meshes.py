@@ -31,10 +31,10 @@ from inverse.criticism.doubts import of_mesh
 from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.mesh_correction import Treatment, error_of
-from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -343,9 +343,8 @@ def inverted(
     inputs, model, finer = case
     data = measured(model, clean, noise, seed)
     start = partial(Nearby.at, model, spread=inputs.std)
-    found = invert_few(
-        inputs, SerialEvaluate(model), Problem(data, method, finer=finer), start=start, model=model
-    ).dataset
+    problem = Problem(data, method, finer=finer, start=start, model=model)
+    found = invert_few(inputs, SerialEvaluate(model), problem).dataset
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),

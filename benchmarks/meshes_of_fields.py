@@ -42,10 +42,10 @@ from inverse.criticism.finer import Finer
 from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
 from inverse.fields.field_posterior import FieldPosterior
+from inverse.methods.infer import Problem as Asked
 from inverse.methods.invert import Invert
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.mesh_correction import along, error_of
-from inverse.methods.record import Problem as Asked
 from uq.evaluation.evaluate import SerialEvaluate
 
 if TYPE_CHECKING:

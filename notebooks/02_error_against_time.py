@@ -14,7 +14,7 @@
 # # Error against time
 #
 # How large is the true error of a method, and what does it cost? `compare` runs methods with increasing numbers
-# of samples, each several times, against a reference. Here with the coarse beam, or from the directory in
+# of samples, each several times, against a reference. This notebook uses the coarse beam, or the directory in
 # `TISSUQ_COMPARISON`, such as `results/beam-compare`.
 
 # %%
@@ -64,8 +64,8 @@ tissuq.plots.errors(data, output, "mean", "cpu_seconds").figure
 # ## Are claimed errors honest?
 #
 # A method claims a standard error with each estimate. Over the repeats, the claims (`mean_claimed`) should be
-# about as large as the true errors (`mean_rmse`). With three repeats both are known only to 40 %: take more
-# repeats to know better.
+# about as large as the true errors (`mean_rmse`). With three repeats both are known only to 40 %; more repeats tell
+# more.
 
 # %%
 one = data.sel(output=output)
@@ -75,8 +75,7 @@ table.drop(columns=["output", "unit"], errors="ignore")
 # %% [markdown]
 # ## The gain of a method
 #
-# Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number over the solves of the
-# method.
+# Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number divided by the method's solves.
 
 # %%
 worth = gains(one, "mean")["solves"].values

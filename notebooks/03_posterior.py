@@ -18,8 +18,8 @@
 # `TISSUQ_INVERSION=results/stiffness-field` shows the full one.
 #
 # The error of such a coarse mesh is larger than that of the data. The full study finds and corrects it by solves on
-# finer meshes, which take minutes; they are left out here (`method.mesh_error`). So the size of the errors is inferred
-# too, by `method.noise`; the findings below, which are also at the top of the report, say whether that was enough.
+# finer meshes, which take minutes and are left out here (`method.mesh_error`). Instead, the size of the errors is
+# inferred by `method.noise`; the findings below, which are also at the top of the report, say whether that was enough.
 
 # %%
 # %matplotlib inline
@@ -54,8 +54,8 @@ tissuq.plots.inversion.slices(one, cut).figure
 # %% [markdown]
 # ## How much is from the data: the spectrum
 #
-# λ compares the data with the prior, direction by direction. Above 1 the data say more; below, the picture shows
-# the prior. The posterior width of a direction is that of the prior over √(1 + λ).
+# λ compares the data with the prior, direction by direction. Above 1, the data say more; below, the picture shows the
+# prior. The posterior width of a direction is that of the prior divided by √(1 + λ).
 
 # %%
 tissuq.plots.inversion.spectrum(one).figure
@@ -69,8 +69,8 @@ print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all:
 # %% [markdown]
 # ## Which directions
 #
-# The data determine the first ones best, and the last ones hardly: fine variations, and those far from the faces
-# that were measured.
+# The data determine the first ones best, and the last ones hardly: fine variations, and those far from the measured
+# faces.
 
 # %%
 tissuq.plots.inversion.direction_slices(one, cut).figure
@@ -101,11 +101,11 @@ ax.figure
 # %% [markdown]
 # ## Does the model explain the data?
 #
-# |r|² of each load case beside its expected value: a bar far above its mark means that the mesh, the material or
-# the stated errors are wrong. The coarse mesh fails here although the size of the errors was inferred: its error is
-# larger in one load case than in another, and smooth, so that residuals of neighbours agree. The full study, on 12³
-# cells and with the errors as stated, passes: probability 0.26 of larger residuals, 0.08 of neighbours that agree
-# more. Do not interpret a posterior that has not passed this test.
+# |r|² of each load case beside its expected value: a bar far above its mark means that the mesh, the material or the
+# stated errors are wrong. The coarse mesh fails here although the size of the errors was inferred: its error is larger
+# in one load case than in another, and smooth, so residuals of neighbours agree. The full study, on 12³ cells and with
+# the errors as stated, passes: probability 0.26 of larger residuals, 0.08 of neighbours that agree more. Do not
+# interpret a posterior that has not passed this test.
 
 # %%
 tissuq.plots.inversion.misfits(one).figure

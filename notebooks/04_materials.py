@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Comparing materials
 #
-# Treloar stretched rubber in three ways. Which law do his tests support? Here are three candidates with few
+# Treloar stretched rubber in three ways. Which law do his tests support? This notebook has three candidates and few
 # solves; `configs/treloar.toml` has five, and `TISSUQ_SELECTION=results/treloar` shows that study.
 
 # %%
@@ -67,7 +67,7 @@ print(*findings(data), sep="\n")
 # %% [markdown]
 # ## Evidence
 #
-# ln Z of each model minus the largest, with three standard errors. First of all: can all of them be trusted?
+# ln Z of each model minus the largest, with three standard errors. First: can all of them be trusted?
 
 # %%
 data["trusted"].to_pandas()

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Your own forward model in 15 lines
 #
-# Everything that maps numbers to numbers is a model: a formula, a table, another program. Here the tip deflection
-# of a slender beam.
+# Everything that maps numbers to numbers is a model: a formula, a table, another program. Here: the tip deflection of
+# a slender beam.
 
 # %%
 # %matplotlib inline
@@ -77,8 +77,8 @@ print(f"{'exact':18} {L4 / (8 * 0.02 * 0.01**3 / 12) * 1.01 / 1e6:.6e} m")
 # %% [markdown]
 # ## As a study
 #
-# The same function as the model of a study: that adds findings, reports and all methods. In a module of its own, which
-# a study names as `function = "own_beam.deflection"`, it runs by `tissuq run` too, on many processors, and can be
+# The same function can be the model of a study, which adds findings, reports and all methods. In its own module, which
+# a study names as `function = "own_beam.deflection"`, it also runs with `tissuq run`, on many processors, and can be
 # interrupted and continued.
 
 # %%

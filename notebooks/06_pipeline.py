@@ -13,9 +13,9 @@
 # %% [markdown]
 # # From tests of a tissue to a prediction, and to the next test
 #
-# The pipeline of `docs/how-to/pipeline.md`, small: which law do tests of the brain support, what are its regions
-# like as a population, how does a body of that tissue deform, and which test of a new region would tell most? Each
-# study takes what the one before has left.
+# A small version of `docs/how-to/pipeline.md`: which law do tests of the brain support, what are its regions like as a
+# population, how does a body of that tissue deform, and which test of a new region would tell most? Each study uses
+# what the one before has left.
 
 # %%
 # %matplotlib inline
@@ -36,7 +36,7 @@ def done(name, *changes):
 # %% [markdown]
 # ## Which law, with which constants
 #
-# Few solves, and without the variants of the study.
+# Few solves, without the variants of the full study.
 
 # %%
 brain = done("brain", "method.samples=32", "method.starts=1", "method.other_noises={}", "method.subsets={}")
@@ -55,8 +55,8 @@ population["new_quantiles"].to_pandas().round(1)
 # %% [markdown]
 # ## A body of that tissue
 #
-# A block of cortex under its own weight, with every candidate that is not improbable.
-# `configs/next/organ-brain.toml` does this with an organ.
+# A block of cortex under its own weight, with every candidate that is not improbable. `configs/next/organ-brain.toml`
+# does this with an organ.
 
 # %%
 body = done(

@@ -16,10 +16,9 @@ Probabilities, averages and residual tests share this file because all come from
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
-from inverse.criticism.assumptions import Assumptions, Moves
+from inverse.criticism.assumptions import Assumption, Assumptions, Moves
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.stacking import stacking
 from inverse.criticism.verdict import Verdict, verdict_on_points
@@ -185,16 +184,15 @@ def comparison(
     whole = {pair: one.assessment.log_evidence for pair, one in found.items()}
     weights = np.array([candidate.weight for candidate in candidates.values()])
 
-    def table(values: Mapping[Pair, Any]) -> Any:
-        return (("model", "group"), np.array([[values[name, group] for group in groups] for name in names]))
-
-    def each(value: Callable[[Compared], Any]) -> Any:
-        return table({pair: value(one) for pair, one in found.items()})
-
     def totals(values: Mapping[Pair, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
         parts = [[values[name, group] for group in groups if (name, group) in values] for name in names]
         sums = np.array([sum(value for value, _ in part) for part in parts])
         return sums, np.array([np.sqrt(sum(error**2 for _, error in part)) for part in parts])
+
+    def joined(of: Callable[[Compared], xr.Dataset], dim: str) -> xr.Dataset:
+        """Put together what is known of each candidate for each group; NaN of what one of them does not have."""
+        whole = xr.concat([xr.concat([of(found[name, group]) for group in groups], dim) for name in names], "model")
+        return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
 
     sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)
     chances = np.array([probabilities(total, weights) for total in sums])
@@ -215,19 +213,6 @@ def comparison(
         "variant_log_evidence": (("variant", "model"), np.array(sums)),
         "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
         "variant_probability": (("variant", "model"), chances),
-        "group_log_evidence": each(lambda one: one.assessment.log_evidence[0]),
-        "group_log_evidence_error": each(lambda one: one.assessment.log_evidence[1]),
-        "laplace_log_evidence": each(lambda one: one.assessment.gaussian.log_evidence),
-        "converged": each(lambda one: one.assessment.gaussian.converged),
-        "route": each(lambda one: one.assessment.evidence.route),
-        "why": each(lambda one: one.assessment.evidence.why),
-        "effective": each(lambda one: one.assessment.evidence.ess),
-        "tail": each(lambda one: one.assessment.evidence.pareto_k),
-        "trusted": each(lambda one: one.assessment.known),
-        "trust": each(lambda one: one.verdict.trust),
-        "verdict": each(lambda one: one.verdict.why),
-        "misfit_probability": each(lambda one: one.critic.misfit),
-        "correlation_probability": each(lambda one: one.critic.correlation),
         "score": ("model", scores.sum(axis=1)),
         "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
         "score_behind": ("model", behind.sum(axis=1)),
@@ -243,32 +228,64 @@ def comparison(
     }
     for k, end in enumerate(("", "_error")):
         if checks:
-            variables[f"nested_log_evidence{end}"] = table({pair: pairs[k] for pair, pairs in checks.items()})
+            nested = [[checks[name, group][k] for group in groups] for name in names]
+            variables[f"nested_log_evidence{end}"] = (("model", "group"), nested)
         if left_out:
             pairs = [(totals({pair: whole[pair] for pair in rest})[k], totals(rest)[k]) for rest in left_out.values()]
             rows = [np.hypot(ours, without) if k else ours - without for ours, without in pairs]
             variables[f"held_out_score{end}"] = (("left_out", "model"), np.array(rows))
-    columns = [_predictions(group, [found[name, group] for name in names], P) for group in groups]
-    for name, (dims, _) in columns[0].items():
-        variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
     parameters = list(dict.fromkeys(p for one in found.values() for p in one.posterior.names))
-    variables |= _by_point(names, groups, parameters, found)
-    variables |= _constants(names, groups, parameters, found)
-    chains = {pair: one.assessment.chains for pair, one in found.items()}
-    if any(one is not None for one in chains.values()):
-        variables["chains"] = table({k: 0 if one is None else len(one.draws) * one.mixed for k, one in chains.items()})
-        variables["chain_rhat"] = table({k: np.nan if one is None else one.rhat.max() for k, one in chains.items()})
-        variables["chain_effective"] = table({k: np.nan if one is None else one.ess for k, one in chains.items()})
-    if all(one.mesh is not None for one in found.values()):
-        variables |= _meshes(names, data_groups, parameters, found)
-    held = list(dict.fromkeys(taken.name for one in found.values() if one.assumed for taken in one.assumed[0].shown[0]))
-    bends = list(dict.fromkeys(name for one in found.values() if one.assumed for name in one.assumed[0].groups))
+    taken = [one.assumed[0] for one in found.values() if one.assumed]
+    held = {one.name: one.unit for several in taken for one in several.shown[0]}
+    bends = list(dict.fromkeys(name for one in taken for name in one.groups))
+    of_groups = joined(_of_group, "group").reindex(parameter=parameters, assumption=list(held), uncertain=bends)
+    of_groups["point_weight"] = of_groups["point_weight"].fillna(0.0)
     if held:
-        variables |= _assumptions(names, groups, parameters, held, bends, found)
+        # A candidate takes the same for granted in all groups.
+        alike = {f"assumption_{name}": of_groups[f"assumption_{name}"].max("group") for name in ("size", "part")}
+        of_groups = of_groups.assign(alike | {"assumption_unit": ("assumption", list(held.values()))})
+    else:
+        of_groups = of_groups.drop_dims(["assumption", "uncertain"])
+    if not any(one.assessment.chains for one in found.values()):
+        of_groups = of_groups.drop_vars(["chains", "chain_rhat", "chain_effective"])
+    of_outputs = joined(_of_outputs, "output")
+    mean, std = of_outputs["prediction_mean"].to_numpy(), of_outputs["prediction_std"].to_numpy()
+    average = P @ mean
+    variables |= {
+        "output_group": ("output", np.repeat(groups, [len(data) for data in data_groups.values()])),
+        **{
+            name: ("output", np.concatenate(several))
+            for name, several in _of_data(data_groups, of_model[names[0]]).items()
+        },
+        "average_mean": ("output", average),
+        "average_within": ("output", P @ std**2),
+        "average_between": ("output", P @ (mean - average) ** 2),
+    }
+    for part in (of_groups, of_outputs):
+        variables |= {str(name): (one.dims, one.to_numpy()) for name, one in part.data_vars.items()}
+    variables["point"] = variables.pop("point_values")  # xarray renames nothing to the name of a dimension
     coordinates = {"model": names, "group": groups, "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
-    coordinates |= {"assumption": held, "uncertain": bends} if held else {}
+    coordinates |= {"assumption": list(held), "uncertain": bends} if held else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
+
+
+def _of_data(data_groups: Mapping[str, Measurements], found: Sequence[Compared]) -> dict[str, list[Any]]:
+    """What was measured, and where, of each group; of what is only predicted the errors are NaN."""
+    several = list(data_groups.values())
+    sigma = [one.posterior.noise.sigma for one in found]
+    return {
+        "output_test": [one.tests for one in several],
+        "output_at": [one.positions for one in several],
+        "measured": [one.values for one in several],
+        "sigma": [_beyond(one, len(data)) for one, data in zip(sigma, several, strict=True)],
+    }
+
+
+def _beyond(values: FloatArray, count: int) -> FloatArray:
+    """Return values (m, …) with NaN behind them, up to so many."""
+    more = [(0, count - len(values)), *((0, 0) for _ in values.shape[1:])]
+    return np.pad(values, more, constant_values=np.nan)
 
 
 def probabilities(log_evidence: FloatArray, weights: FloatArray) -> FloatArray:
@@ -283,142 +300,85 @@ def _chance_errors(P: FloatArray, errors: FloatArray) -> FloatArray:
     return np.sqrt((slopes**2) @ errors**2)
 
 
-def _predictions(group: str, models: Sequence[Compared], P: FloatArray) -> dict[str, Any]:
-    """Outputs of one group without noise, by each model and by all, beside the data."""
-    data = models[0].data
-    m, M = len(data.seen()), len(data)
-    mean, std = np.empty((2, len(models), M))
-    bands = np.empty((len(QUANTILES), len(models), M))
-    for k, found in enumerate(one.points for one in models):
-        used = found.weights > 0
-        w, outputs = found.weights[used], found.everything[used].copy()
-        outputs[:, :m] = found.outputs[used]  # corrected for the mesh, where that was done
-        mean[k] = w @ outputs
-        std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
-        bands[:, k] = np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T
-    average = P @ mean
-    return {
-        "output_group": ("output", np.full(M, group)),
-        "output_test": ("output", data.tests),
-        "output_at": ("output", data.positions),
-        "measured": ("output", data.values),
-        "sigma": ("output", np.concatenate([models[0].posterior.noise.sigma, np.full(M - m, np.nan)])),
-        "prediction_mean": (("model", "output"), mean),
-        "prediction_std": (("model", "output"), std),
-        "prediction_quantiles": (("quantile", "model", "output"), bands),
-        "average_mean": ("output", average),
-        "average_within": ("output", P @ std**2),
-        "average_between": ("output", P @ (mean - average) ** 2),
+def _of_outputs(one: Compared) -> xr.Dataset:
+    """Outputs of a candidate for a group without noise, ln of the density of each datum, and the error of the mesh."""
+    import xarray as xr
+
+    found, m, M = one.points, len(one.data.seen()), len(one.data)
+    used = found.weights > 0
+    w, outputs = found.weights[used], found.everything[used].copy()
+    outputs[:, :m] = found.outputs[used]  # corrected for the mesh, where that was done
+    mean = w @ outputs
+    known: dict[str, Any] = {
+        "prediction_mean": ("output", mean),
+        "prediction_std": ("output", np.sqrt(w @ (outputs - mean) ** 2)),
+        "prediction_quantiles": (
+            ("quantile", "output"),
+            np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T,
+        ),
+        "point_log_likelihood": (("point", "output"), _beyond(one.critic.pointwise.T, M).T),
     }
+    if one.mesh is not None:
+        known["mesh_error"] = ("output", _beyond(one.mesh.error, M))
+    return xr.Dataset(known, {"point": np.arange(len(found.weights))})
 
 
-Cells = Iterator[tuple[tuple[int, int], Compared, list[int]]]
+def _of_group(one: Compared) -> xr.Dataset:
+    """Return what is known of a candidate for a group of data.
 
+    That is its evidence, its constants, its points, what a finer mesh adds to ln Z and to unknowns, and how far what is
+    taken for granted moves both; unknowns are moved in their deviations.
+    """
+    import xarray as xr
 
-def _cells(names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]) -> Cells:
-    """Go through models and groups: their numbers, what was found, and the columns of its parameters."""
-    for (k, name), (g, group) in product(enumerate(names), enumerate(groups)):
-        one = found[name, group]
-        yield (k, g), one, [parameters.index(p) for p in one.posterior.names]
-
-
-def _constants(
-    names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]
-) -> dict[str, Any]:
-    """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
-    shape, dims = (len(names), len(groups), len(parameters)), ("model", "group", "parameter")
-    mode, mean, std, far = np.full((4, *shape), np.nan)
-    bands = np.full((len(QUANTILES), *shape), np.nan)
-    for (k, g), one, columns in _cells(names, groups, parameters, found):
-        known = answer(one.posterior, one.assessment)
-        mode[k, g, columns] = one.posterior.physical(one.assessment.gaussian.mode[None, :])[0]
-        mean[k, g, columns], std[k, g, columns], far[k, g, columns] = known.mean, known.std, known.outermost
-        bands[:, k, g, columns] = known.quantiles(QUANTILES).T
-    return {
-        "constant_mode": (dims, mode),
-        "constant_mean": (dims, mean),
-        "constant_std": (dims, std),
-        "constant_outermost": (dims, far),
-        "constant_quantiles": (("quantile", *dims), bands),
+    posterior, assessment, mesh, by = one.posterior, one.assessment, one.mesh, "parameter"
+    gaussian, evidence, chains = assessment.gaussian, assessment.evidence, assessment.chains
+    known, d, c = answer(posterior, assessment), len(posterior.inputs.names), len(posterior.names)
+    found: dict[str, Any] = {
+        "group_log_evidence": assessment.log_evidence[0],
+        "group_log_evidence_error": assessment.log_evidence[1],
+        "laplace_log_evidence": gaussian.log_evidence,
+        "converged": gaussian.converged,
+        "route": evidence.route,
+        "why": evidence.why,
+        "effective": evidence.ess,
+        "tail": evidence.pareto_k,
+        "trusted": assessment.known,
+        "trust": one.verdict.trust,
+        "verdict": one.verdict.why,
+        "misfit_probability": one.critic.misfit,
+        "correlation_probability": one.critic.correlation,
+        "constant_mode": (by, posterior.physical(gaussian.mode[None, :])[0]),
+        "constant_mean": (by, known.mean),
+        "constant_std": (by, known.std),
+        "constant_outermost": (by, known.outermost),
+        "constant_quantiles": (("quantile", by), known.quantiles(QUANTILES).T),
+        "point_values": (("point", by), one.points.values),
+        "point_weight": ("point", one.points.weights),
+        "chains": 0 if chains is None else len(chains.draws) * chains.mixed,
+        "chain_rhat": np.nan if chains is None else chains.rhat.max(),
+        "chain_effective": np.nan if chains is None else chains.ess,
     }
-
-
-def _by_point(
-    names: list[str], groups: list[str], parameters: list[str], found: Mapping[Pair, Compared]
-) -> dict[str, Any]:
-    """Points with their weights, and ln of the density of every datum at each; NaN where nothing was measured."""
-    count = max(one.points.weights.size for one in found.values())
-    ends = np.cumsum([0, *(len(found[names[0], group].data) for group in groups)])
-    logs = np.full((len(names), count, ends[-1]), np.nan)
-    places = np.full((len(names), len(groups), count, len(parameters)), np.nan)
-    shares = np.zeros(places.shape[:3])
-    for (k, g), one, columns in _cells(names, groups, parameters, found):
-        n, m = one.critic.pointwise.shape
-        logs[k, :n, ends[g] : ends[g] + m] = one.critic.pointwise
-        places[k, g, :n, columns] = one.points.values.T
-        shares[k, g, :n] = one.points.weights
-    return {
-        "point_log_likelihood": (("model", "point", "output"), logs),
-        "point": (("model", "group", "point", "parameter"), places),
-        "point_weight": (("model", "group", "point"), shares),
-    }
-
-
-def _meshes(
-    names: list[str], data_groups: Mapping[str, Measurements], parameters: list[str], found: Mapping[Pair, Compared]
-) -> dict[str, Any]:
-    """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations."""
-    shape, dims = (len(names), len(data_groups)), ("model", "group")
-    whys, added, fixed = np.full(shape, "", dtype=object), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
-    shift, left = np.full((2, *shape, len(parameters)), np.nan)
-    errors = [np.full((len(names), len(data)), np.nan) for data in data_groups.values()]
-    for (k, g), one, columns in _cells(names, list(data_groups), parameters, found):
-        mesh, d = one.mesh, len(one.posterior.inputs.names)
-        assert mesh is not None
-        whys[k, g], added[k, g], fixed[k, g] = mesh.why, mesh.log_evidence, mesh.corrected and mesh.settled
-        errors[g][k, : len(mesh.error)] = mesh.error
-        shift[k, g, columns[:d]], left[k, g, columns[:d]] = mesh.shift, mesh.left
-    return {
-        "mesh_checked": (dims, whys == ""),
-        "mesh_why": (dims, whys.astype(str)),
-        "mesh_corrected": (dims, fixed),
-        "mesh_log_evidence": (dims, added),
-        "mesh_error": (("model", "output"), np.concatenate(errors, axis=1)),
-        "mesh_shift": ((*dims, "parameter"), shift),
-        "mesh_left": ((*dims, "parameter"), left),
-    }
-
-
-def _assumptions(
-    names: list[str],
-    groups: list[str],
-    parameters: list[str],
-    held: list[str],
-    uncertain: list[str],
-    found: Mapping[Pair, Compared],
-) -> dict[str, Any]:
-    """How far what is taken for granted moves the constants, in their deviations, and ln Z; NaN where it is not."""
-    shape, dims = (len(names), len(groups), len(held)), ("model", "group", "assumption")
-    shift, added = np.full((*shape, len(parameters)), np.nan), np.full(shape, np.nan)
-    bend = np.full((*shape[:2], len(uncertain), len(parameters)), np.nan)
-    size, part = np.full((2, len(names), len(held)), np.nan)
-    unit: dict[str, str] = {}
-    for (k, g), one, columns in _cells(names, groups, parameters, found):
-        if one.assumed is None:
-            continue
+    if mesh is not None:
+        found |= {
+            "mesh_checked": not mesh.why,
+            "mesh_why": mesh.why,
+            "mesh_corrected": mesh.corrected and mesh.settled,
+            "mesh_log_evidence": mesh.log_evidence,
+            "mesh_shift": (by, _beyond(mesh.shift, c)),
+            "mesh_left": (by, _beyond(mesh.left, c)),
+        }
+    shown, groups, moves = list[Assumption](), list[str](), Moves(np.zeros((0, d)), np.zeros(0), np.zeros((0, d)))
+    if one.assumed is not None:
         taken, moves = one.assumed
-        rows, mine = [held.index(each.name) for each in taken.shown[0]], columns[: len(one.posterior.inputs.names)]
-        std = answer(one.posterior, one.assessment).std[: len(mine)]
-        shift[k, g][np.ix_(rows, mine)] = moves.parameters / std
-        bend[k, g][np.ix_([uncertain.index(name) for name in taken.groups], mine)] = moves.bends / std
-        added[k, g, rows] = moves.log_evidence
-        size[k, rows], part[k, rows] = [each.size for each in taken.shown[0]], [each.part for each in taken.shown[0]]
-        unit |= {each.name: each.unit for each in taken.shown[0]}
-    return {
-        "assumption_shift": ((*dims, "parameter"), shift),
-        "assumption_bend": (("model", "group", "uncertain", "parameter"), bend),
-        "assumption_log_evidence": (dims, added),
-        "assumption_size": (("model", "assumption"), size),
-        "assumption_part": (("model", "assumption"), part),
-        "assumption_unit": ("assumption", [unit[name] for name in held]),
+        shown, groups = taken.shown[0], list(taken.groups)
+    over = known.std[:d]
+    found |= {
+        "assumption_shift": (("assumption", by), _beyond((moves.parameters / over).T, c).T),
+        "assumption_bend": (("uncertain", by), _beyond((moves.bends / over).T, c).T),
+        "assumption_log_evidence": ("assumption", moves.log_evidence),
+        "assumption_size": ("assumption", [each.size for each in shown]),
+        "assumption_part": ("assumption", [each.part for each in shown]),
     }
+    names = {by: list(posterior.names), "assumption": [each.name for each in shown], "uncertain": groups}
+    return xr.Dataset(found, {**names, "point": np.arange(len(one.points.weights))})

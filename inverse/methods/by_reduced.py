@@ -19,9 +19,10 @@ from inverse.criticism.doubts import SAME
 from inverse.criticism.weights import effective_sample_size, normalised, resampled
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Inverted, invert_few
-from inverse.methods.record import Problem
+from inverse.methods.record import noise_of
 from uq.evaluation.evaluate import OfEvaluate, Recorder, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
@@ -103,7 +104,9 @@ class Agreement:
         return cls(effective_sample_size(w) / n, shift, log_ratio, float(n * w.std(ddof=1) / np.sqrt(n)))
 
 
-def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel, problem: Problem) -> xr.Dataset:
+def invert_by_reduced(
+    inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel, problem: Problem[Invert]
+) -> xr.Dataset:
     """Invert a data set with a reduced model of a body, which has the same parameters and outputs.
 
     Raises
@@ -116,7 +119,7 @@ def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel,
     full, cheap = Recorder(evaluate), Recorder(SerialEvaluate(reduced))
     centre, corrected = _corrected(inputs, full, cheap, problem)
     for number in range(1, ROUNDS + 1):
-        found = invert_few(inputs, corrected, problem, start=lambda _: None)
+        found = invert_few(inputs, corrected, replace(problem, start=lambda _: None, model=None))
         checked, points, left = _checked(found, full, centre, corrected, method)
         share = f"weights worth {100 * checked.share:.0f} % of {method.reduced.solves} draws"
         problem.say(f"posterior by the reduced model against full solves: {share}")
@@ -135,10 +138,12 @@ def invert_by_reduced(inputs: Inputs, evaluate: Evaluate, reduced: ForwardModel,
     )
 
 
-def _corrected(inputs: Inputs, full: Evaluate, cheap: Evaluate, problem: Problem) -> tuple[Linearisation, Corrected]:
+def _corrected(
+    inputs: Inputs, full: Evaluate, cheap: Evaluate, problem: Problem[Invert]
+) -> tuple[Linearisation, Corrected]:
     """Search with the reduced model as it is, and solve the body where that ends."""
     data, method = problem.data, problem.method
-    posterior = Posterior(inputs, cheap, data.values, problem.noise, data.which)
+    posterior = Posterior(inputs, cheap, data.values, noise_of(problem), data.which)
     gaussian = laplace(posterior, starts=method.starts, seed=method.seed, exact=False)
     point = posterior.physical(gaussian.mode[None])[0, : len(inputs.names)]
     own = cheap(Request(point[None], tangents=True))

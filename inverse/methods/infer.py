@@ -7,17 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.settings import Settings
 from inverse.criticism.assessment import Assessment, Kind, When, assess
 from inverse.criticism.assumptions import BENT, Assumptions, Moves, moved_by
-from inverse.criticism.finer import Finer, MeshFound
+from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
+from inverse.criticism.questions import Questions
 from inverse.data.measurements import Measurements
+from inverse.data.noise import NORMAL, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
@@ -36,16 +40,30 @@ ROUNDS, SETTLED = 4, 0.5
 Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what predicts states near there; None if nothing
 
 
-@dataclass(frozen=True, eq=False)
-class Looked:
-    """How the error of the mesh is looked at: on finer meshes, of which data, and what is done about it.
+class Inference(Settings):
+    """What methods that infer have in common; each says what it is there."""
 
-    Without a treatment it is not looked at before the search, and only reported.
-    """
+    starts: Annotated[int, Field(ge=1)] = 4
+    seed: Annotated[int, Field(ge=0)] = 0
+    chains: Kind | None = None
+    chains_when: When = "always"
+    mesh_error: Treatment | Literal[False] = "correct"
+    mesh_check: bool = True
+    assumptions: bool = True
 
-    finer: Finer
-    data: Measurements
-    treatment: Treatment | None
+    def solves(self, size: int, *, field: bool) -> int:
+        """Number of solves for a data set with `size` unknown parameters that correct the Gaussian."""
+        raise NotImplementedError
+
+    @property
+    def treatment(self) -> Treatment | None:
+        """What is done about the error of the mesh; None where it is not asked for."""
+        return (self.mesh_error or None) if self.mesh_check else None
+
+    @property
+    def unchecked(self) -> str:
+        """Why the mesh is not looked at, where it is not."""
+        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +81,53 @@ class Sampled:
     names: tuple[str, ...]
     model: ForwardModel
     evaluate: Evaluate
+
+
+M = TypeVar("M", bound=Inference)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(Generic[M]):
+    """A data set, and how it is inverted.
+
+    Attributes
+    ----------
+    data, method, errors
+        What was measured, the method, and the distribution of the errors.
+    finer
+        The model on finer meshes; None where it has no mesh.
+    shared
+        What errors the data share, at parameters (d,) or values of a field (N,); None if they are independent.
+    start
+        Makes what predicts states from a solution at parameters (d,), at the mean and at the mode; by default tangents.
+    model
+        The model itself, whose gradients chains by "hmc" follow.
+    say
+        Shows the user a line before the search.
+    steps
+        What keeps what is found of few parameters; by default it is found again after an interruption.
+    assumed, sampled
+        What is taken for granted, None if it is not looked at; and what samples those of it that are uncertain, where
+        first order is not enough, None where nothing can be.
+    questions
+        What the body does not have, to be asked about; None if nothing is asked.
+    truth
+        What the errors of the model are learnt from; None where they are not, and always with finer meshes.
+    """
+
+    data: Measurements
+    method: M
+    errors: NormalErrors | StudentErrors = NORMAL
+    finer: Finer | None = NOT_LOOKED
+    shared: Shared | None = None
+    start: Starts | None = None
+    model: ForwardModel | None = None
+    say: Callable[[str], None] = field(default=lambda line: None)
+    steps: Steps = ALL_AGAIN
+    assumed: Assumptions | None = None
+    sampled: Sampled | None = None
+    questions: Questions | None = None
+    truth: Truth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,57 +186,24 @@ class Inferred:
         return self.found.posterior
 
 
-def infer(
-    posterior: Posterior,
-    start: Starts,
-    samples: int,
-    *,
-    starts: int,
-    seed: int,
-    look: Looked | None = None,
-    shared: Shared | None = None,
-    unexplained: Measurements | None = None,
-    truth: Truth | None = None,
-    chains: Kind | None = None,
-    when: When = "always",
-    model: ForwardModel | None = None,
-    assumed: Assumptions | None = None,
-    sampled: Sampled | None = None,
-    say: Callable[[str], None] = lambda line: None,
-    steps: Steps = ALL_AGAIN,
-) -> Inferred:
+def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
     """Find the mode of a posterior, and what stands for it around there.
 
-    Parameters
-    ----------
-    posterior
-        Of a model and data. Where solves start from something already, that is not sought again.
-    start
-        Makes what predicts states from a solution at parameters (d,), at the mean and at the mode.
-    samples, chains, when, model
-        As of `assess`.
-    starts, seed
-        Of the search for the mode.
-    look
-        How the error of the mesh is looked at; None where there is no mesh.
-    shared
-        What errors the data share, at parameters (d,); None if they are independent.
-    unexplained
-        The data, if what the model does not explain of them is a process among their errors.
-    truth
-        What the errors of the model are learnt from; None where they are not, and always with finer meshes.
-    assumed, sampled
-        What is taken for granted; and what samples those of it that are uncertain, where first order is not enough.
-    say
-        Shows the user a line before the search.
-    steps
-        What keeps the mode, weighted points and chains; by default they are found again after an interruption.
+    Where solves start from something already, that is not sought again.
 
     Raises
     ------
     SolveError
         If the model has no answer where the search needs one.
     """
+    method: Inference = problem.method
+    shared, truth, assumed = problem.shared, problem.truth, problem.assumed
+    start, steps, model = (
+        problem.start or by_tangents(posterior.inputs, posterior.evaluate),
+        problem.steps,
+        problem.model,
+    )
+    samples = method.solves(len(posterior.names), field=False)
     d = len(posterior.inputs.names)
     if shared is not None:
         posterior = _sharing(posterior, shared(posterior.inputs.mean))
@@ -180,32 +212,43 @@ def infer(
             posterior = replace(posterior, start=start(posterior.inputs.mean))
     if truth is not None:
         posterior = over_prior(posterior, truth, steps)
-    before = None if look is None or look.treatment is None else before_few(posterior, look.finer, say)
-    searched = gaussian = steps("mode", partial(laplace, posterior, starts=starts, seed=seed))
+    before = None
+    if problem.finer is not None and method.treatment is not None:
+        before = before_few(posterior, problem.finer, problem.say)
+    searched = gaussian = steps("mode", partial(laplace, posterior, starts=method.starts, seed=method.seed))
     if shared is not None:
         posterior, gaussian = _settled(posterior, gaussian, shared)
     if truth is not None:
         posterior, gaussian = over_posterior(posterior, gaussian, truth, steps)
     posterior, mesh = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d])), None
     process = None
-    if look is not None:
-        treatment = look.treatment or "report"
-        posterior, gaussian, mesh = corrected_few(posterior, gaussian, look.finer, look.data, treatment)
-    if unexplained is not None:
-        posterior, gaussian, process = with_process(posterior, gaussian, unexplained)
+    if problem.finer is not None:
+        treatment = method.treatment or "report"
+        posterior, gaussian, mesh = corrected_few(posterior, gaussian, problem.finer, problem.data, treatment)
+    if problem.errors.process:
+        posterior, gaussian, process = with_process(posterior, gaussian, problem.data)
     found = first = AtMode(posterior, gaussian)
     moves = None if assumed is None else moved_by(posterior, gaussian, first.at, assumed)
-    places, recorder = None, None
+    places, recorder, sampled = None, None, problem.sampled
     if sampled is not None and assumed is not None:
         recorder = Recorder(sampled.evaluate)
         with suppress(SolveError):  # there is no answer to any of them at the mode
             wider, parts = _sampling(first, assumed, sampled, recorder), replace(steps.of("sampled"), recorder=recorder)
             if not (np.abs(missed(wider)) <= BENT).all():  # or it is not known
                 gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
-                say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
+                problem.say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
                 found, places = AtMode(wider.posterior, gaussian), (wider.own, wider.new)
                 model, steps = sampled.model, parts
-    one = assess(found.posterior, gaussian, samples, chains=chains, when=when, model=model, seed=seed, steps=steps)
+    one = assess(
+        found.posterior,
+        gaussian,
+        samples,
+        chains=method.chains,
+        when=method.chains_when,
+        model=model,
+        seed=method.seed,
+        steps=steps,
+    )
     solves = 0 if recorder is None else recorder.solves
     return Inferred(found, first, searched, one, mesh, before, process, moves, places, solves)
 

@@ -8,13 +8,13 @@ from pydantic import Field, field_validator, model_validator
 
 from forward.model import ForwardModel, ModelError
 from forward.settings import Settings
-from inverse.criticism.assessment import Kind, When, solves_of
+from inverse.criticism.assessment import solves_of
 from inverse.criticism.chains import FIELD
 from inverse.criticism.weights import usual
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.mesh_correction import MeshTreatment
+from inverse.methods.infer import Inference
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
@@ -54,7 +54,7 @@ class ByReduced(Settings):
         return ", ".join(self.by_case.values())
 
 
-class Invert(MeshTreatment, Settings):
+class Invert(Inference):
     """Inversion of measurements: the most probable parameters or interior, their uncertainty, and what stays open.
 
     Parameters
@@ -105,18 +105,11 @@ class Invert(MeshTreatment, Settings):
     kind: Literal["invert"] = "invert"
     samples: Annotated[int, Field(ge=0)] | None = None
     noise: Distribution | None = None
-    chains: Kind | None = None
-    chains_when: When = "always"
-    starts: Annotated[int, Field(ge=1)] = 4
     cutoff: Annotated[float, Field(gt=0)] = CUTOFF
     rank: Annotated[int, Field(ge=1)] = 256
     draws: Annotated[int, Field(ge=10)] = 400
-    seed: Annotated[int, Field(ge=0)] = 0
-    mesh_error: Literal["correct", "report", False] = "correct"
     expansion: Annotated[int, Field(ge=LEAST_SHARED)] | None = None
     reduced: ByReduced | None = None
-    mesh_check: bool = True
-    assumptions: bool = True
     question: bool = False
 
     @field_validator("reduced", mode="before", json_schema_input_type=ByReduced | str)

@@ -34,15 +34,15 @@ from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.methods.infer import Looked, Starts, infer
+from inverse.methods.infer import Problem, infer
 from inverse.methods.invert import Invert
 from inverse.methods.record import (
     ENDS,
     SOURCES,
-    Problem,
     Record,
     as_dataset,
     diagnosed,
+    noise_of,
     of_data,
     of_learnt,
     of_mesh,
@@ -103,16 +103,12 @@ class Inverted:
 def invert_few(
     inputs: Inputs,
     evaluate: Evaluate,
-    problem: Problem,
+    problem: Problem[Invert],
     look: Look | None = None,
-    *,
-    start: Starts | None = None,
-    model: ForwardModel | None = None,
 ) -> Inverted:
     """Invert a data set for few parameters.
 
-    The stiffness of the interior is looked at as a function of the parameters, if there is one; states are predicted
-    from a solution at parameters (d,), by default by tangents there; chains follow the gradients of the model itself.
+    The stiffness of the interior is looked at as a function of the parameters, if there is one.
 
     Raises
     ------
@@ -121,28 +117,10 @@ def invert_few(
     """
     data, method = problem.data, problem.method
     counted = Recorder(evaluate)
-    of_data_set = Posterior(inputs, counted, data.values, problem.noise, data.which)
-    solves, d = method.solves(len(of_data_set.names), field=False), len(inputs.names)
-    looked = None if problem.finer is None else Looked(problem.finer, data, method.treatment)
-    steps = replace(problem.steps, recorder=counted)
-    inferred = infer(
-        of_data_set,
-        start or (lambda point: linearise(inputs, evaluate, point).prediction),
-        solves,
-        starts=method.starts,
-        seed=method.seed,
-        look=looked,
-        shared=problem.shared,
-        unexplained=data if problem.errors.process else None,
-        truth=problem.truth,
-        chains=method.chains,
-        when=method.chains_when,
-        model=model,
-        assumed=problem.assumed,
-        sampled=problem.sampled,
-        say=problem.say,
-        steps=steps,
-    )
+    of_data_set = Posterior(inputs, counted, data.values, noise_of(problem), data.which)
+    steps, d = replace(problem.steps, recorder=counted), len(inputs.names)
+    start = problem.start or (lambda point: linearise(inputs, evaluate, point).prediction)
+    inferred = infer(of_data_set, replace(problem, start=start, steps=steps))
     posterior, one, mesh, first = inferred.posterior, inferred.assessment, inferred.mesh, inferred.first
     gaussian, found, chains, at = one.gaussian, one.evidence, one.chains, inferred.found.at
     own, new = inferred.sampled or (list(range(d)), [])
@@ -291,7 +269,7 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
 
 
 def _of_uncertain(
-    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem, new: Sequence[int]
+    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem[Invert], new: Sequence[int]
 ) -> Record:
     """Moments of what is uncertain beside the parameters, in its deviations, at each point and over all.
 

@@ -25,13 +25,13 @@ from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import Beside, LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise_size import SolvedField, infer_noise
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import corrected_field, field_moved, told
 from inverse.methods.record import (
     COLUMNS,
     ENDS,
     SHOWN,
-    Problem,
     Record,
     as_dataset,
     diagnosed,
@@ -76,7 +76,7 @@ def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) 
 
 def invert_field(
     posterior: FieldPosterior,
-    problem: Problem,
+    problem: Problem[Invert],
     vertices: Vertices,
     predict: Callable[[LowRankPosterior, Weighted | None, Beside], Record] | None = None,
 ) -> xr.Dataset:

@@ -40,24 +40,6 @@ OF_DIFFERENCE, OF_ERROR, OF_DATUM = 0.35, 0.1, 0.3
 OF_DIRECTION = 0.5
 
 
-class MeshTreatment:
-    """What a method with the settings `mesh_error` and `mesh_check` asks for."""
-
-    if TYPE_CHECKING:  # fields of the methods, each with its place among the others
-        mesh_error: Treatment | Literal[False]
-        mesh_check: bool
-
-    @property
-    def treatment(self) -> Treatment | None:
-        """What is done about the error of the mesh; None where it is not asked for."""
-        return (self.mesh_error or None) if self.mesh_check else None
-
-    @property
-    def unchecked(self) -> str:
-        """Why the mesh is not looked at, where it is not."""
-        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
-
-
 EXCEEDS = 0.2  # of a datum's noise, or of an unknown's deviation, from which on the error of the mesh is corrected
 SETTLED = 0.1  # deviations of an unknown that are left when it is
 ROUNDS = 5

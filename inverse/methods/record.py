@@ -7,30 +7,26 @@ directions that all cases together constrain, exact to the first λ that was neg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
-from inverse.criticism.finer import NOT_LOOKED, Finer, MeshFound
+from inverse.criticism.finer import MeshFound
 from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.questions import Questions
 from inverse.criticism.verdict import Verdict
 from inverse.data.measurements import Measurements
-from inverse.data.noise import NORMAL, Noise, NormalErrors, StudentErrors
-from inverse.data.shared_motion import Shared, determined
+from inverse.data.noise import Noise
+from inverse.data.shared_motion import determined
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.residual_process import Process
-from inverse.methods.infer import Sampled
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
 from uq.estimators.estimate import BAND, part
-from uq.evaluation.evaluate import ALL_AGAIN, Steps
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -99,48 +95,9 @@ _ARRAYS = {
 DIMS = {name: tuple(dims.split()) for dims, names in {"": _NUMBERS, **_ARRAYS}.items() for name in names.split()}
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A data set, and how it is inverted.
-
-    Attributes
-    ----------
-    data, method, errors
-        What was measured, the method, and the distribution of the errors.
-    finer
-        The model on finer meshes; None where it has no mesh.
-    shared
-        What errors the data share, at parameters (d,) or values of a field (N,); None if they are independent.
-    say
-        Shows the user a line before the search.
-    steps
-        What keeps what is found of few parameters.
-    assumed
-        What is taken for granted; None if it is not looked at.
-    questions
-        What the body does not have, to be asked about; None if nothing is asked.
-    truth
-        What the errors of the model are learnt from; None where they are not.
-    sampled
-        What samples that of `assumed` which is too uncertain for first order; None where nothing can be.
-    """
-
-    data: Measurements
-    method: Invert
-    errors: NormalErrors | StudentErrors = NORMAL
-    finer: Finer | None = NOT_LOOKED
-    shared: Shared | None = None
-    say: Callable[[str], None] = field(default=lambda line: None)
-    steps: Steps = ALL_AGAIN
-    assumed: Assumptions | None = None
-    questions: Questions | None = None
-    truth: Truth | None = None
-    sampled: Sampled | None = None
-
-    @property
-    def noise(self) -> Noise:
-        """The errors of the data, as they are stated."""
-        return Noise(self.data.sigma, self.errors.dof, self.method.noise)
+def noise_of(problem: Problem[Invert]) -> Noise:
+    """Return the errors of the data, as they are stated."""
+    return Noise(problem.data.sigma, problem.errors.dof, problem.method.noise)
 
 
 def as_dataset(record: Record) -> xr.Dataset:

@@ -17,23 +17,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ForwardModel, SolveError
+from forward.model import FloatArray, SolveError
 from forward.phases import phase
 from forward.settings import Settings
-from inverse.criticism.assessment import Kind, When, solves_of
-from inverse.criticism.assumptions import Assumptions
-from inverse.criticism.comparison import Candidate, Compared, comparison
-from inverse.criticism.finer import Finer
+from inverse.criticism.assessment import solves_of
+from inverse.criticism.comparison import Candidate, Compared, Pair, comparison
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
-from inverse.data.shared_motion import Shared, determined
+from inverse.data.shared_motion import determined
 from inverse.low_dimensional.evidence import LEAST, nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.infer import Inferred, Looked, Starts, by_tangents, infer
-from inverse.methods.mesh_correction import MeshTreatment
+from inverse.methods.infer import Inference, Inferred, Problem, by_tangents, infer
 from inverse.methods.model_error import Truth
 from inverse.methods.record import of_learnt
-from uq.evaluation.evaluate import ALL_AGAIN, Steps
+from uq.evaluation.evaluate import Steps
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
 
@@ -91,7 +88,7 @@ class StatedNoise(Settings):
         return replace(other, sigma=sigma, factor=self.factor)
 
 
-class Select(MeshTreatment, Settings):
+class Select(Inference):
     """Bayesian model selection: evidence and probability of every candidate, and how far they can be trusted.
 
     Parameters
@@ -134,14 +131,7 @@ class Select(MeshTreatment, Settings):
     other_noises: dict[str, StatedNoise] = Field(default={})
     subsets: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
     held_out: bool = False
-    seed: Annotated[int, Field(ge=0)] = 0
-    starts: Annotated[int, Field(ge=1)] = 4
-    chains: Kind | None = None
-    chains_when: When = "always"
     check: Literal["dynesty"] | None = None
-    mesh_error: Literal["correct", "report", False] = "correct"
-    mesh_check: bool = True
-    assumptions: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> Select:
@@ -155,6 +145,10 @@ class Select(MeshTreatment, Settings):
         """Number of times that all evidences are computed, not counting held-out tests."""
         return 1 + len(self.other_noises) + len(self.subsets)
 
+    def solves(self, size: int, *, field: bool) -> int:
+        """Number of solves for each evidence, whatever is unknown."""
+        return self.samples
+
     def chain_solves(self, size: int) -> int:
         """Most solves of the chains of a candidate with so many unknown constants."""
         return solves_of(self.chains, size)
@@ -164,14 +158,8 @@ class Select(MeshTreatment, Settings):
         candidates: Mapping[str, Candidate],
         data_groups: Mapping[str, Measurements],
         evaluate: Callable[[str, str], Evaluate],
+        problem: Callable[[str, str], Problem[Select]] | None = None,
         free: Callable[[str, str], Evaluate] | None = None,
-        finer: Callable[[str, str], Finer] | None = None,
-        say: Callable[[str], None] = lambda line: None,
-        shared: Mapping[tuple[str, str], Shared] | None = None,
-        model: Callable[[str, str], ForwardModel] | None = None,
-        steps: Callable[[str, str], Steps] = lambda name, group: ALL_AGAIN,
-        assumed: Callable[[str, str], Assumptions] | None = None,
-        truth: Callable[[str, str], Truth | None] = lambda name, group: None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -183,22 +171,11 @@ class Select(MeshTreatment, Settings):
             Data by the name of the group.
         evaluate
             The model of a candidate for a group; its first outputs are the data of the group, others are predicted.
+        problem
+            The measured data of a group, and what is known besides for a candidate; asked after the model. By default
+            the data alone.
         free
-            The same without cost, for nested sampling.
-        finer
-            The same on a finer mesh; by default there are no meshes.
-        say
-            Shows the user a line before the search of each candidate.
-        shared
-            What errors the data share, by candidate and group; by default they are independent.
-        model
-            The model of a candidate for a group itself, whose gradients chains follow.
-        steps
-            What keeps what is found of a candidate for a group; by default an interrupted comparison begins again.
-        assumed
-            What a candidate and a group take for granted; by default it is not looked at.
-        truth
-            What the errors of a candidate are learnt from; by default they are not.
+            The same as `evaluate` without cost, for nested sampling.
 
         Returns
         -------
@@ -211,47 +188,32 @@ class Select(MeshTreatment, Settings):
             If a model has no answer at any start or any point.
         """
         pairs = [(name, group) for name in candidates for group in data_groups]
-        found: dict[tuple[str, str], Inferred] = {}
-        starts: dict[tuple[str, str], Starts] = {}
-        truths = {pair: truth(*pair) for pair in pairs}
-        takes = {pair: None if assumed is None else assumed(*pair) for pair in pairs}
+        found: dict[Pair, Inferred] = {}
+        problems: dict[Pair, Problem[Select]] = {}
         for name, group in pairs:
             one = posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group))
-            starts[name, group] = by_tangents(one.inputs, one.evaluate)
-            data = data_groups[group].seen()
+            asked = Problem(data_groups[group].seen(), self, finer=None) if problem is None else problem(name, group)
+            problems[name, group] = asked = replace(asked, start=by_tangents(one.inputs, one.evaluate))
             with _of((name, group)):
-                found[name, group] = infer(
-                    one,
-                    starts[name, group],
-                    self.samples,
-                    starts=self.starts,
-                    seed=self.seed,
-                    look=None if finer is None else Looked(finer(name, group), data, self.treatment),
-                    shared=None if shared is None else shared.get((name, group)),
-                    truth=truths[name, group],
-                    chains=self.chains,
-                    when=self.chains_when,
-                    model=None if model is None else model(name, group),
-                    assumed=takes[name, group],
-                    say=lambda line, name=name: say(f"{name}: {line}"),  # type: ignore[misc]
-                    steps=steps(name, group).of(STATED),
-                )
+                found[name, group] = infer(one, replace(asked, steps=asked.steps.of(STATED)))
         posteriors = {pair: one.posterior for pair, one in found.items()}
         stated = {pair: one.assessment for pair, one in found.items()}
+        quick = self.model_copy(update={"chains": None})
 
-        def value(changed: Posterior, pair: tuple[str, str], label: str) -> tuple[float, float]:
+        def value(changed: Posterior, pair: Pair, label: str) -> tuple[float, float]:
             def found() -> tuple[float, float]:
-                again = infer(changed, starts[pair], self.samples, starts=self.starts, seed=self.seed, steps=parts)
-                return again.assessment.log_evidence
+                again = Problem(one.data, quick, finer=None, start=one.start, steps=parts)
+                return infer(changed, again).assessment.log_evidence
 
-            parts = steps(*pair).of(label)
+            one = problems[pair]
+            parts = one.steps.of(label)
             with _of(pair):
                 return parts("evidence", found)
 
         def checked(one: Posterior, parts: Steps) -> tuple[float, float]:
             return parts("nested", lambda: nested(one, seed=self.seed, kept=parts.rows("likelihoods")))
 
-        variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
+        variants: dict[str, dict[Pair, tuple[float, float]]] = {
             STATED: {pair: one.log_evidence for pair, one in stated.items()}
         }
         for width in WIDTHS:
@@ -265,9 +227,7 @@ class Select(MeshTreatment, Settings):
                 for pair, one in posteriors.items()
             }
 
-        def some(
-            label: str, wanted: Callable[[tuple[str, ...]], set[str]]
-        ) -> dict[tuple[str, str], tuple[float, float]]:
+        def some(label: str, wanted: Callable[[tuple[str, ...]], set[str]]) -> dict[Pair, tuple[float, float]]:
             """Return ln Z and errors by the data of wanted ones of the tests of a group, in groups that have any."""
             tests = {pair: wanted(data_groups[pair[1]].measured_tests) for pair in pairs}
             return {
@@ -281,24 +241,22 @@ class Select(MeshTreatment, Settings):
         checks = {}
         if self.check is not None:
             source = free or evaluate
-            checks = {pair: checked(replace(posteriors[pair], evaluate=source(*pair)), steps(*pair)) for pair in pairs}
+            checks = {
+                pair: checked(replace(posteriors[pair], evaluate=source(*pair)), one.steps)
+                for pair, one in problems.items()
+            }
         tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
         left_out = {
             test: some(f"without {test}", lambda those, test=test: {*those} - {test} if test in those else set())  # type: ignore[misc]
             for test in dict.fromkeys(tests_of)
         }
-        compared = {
-            (name, group): Compared(
-                one.posterior,
-                data_groups[group],
-                one.assessment,
-                one.mesh,
-                (taken, one.moves) if (taken := takes[name, group]) and one.moves else None,
-            )
-            for (name, group), one in found.items()
-        }
+        compared = {}
+        for pair, it in found.items():
+            taken = problems[pair].assumed
+            moves = None if taken is None or it.moves is None else (taken, it.moves)
+            compared[pair] = Compared(it.posterior, data_groups[pair[1]], it.assessment, it.mesh, moves)
         result = comparison(candidates, data_groups, compared, variants, checks, left_out)
-        result = result.assign(_learnt(posteriors, truths, data_groups))
+        result = result.assign(_learnt(posteriors, {pair: one.truth for pair, one in problems.items()}, data_groups))
         if any(one.noise.shared is None for one in posteriors.values()):
             return result
         seen = [_motions(found[pair]) for pair in pairs]
@@ -313,8 +271,8 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
 
 
 def _learnt(
-    posteriors: Mapping[tuple[str, str], Posterior],
-    truths: Mapping[tuple[str, str], Truth | None],
+    posteriors: Mapping[Pair, Posterior],
+    truths: Mapping[Pair, Truth | None],
     data_groups: Mapping[str, Measurements],
 ) -> dict[str, Any]:
     """Mean and standard deviation of learnt errors, over those of the data; NaN of others, empty without any."""
@@ -361,7 +319,7 @@ def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatAr
 
 
 @contextmanager
-def _of(pair: tuple[str, str]) -> Iterator[None]:
+def _of(pair: Pair) -> Iterator[None]:
     """Say which candidate is looked at, and of which one a model has no answer."""
     try:
         with phase(pair[0]):

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH = 24  # letters of a bar
 MANY = 12  # outputs that are told
+MOST = 11  # lines that notes fill up; one more says where the report is
 Row = Sequence[str]
 
 
@@ -48,7 +49,11 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
         lines.append(words.joined(summary["joined"], summary["work"]))
     if "note" in summary:
         lines.append(summary["note"])
-    return "\n".join([*lines, *(line for severity, line in said if severity == "note")]) + "\n"
+    notes = [line for severity, line in said if severity == "note"]
+    if len(lines) + len(notes) > MOST:
+        kept = notes[: max(MOST - 1 - len(lines), 0)]
+        notes = [*kept, f"notes: {len(notes) - len(kept)} more in report.html"]
+    return "\n".join([*lines, *notes]) + "\n"
 
 
 def answers(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind) -> Iterator[str]:

@@ -19,11 +19,11 @@ from forward.settings import one_line
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
-from inverse.methods.infer import Sampled
-from inverse.methods.invert import derivable
+from inverse.methods.infer import Problem, Sampled
+from inverse.methods.invert import Invert, derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.model_error import Truth
-from inverse.methods.record import Problem, with_record
+from inverse.methods.record import noise_of, with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept, KeptSolves
@@ -231,7 +231,9 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
-def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensemble: Ensemble, kept: Kept) -> Problem:
+def _problem(
+    study: InversionBlocks, number: int, seen: _Observed, on: On, ensemble: Ensemble, kept: Kept, start: Starts | None
+) -> Problem[Invert]:
     """Return what is inverted of a data set, by its number; with a reduced model, steps are done more than once."""
     finer = None
     if seen.there is not None:
@@ -250,22 +252,33 @@ def _problem(study: InversionBlocks, number: int, seen: _Observed, on: On, ensem
     truth = None
     if seen.truth is not None and study.model_error is not None:
         truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
-    errors, questions = study.data.errors, seen.questions
-    return Problem(data, study.method, errors, finer, shared, ensemble.say, steps, assumed, questions, truth, sampled)
+    return Problem(
+        data,
+        study.method,
+        study.data.errors,
+        finer=finer,
+        shared=shared,
+        start=start,
+        model=seen.model,
+        say=ensemble.say,
+        steps=steps,
+        assumed=assumed,
+        sampled=sampled,
+        questions=seen.questions,
+        truth=truth,
+    )
 
 
 def _inverted(
     study: InversionBlocks,
     made: _Made,
-    seen: _Observed,
-    problem: Problem,
+    problem: Problem[Invert],
     evaluate: Recorder,
     cheap: ForwardModel | None,
-    start: Starts | None,
 ) -> xr.Dataset:
     """Invert a data set for few parameters, with a reduced model if there is one, which is `cheap`."""
     if cheap is None:
-        return invert_few(study.inputs, evaluate, problem, made.look, start=start, model=seen.model).dataset
+        return invert_few(study.inputs, evaluate, problem, made.look).dataset
     if problem.shared is not None:  # a reduced model would have to know what moved points do
         message = "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
         raise SolveError(message)
@@ -324,12 +337,12 @@ def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Pa
                 solved += log
             return _by_expansion(study, found, number, ensemble.say)
         seen = made.observed(number)
-        problem = _problem(study, number, seen, on, ensemble, kept(names[number]))
+        near = None if study.field else partial(Nearby.at, seen.model, spread=study.inputs.std)
+        problem = _problem(study, number, seen, on, ensemble, kept(names[number]), near)
         if invert_field is not None:
             return invert_field(names[number], Recorded(seen.model, KeptSolves(kept(names[number]), solved)), problem)
         full = Recorder(SerialEvaluate(seen.model, ensemble.count, kept=kept(names[number])), log=solved)
-        near = partial(Nearby.at, seen.model, spread=study.inputs.std)
-        return _inverted(study, made, seen, problem, full, reduced(seen.model), near)
+        return _inverted(study, made, problem, full, reduced(seen.model))
 
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         if all(one.dataset is None for one in outcomes):
@@ -362,16 +375,17 @@ def _by_expansion(
     data = study.measurements[number]
     missed = found.error[data.axes]
     wider = replace(data, sigma=np.hypot(data.sigma, missed))
-    problem = Problem(wider, study.method, study.data.errors, found.finer, say=say)
     near = partial(Nearby.at, found.model, spread=study.inputs.std)
-    one = invert_few(study.inputs, SerialEvaluate(found.model), problem, start=near, model=found.model).dataset
+    known = study.data.errors, found.finer
+    problem = Problem(wider, study.method, *known, start=near, model=found.model, say=say)
+    one = invert_few(study.inputs, SerialEvaluate(found.model), problem).dataset
     size, count = float((missed / data.sigma).max()), found.solves + found.finer_solves
     return one.assign(solves=0.0, expansion_error=size, expansion_solves=float(count))
 
 
 def _inverting_field(
     study: InversionBlocks, made: _Made, ensemble: Ensemble, kept: Callable[[str], Kept]
-) -> Callable[[str, ForwardModel, Problem], xr.Dataset]:
+) -> Callable[[str, ForwardModel, Problem[Invert]], xr.Dataset]:
     """Return what inverts a data set, by its name, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
@@ -386,8 +400,8 @@ def _inverting_field(
 
         predicting = of_field(study, lambda name: Recorded(predicted, KeptSolves(kept(name))))
 
-    def invert(name: str, states: ForwardModel, problem: Problem) -> xr.Dataset:
-        posterior = FieldPosterior(states, problem.data.values, problem.noise, prior, progress=ensemble.count)
+    def invert(name: str, states: ForwardModel, problem: Problem[Invert]) -> xr.Dataset:
+        posterior = FieldPosterior(states, problem.data.values, noise_of(problem), prior, progress=ensemble.count)
         predict = None if predicting is None else partial(predicting, name)
         return invert_field(posterior, problem, Vertices(offset, prior.matern.mass), predict)
 
@@ -433,8 +447,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Ch
             # Values at moved points and errors of meshes are not kept.
             return full.on(name) if name == FINER else evaluate.on(name.partition(",")[0])
 
-        problem = _problem(study, 0, seen, on, ensemble, Kept(checkpoint, MPI.COMM_SELF, "steps"))
-        found = _inverted(study, made, seen, problem, full, cheap, None)
+        problem = _problem(study, 0, seen, on, ensemble, Kept(checkpoint, MPI.COMM_SELF, "steps"), None)
+        found = _inverted(study, made, problem, full, cheap)
         if predicted is not None:
             from workflows.studies.predicted import prior_band
 

@@ -12,10 +12,12 @@ from forward.combine import sums_of
 from forward.fem.finer import Keep, extrapolated
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel
-from inverse.criticism.assumptions import Assumptions, by_evaluation
+from inverse.criticism.assumptions import by_evaluation
 from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
+from inverse.methods.infer import Problem
 from inverse.methods.model_error import Truth
+from inverse.methods.selection import Select
 from uq.evaluation.evaluate import Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
@@ -50,16 +52,6 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
     motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
-        def assumed(name: str, group: str) -> Assumptions:
-            one = taken[name, group]
-            asked = by_evaluation(evaluate.on(f"{name}/{group}/{ASSUMED}")) if one.asked else None
-            return one.of(one.data, asked)
-
-        shared = {(n, g): motion.errors_by(evaluate.on(f"{n}/{g}/{MOVED}")) for (n, g), motion in motions.items()}
-        for pair, one in taken.items():
-            if one.groups and (errors := together(shared.get(pair), assumed(*pair).shared)) is not None:
-                shared[pair] = errors
-
         def recorded(name: str, group: str) -> Evaluate:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
             return recorders[f"{name}/{group}"]
@@ -68,29 +60,29 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
             # What nested sampling solves is too much, and too cheap, to keep.
             return SerialEvaluate(study.build(name, group), ensemble.count)
 
-        def look(name: str, group: str) -> Finer:
-            if (name, group) not in checked:
-                return Finer(None, why[name])
-            return Finer.by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
+        def problem(name: str, group: str) -> Problem[Select]:
+            pair, label = (name, group), f"{name}/{group}"
+            recorder, motion, one, learnt = recorders[label], motions.get(pair), taken[pair], study.learnt.get(name)
+            finer = None if not why else Finer(None, why[name])
+            if pair in checked:
+                finer = Finer.by(recorder.on(f"{label}/{FINER}"))
+            assumed = None
+            if method.assumptions or study.uncertain:
+                assumed = one.of(one.data, by_evaluation(evaluate.on(f"{label}/{ASSUMED}")) if one.asked else None)
+            moved = None if motion is None else motion.errors_by(evaluate.on(f"{label}/{MOVED}"))
+            return Problem(
+                study.data_groups[group].seen(),
+                method,
+                finer=finer,
+                shared=together(moved, None if assumed is None else assumed.shared),
+                model=makers[pair](),
+                say=lambda line: ensemble.say(f"{name}: {line}"),
+                steps=Steps(kept, recorder, label, ensemble.count),
+                assumed=assumed,
+                truth=None if learnt is None else Truth(evaluate.on(f"{label}/{TRUTH}"), learnt.solves, method.seed),
+            )
 
-        def truth(name: str, group: str) -> Truth | None:
-            if name not in study.learnt:
-                return None
-            return Truth(evaluate.on(f"{name}/{group}/{TRUTH}"), study.learnt[name].solves, method.seed)
-
-        return method.run(
-            study.models,
-            study.data_groups,
-            recorded,
-            free,
-            look if why else None,
-            ensemble.say,
-            shared or None,
-            lambda *pair: makers[pair](),
-            lambda *pair: Steps(kept, recorders["/".join(pair)], "/".join(pair), ensemble.count),
-            assumed if method.assumptions or study.uncertain else None,
-            truth,
-        )
+        return method.run(study.models, study.data_groups, recorded, problem, free)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.data.quantity)

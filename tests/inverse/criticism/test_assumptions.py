@@ -31,8 +31,8 @@ from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.infer import Problem
 from inverse.methods.invert_few import invert_few
-from inverse.methods.record import Problem
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogUniform, Normal
 from uq.inputs.random_parameters import Inputs

@@ -10,7 +10,6 @@ from mpi4py import MPI
 from forward.conformance import check_derivatives
 from forward.model import SolveError
 from forward.specimen import Specimen
-from inverse.criticism.finer import NOT_LOOKED
 from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
 from inverse.methods.mesh_correction import uncertain
@@ -304,14 +303,14 @@ def test_forces_lie_nowhere_in_comparisons_as_in_inversions(folder, monkeypatch)
     """What finer meshes still miss of displacements varies over the body, with which forces have nothing to do."""
     looked = []
 
-    def stop(*given, look, **more):
-        looked.append(look.data)
+    def stop(posterior, problem):
+        looked.append(problem.data)
         raise SolveError("enough")
 
     monkeypatch.setattr("inverse.methods.selection.infer", stop)
     study = load(folder / "select.toml")
     with pytest.raises(SolveError, match="enough"):
-        study.method.run(study.models, study.data_groups, lambda *pair: None, finer=lambda *pair: NOT_LOOKED)
+        study.method.run(study.models, study.data_groups, lambda *pair: None)
     (data,), inverted = looked, load(folder / "few.toml").measurements[0]
     np.testing.assert_array_equal(np.isnan(data.places).all(axis=1), data.axes >= 3)
     rows = (uncertain(np.ones(len(one)), np.ones(len(one)), one) for one in (data, inverted))

@@ -23,10 +23,11 @@ from inverse.data.measurements import Measurements
 from inverse.data.rigid import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.invert_field import Vertices, invert_field
-from inverse.methods.record import Problem, as_dataset, stacked
+from inverse.methods.record import as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
 from tests.launch import TISSUQ, on_kept_ranks, run, run_script
 from tests.problems import curved

@@ -10,9 +10,11 @@ from scipy.stats import multivariate_normal, t
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import answer
+from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.infer import infer
+from inverse.methods.infer import Problem, infer
+from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
 from tests.launch import in_process
 from uq.evaluation.evaluate import SerialEvaluate
@@ -52,7 +54,11 @@ def truth(function=true, solves=PAIRS, seed=0, names=NAMES):
 
 
 def inferred(data, other, **kwargs):
-    return infer(posterior(data, **kwargs), lambda point: None, 64, starts=1, seed=0, truth=other)
+    given, method = (
+        Measurements.of(data, np.ones(len(data)), [0] * len(data), range(len(data))),
+        Invert(samples=64, starts=1),
+    )
+    return infer(posterior(data, **kwargs), Problem(given, method, finer=None, start=lambda point: None, truth=other))
 
 
 # --- what pairs tell -------------------------------------------------------------------------------------------------

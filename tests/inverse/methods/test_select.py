@@ -19,9 +19,9 @@ from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
-from inverse.methods.record import Problem
 from inverse.methods.selection import Select, StatedNoise, posterior
 from tests.launch import in_process, run_script, tissuq_on_two_ranks
 from tests.problems import bananas
@@ -691,11 +691,12 @@ def of_bananas(pairs, bend=0.7, **settings):
     data = Measurements.of_tests(np.zeros(d), np.ones(d), ("all",) * d, np.arange(d, dtype=float))
     method = Select(noise=StatedNoise(), **settings)
     evaluate = SerialEvaluate(model)
-    found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, model=lambda *_: model)
+    problem = Problem(data, method, finer=None, model=model)
+    found = method.run({"it": Candidate(curved.inputs)}, {"all": data}, lambda *_: evaluate, lambda *_: problem)
     named = tuple(f"z{k}" for k in range(d))
     of_outputs = Measurements.of(np.zeros(d), np.ones(d), range(d), range(d), named, named, named, some=True)
     beside = Invert(samples=settings["samples"], chains=settings.get("chains"))
-    asked = partial(invert_few, curved.inputs, evaluate, Problem(of_outputs, beside, finer=None), model=model)
+    asked = partial(invert_few, curved.inputs, evaluate, Problem(of_outputs, beside, finer=None, model=model))
     return found.sel(model="it", group="all"), lambda: asked().dataset, truth
 
 

@@ -20,6 +20,7 @@ import forward.finer_meshes
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer
+from inverse.methods.infer import Problem
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import SerialEvaluate
@@ -178,6 +179,15 @@ def test_one_line_for_a_mistake(study, old, new, told):
     assert len(caught.value.args) == 1
 
 
+def looking(method, it, finer, say=lambda line: None):
+    """What makes the problem of a candidate that is looked at on finer meshes."""
+
+    def problem(name, group):
+        return Problem(it.data_groups[group].seen(), method, finer=Finer.by(SerialEvaluate(finer[name])), say=say)
+
+    return problem
+
+
 @pytest.mark.slow
 def test_what_a_mesh_does_to_an_evidence(study):
     """Beside the evidence of a model that has no such error, of one candidate that moves little and one that does."""
@@ -200,7 +210,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
             it.models,
             it.data_groups,
             lambda name, _, models=models: SerialEvaluate(models[name]),
-            finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
+            looking(it.method, it, finer),
         )
         for models in runs
     )
@@ -229,17 +239,14 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
         it.models,
         it.data_groups,
         lambda name, _: SerialEvaluate(coarse[name]),
-        finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
-        say=lines.append,
+        looking(it.method, it, finer, lines.append),
     )
     assert found["mesh_corrected"].all()
     before = "at the mean of the prior the error of the mesh is"
-    assert [line.startswith(f"{name}: {before}") for name, line in zip(it.candidates, lines, strict=True)] == [True] * 2
-    plain = it.method.model_copy(update={"mesh_error": "report"}).run(
-        it.models,
-        it.data_groups,
-        lambda name, _: SerialEvaluate(coarse[name]),
-        finer=lambda name, _: Finer.by(SerialEvaluate(finer[name])),
+    assert [line.startswith(before) for line in lines] == [True] * 2
+    report = it.method.model_copy(update={"mesh_error": "report"})
+    plain = report.run(
+        it.models, it.data_groups, lambda name, _: SerialEvaluate(coarse[name]), looking(report, it, finer)
     )
     apart = abs(np.diff(plain["log_evidence"].values.ravel())).item()
     assert abs(np.diff(found["log_evidence"].values.ravel())).item() < 0.5 * apart

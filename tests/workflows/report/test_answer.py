@@ -174,6 +174,19 @@ def test_the_terminal_says_how_many_answers_it_leaves_to_the_report(monkeypatch)
     assert last == "The other 3 are in the tables of the report."
 
 
+@pytest.mark.parametrize(("notes", "shown"), [(5, 5), (6, 4), (20, 4)])
+def test_the_end_of_a_run_is_twelve_lines_and_notes_are_what_gives_way(monkeypatch, notes, shown):
+    monkeypatch.setattr(closing, "answers", lambda *given: [f"a{k}: 1 m" for k in range(3)])
+    said = [("warning", "w0"), ("warning", "w1"), *(("note", f"n{k}") for k in range(notes))]
+    summary = {"findings": [{"severity": one, "text": text} for one, text in said], "failed": 0, "solves": 1}
+    summary |= {"wall_seconds": 1.0, "cpu_seconds": 1.0, "own_seconds": 0.0, "evaluations": 1}
+    lines = closing.closing_words(xr.Dataset(), summary, None).splitlines()
+    assert lines[:2] == ["warning: w0", "warning: w1"]
+    assert sum(line.startswith("note: ") for line in lines) == shown
+    assert len(lines) <= 11
+    assert lines[-1] == (f"notes: {notes - shown} more in report.html" if notes > shown else f"note: n{notes - 1}")
+
+
 def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():
     """The truth and the prior are given, so no posterior says how exactly they are known: 450 Pa is not 400 Pa."""
     posterior = {"mean": 540.0, "std": 120.0, "lower": 282.0, "upper": 719.0}
