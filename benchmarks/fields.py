@@ -9,7 +9,8 @@ from mpi4py import MPI
 
 from benchmarks.beams import field_beam
 from forward.bodies.geometry import Box
-from forward.bodies.random_fields import ROBIN, Matern, Smoothness, correlation
+from forward.bodies.random_fields import ROBIN, Matern, Smoothness
+from tests.matern import correlation, inflation
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
@@ -45,7 +46,8 @@ def sampler() -> None:
                 distance = np.linalg.norm(places - middle, axis=1)
                 near = distance <= length
                 error = np.abs(row - correlation(distance, length, smoothness))[near].max()
-                shown = " | ".join(f"{matern.inflation[i]:.2f}" for i in (centre, end, 0))
+                variances = inflation(matern, length, smoothness)
+                shown = " | ".join(f"{variances[i]:.2f}" for i in (centre, end, 0))
                 print(f"| {smoothness} | {condition} | {name} | {shown} | {error:.3f} |", flush=True)
 
 

@@ -21,8 +21,7 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 
-from forward.bodies.hexahedra import CORNERS
-from forward.bodies.mesh import FACES, TETRAHEDRA
+from forward.bodies.mesh import CORNERS, FACES, TETRAHEDRA
 from forward.fem.invariants import OPS
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError

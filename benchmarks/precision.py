@@ -61,9 +61,10 @@ def _measured(size: float, precision: str, samples: int) -> tuple[np.ndarray, np
     corrections = np.mean([one.work.back_substitutions for one in found])
     single = precision == "single" and solver.in_single
     contraction = f"{solver.contraction:.4f}" if single else ""
+    memory = solver._library.told(solver._factor, 22) if single else _in_double(solver).getMumpsInfog(22)  # MB
     print(
         f"| {model.equations.size:,} | {precision} | {times} | {corrections:.1f} | {of_tangents:.0f} "
-        f"| {solver.memory() / 1e6:.0f} | {contraction} |",
+        f"| {memory} | {contraction} |",
         flush=True,
     )
     return np.array([one.state for one in found]), tangents
@@ -75,6 +76,11 @@ def _milliseconds(call: Callable[[], object], repeats: int) -> float:
     for _ in range(repeats):
         call()
     return (time.process_time() - begin) / repeats * 1e3
+
+
+def _in_double(solver: Any) -> Any:
+    """Return MUMPS's factor in double precision."""
+    return getattr(solver, "_double", solver)._ksp.pc.getFactorMatrix()
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:

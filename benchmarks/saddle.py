@@ -19,8 +19,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from scipy.sparse.linalg import LinearOperator, gmres, splu
 
-from forward.fem.dolfinx.spaces import Transfer
-from forward.fem.dolfinx.unknowns import Unknowns
+from forward.fem.dolfinx.spaces import Transfer, Unknowns
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray
 

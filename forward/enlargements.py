@@ -16,8 +16,9 @@ from pydantic import create_model
 
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.inclusions import RADII, Ellipsoid, Sphere, log_factor
+from forward.bodies.mesh import fan
 from forward.bodies.random_fields import RandomField
-from forward.bodies.surface import Surface, facets, fan
+from forward.bodies.surface import Surface, facets
 from forward.model import FloatArray
 from forward.readable import number, place, told
 from forward.solid import Solid

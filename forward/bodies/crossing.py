@@ -16,8 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from forward.bodies.location import nearest_of
-from forward.bodies.mesh import TETRAHEDRA, IntArray
-from forward.bodies.surface import fan
+from forward.bodies.mesh import TETRAHEDRA, IntArray, fan
 from forward.model import FloatArray
 
 OUTSIDE = -1e-3  # least barycentric coordinate: where meshes of both sides match, vertices lie on edges of cells

@@ -18,7 +18,7 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
-from forward.bodies.mesh import EDGES, IntArray, Loaded, surface_of
+from forward.bodies.mesh import IntArray, Loaded, edges_of, surface_of
 from forward.model import FloatArray
 
 CREASE = np.cos(np.radians(40.0))  # cosine of the angle between facets from which on they are of two parts
@@ -124,7 +124,7 @@ def _quadratic(around: FloatArray, normal: FloatArray) -> tuple[FloatArray, Floa
 
 def _followed(mesh: Loaded, outer: IntArray, shifts: FloatArray) -> FloatArray:
     """Shifts (n, 3) of all vertices: those inside are at rest between springs along the edges, stiffer where short."""
-    edges = np.unique(np.sort(mesh.cells[:, EDGES[mesh.cell]].reshape(-1, 2), axis=1), axis=0)
+    edges, _ = edges_of(mesh.cells, mesh.cell)
     n, stiff = len(mesh.points), 1 / ((mesh.points[edges[:, 0]] - mesh.points[edges[:, 1]]) ** 2).sum(axis=1)
     both = np.concatenate([edges, edges[:, ::-1]]).T
     springs = csr_matrix((np.concatenate([stiff, stiff]), both), shape=(n, n))

@@ -14,6 +14,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import AfterValidator, Field, model_validator
 
+from forward.bodies.location import locate
 from forward.bodies.mesh import default_quadrature
 from forward.bodies.mesh_file import MeshFile
 from forward.findings import Finding
@@ -68,6 +69,11 @@ class _SixSided(Settings):
     """
 
     structured: ClassVar[bool] = True  # whether cells lie along edges of the body, and any number of them
+    boundaries: ClassVar[tuple[str, ...]] = tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
+    # There are no named regions, there is no file whose contents could be listed, and nothing is unusual about it.
+    regions: ClassVar[tuple[str, ...]] = ()
+    listed: ClassVar[dict[str, str]] = {}
+    findings: ClassVar[tuple[Finding, ...]] = ()
     kind: str
     cells: tuple[Count, Count, Count]
     cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
@@ -148,16 +154,6 @@ class _SixSided(Settings):
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
 
     @property
-    def boundaries(self) -> tuple[str, ...]:
-        """Names of the boundaries."""
-        return tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
-
-    @property
-    def regions(self) -> tuple[str, ...]:
-        """There are no named regions."""
-        return ()
-
-    @property
     def cell_count(self) -> int:
         """Number of cells."""
         a, b, c = self.cells
@@ -167,16 +163,6 @@ class _SixSided(Settings):
     def cells_in_words(self) -> str:
         """How many cells there are along each edge."""
         return " × ".join(f"{n}" for n in self.cells)
-
-    @property
-    def listed(self) -> dict[str, str]:
-        """Contents of a file, in words: there is no file."""
-        return {}
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Nothing is unusual about it."""
-        return ()
 
     @property
     def nodes(self) -> int:
@@ -342,20 +328,6 @@ class Block(_SixSided):
         """Map points (n, 3) of the cube into the body (m)."""
         return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
 
-    def contains(self, point: Vector) -> bool:
-        """Whether a point (m) lies in the undeformed body."""
-        steps = np.linspace(0, 1, 5)
-        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-        gaps = np.asarray(point) - self.shaped(guesses)
-        # Newton's method from the nearest guess, kept near the cube: the map is not invertible everywhere outside.
-        x = guesses[[np.linalg.norm(gaps, axis=1).argmin()]]
-        for _ in range(30):
-            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.shaped(x)[0], rcond=None)[0]
-            x = np.clip(x + step, -0.1, 1.1)
-        gap = np.abs(np.asarray(point) - self.shaped(x)[0]).max()
-        extent = max(high - low for low, high in self.bounds)
-        return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
-
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         from scipy.optimize import lsq_linear
@@ -412,12 +384,12 @@ def tolerance(body: Body) -> float:
 
 def outside(body: Body, point: Vector) -> float:
     """How far (m) a point lies outside the undeformed body; for a mesh from a file, outside the box around it."""
-    if body.kind == "block" and body.contains(point):  # where its nearest place is less exact
-        return 0.0
-    at = np.array([point])
+    at, rounding = np.array([point]), ROUNDING * tolerance(body)
+    if body.kind == "block" and locate(np.array([body.corners]), at).distances[0] <= rounding:
+        return 0.0  # where its nearest place is less exact
     place = np.clip(at, *np.transpose(body.bounds)) if body.kind == "mesh" else body.nearest(at)
     gap = float(np.linalg.norm(place - at))
-    return gap if gap > ROUNDING * tolerance(body) else 0.0
+    return gap if gap > rounding else 0.0
 
 
 def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...]:

@@ -152,10 +152,7 @@ def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]
 
 
 def derived(
-    inclusions: Sequence[Sphere | Ellipsoid],
-    parameters: Sequence[str],
-    points: FloatArray,
-    places: FloatArray | None = None,
+    inclusions: Sequence[Sphere | Ellipsoid], parameters: Sequence[str], points: FloatArray
 ) -> dict[str, FloatArray]:
     """Return what follows from the numbers of inclusions at many parameter vectors, by path.
 
@@ -167,39 +164,35 @@ def derived(
         Paths of the parameters; numbers of the inclusions that are not among them keep their values.
     points
         Parameters (n, d).
-    places
-        Places (k, 3) (m) at which the factor on the stiffness is wanted.
 
     Returns
     -------
     dict
-        "inclusions.NAME.volume" (m³) of where the indicator is above ½: 4/3 π abc (n,); "stiffness.i" (1), the
-        product of the factors of all inclusions at place i (n,).
+        "inclusions.NAME.volume" (m³) of where the indicator is above ½: 4/3 π abc (n,).
     """
     found: dict[str, FloatArray] = {}
-    factor: Any = 1.0
     for inclusion in inclusions:
-        path = f"inclusions.{inclusion.label}"
-        numbers = {
-            name: points[:, [parameters.index(f"{path}.{name}")]] if f"{path}.{name}" in parameters else value
-            for name, value in inclusion.model_dump(exclude={"kind", "name"}).items()
-        }
-        volume = (
-            4 / 3 * np.pi * np.prod([np.broadcast_to(numbers[r], (len(points), 1)) for r in RADII[inclusion.kind]], 0)
-        )
-        found[f"{path}.volume"] = np.asarray(volume[:, 0])
-        if places is not None:
-            factor = factor * stiffness_factor(OPS, places.T, inclusion.kind, **numbers)
-    if places is not None:
-        columns = np.broadcast_to(factor, (len(points), len(places))).T
-        found |= {f"stiffness.{i}": np.array(column) for i, column in enumerate(columns)}
+        numbers = _numbers(inclusion, parameters, points)
+        radii = [np.broadcast_to(numbers[r], (len(points), 1)) for r in RADII[inclusion.kind]]
+        found[f"inclusions.{inclusion.label}.volume"] = (4 / 3 * np.pi * np.prod(radii, 0))[:, 0]
     return found
 
 
 def log_factor(
     inclusions: Sequence[Sphere | Ellipsoid], parameters: Sequence[str], points: FloatArray, places: FloatArray
 ) -> FloatArray:
-    """Return ln of what inclusions multiply the stiffness by (n, k) at places (k, 3); arguments as in `derived`."""
-    found = derived(inclusions, parameters, points, places)
-    columns = [values for path, values in found.items() if path.startswith("stiffness.")]
-    return np.log(np.column_stack(columns)) if inclusions else np.zeros((len(points), len(places)))
+    """Return ln of what inclusions multiply the stiffness by (n, k) at places (k, 3) (m); arguments as in `derived`."""
+    factor = np.ones((len(points), len(places)))
+    for inclusion in inclusions:
+        numbers = _numbers(inclusion, parameters, points)
+        factor = factor * stiffness_factor(OPS, places.T, inclusion.kind, **numbers)
+    return np.asarray(np.log(factor))
+
+
+def _numbers(inclusion: Sphere | Ellipsoid, parameters: Sequence[str], points: FloatArray) -> dict[str, Any]:
+    """Return the numbers of an inclusion by name: columns (n, 1) of the points where they are parameters."""
+    path = f"inclusions.{inclusion.label}"
+    return {
+        name: points[:, [parameters.index(f"{path}.{name}")]] if f"{path}.{name}" in parameters else value
+        for name, value in inclusion.model_dump(exclude={"kind", "name"}).items()
+    }

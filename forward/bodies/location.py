@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.bodies.mesh import FACES
 from forward.model import FloatArray
 
 ROUNDING = 1e-12  # of the extent of the mesh: distance that counts as rounding
@@ -19,7 +20,6 @@ STEPS = 30  # of Newton's method in a hexahedron
 NEAREST = 8  # cells that are tried for a point in no cell
 AT_ONCE = 2048  # points
 FEW = 2**21  # pairs of a point and a cell, all of which are looked at
-FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])  # of a tetrahedron
 
 
 class Located(NamedTuple):
@@ -124,7 +124,7 @@ def _in_tetrahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
     found = shares(points, corners)
     out = np.flatnonzero((found < 0).any(axis=1))
     if len(out):
-        faces = np.array([nearest_of(corners[out][:, face], points[out]) for face in FACES])
+        faces = np.array([nearest_of(corners[out][:, face], points[out]) for face in FACES["tetrahedron"]])
         best = ((faces - points[out]) ** 2).sum(axis=2).argmin(axis=0)
         found[out] = np.maximum(shares(faces[best, np.arange(len(out))], corners[out]), 0.0)
     return np.asarray((found / found.sum(axis=1, keepdims=True))[:, 1:])

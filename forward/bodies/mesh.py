@@ -5,44 +5,49 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field, replace
 from math import comb
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.bodies import hexahedra
 from forward.model import FloatArray, ModelError
 from forward.settings import Settings, nearest
 
 Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
+T = TypeVar("T", bound=np.generic)
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
 APART = 1e-6, 1e-3  # how far lips of closed slits are drawn apart, over that extent, and at most over the shortest edge
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])  # VTK's
+X_FIRST = [0, 1, 3, 2, 4, 5, 7, 6]  # these, x first, then y, then z
 FACES = {
     "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
-    "hexahedron": hexahedra.FACES.tolist(),
+    "hexahedron": [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [3, 2, 6, 7], [0, 3, 7, 4], [1, 2, 6, 5]],  # in circles
 }
 EDGES = {
     "tetrahedron": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
-    "hexahedron": hexahedra.EDGES.tolist(),
+    "hexahedron": [[a, b] for a in range(8) for b in range(a, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1],
 }
 TETRAHEDRA = {
     "tetrahedron": [[0, 1, 2, 3]],
     "hexahedron": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
 }
-# Corners of hexahedra with their neighbours, in an order that makes all determinants positive.
-CORNERS = [
-    [0, 1, 3, 4],
-    [1, 2, 0, 5],
-    [2, 3, 1, 6],
-    [3, 0, 2, 7],
-    [4, 7, 5, 0],
-    [5, 4, 6, 1],
-    [6, 5, 7, 2],
-    [7, 6, 4, 3],
-]
+# Corners with their neighbours, in an order that makes all determinants positive; of a tetrahedron one is enough.
+AT_CORNERS = {
+    "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [
+        [0, 1, 3, 4],
+        [1, 2, 0, 5],
+        [2, 3, 1, 6],
+        [3, 0, 2, 7],
+        [4, 7, 5, 0],
+        [5, 4, 6, 1],
+        [6, 5, 7, 2],
+        [7, 6, 4, 3],
+    ],
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +131,21 @@ def twins_of(points: FloatArray) -> int:
     return len(points) - int(places_of(points).max()) - 1
 
 
-def surface_faces(cells: IntArray, cell: str) -> IntArray:
-    """Return the faces (n, 3 or 4) that belong to one cell, by their vertices."""
-    return surface_of(cells, cell)[0]
+def edges_of(cells: IntArray, cell: str) -> tuple[IntArray, IntArray]:
+    """Return the edges (n, 2) of cells, the lower vertex first, and their numbers (c, 6 or 12) for each cell."""
+    edges = np.sort(cells[:, EDGES[cell]].reshape(-1, 2), axis=1)
+    found, number = np.unique(edges, axis=0, return_inverse=True)
+    return found, number.reshape(len(cells), -1)
+
+
+def faces_of(cells: IntArray, cell: str) -> IntArray:
+    """Return the faces (n, 3 or 4) of all cells, one cell after the other, by their vertices."""
+    return np.asarray(cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0])))
 
 
 def surface_of(cells: IntArray, cell: str) -> tuple[IntArray, IntArray]:
     """Return the faces (n, 3 or 4) that belong to one cell, by their vertices, and the numbers (n,) of these cells."""
-    faces = cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0]))
+    faces = faces_of(cells, cell)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     outer = first[count == 1]
     return np.asarray(faces[outer]), np.asarray(outer // len(FACES[cell]))
@@ -150,7 +162,7 @@ def opened(points: FloatArray, cells: IntArray, cell: str) -> tuple[FloatArray, 
     places = places_of(points)
     if places.max() + 1 == len(points):
         return points, np.zeros((0, len(FACES[cell][0])), dtype=np.int64), 0
-    outer = surface_faces(cells, cell)
+    outer, _ = surface_of(cells, cell)
     _, which, count = np.unique(np.sort(places[outer], axis=1), axis=0, return_inverse=True, return_counts=True)
     lips = outer[count[which.ravel()] > 1]
     holder = np.full(len(points), len(cells))  # of each point, the cell that comes first
@@ -210,17 +222,13 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
     for name in towards:
         held[mesh.boundaries[name]] = 0.5 - QUARTER
     if mesh.cell == "hexahedron":
-        found = hexahedra.divided(mesh.points, mesh.cells, mesh.boundaries, held)
-        return replace(mesh, **found._asdict(), region=np.repeat(mesh.region, 8))
-    ends, which = np.unique(
-        np.sort(mesh.cells[:, EDGES["tetrahedron"]].reshape(-1, 2), axis=1), axis=0, return_inverse=True
-    )
-    number = len(mesh.points) + which.reshape(-1, 6)
+        return _hexahedra_divided(mesh, held)
+    ends, edge = edges_of(mesh.cells, mesh.cell)
     share = 0.5 + held[ends[:, 1]] - held[ends[:, 0]]  # of the second end
     points = np.concatenate(
         [mesh.points, (1 - share)[:, None] * mesh.points[ends[:, 0]] + share[:, None] * mesh.points[ends[:, 1]]]
     )
-    m01, m02, m03, m12, m13, m23 = number.T
+    m01, m02, m03, m12, m13, m23 = len(mesh.points) + edge.T
     v0, v1, v2, v3 = mesh.cells.T
     corners = [(v0, m01, m02, m03), (v1, m01, m12, m13), (v2, m02, m12, m23), (v3, m03, m13, m23)]
     cuts = []
@@ -253,6 +261,65 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
     )
 
 
+def _hexahedra_divided(mesh: Loaded, nearer: FloatArray) -> Loaded:
+    """Divide every hexahedron into eight trilinear ones, which fill the same body.
+
+    The point that divides an edge lies nearer to a vertex than the middle by `nearer` (n,) of its length, less that of
+    the other end. Points on faces and inside are at the mean shares of the edges along them.
+    """
+    points, cells = mesh.points, mesh.cells
+    ends, edge = edges_of(cells, mesh.cell)
+    around = faces_of(cells, mesh.cell)
+    sides, first, face = np.unique(np.sort(around, axis=1), axis=0, return_index=True, return_inverse=True)
+    circles = around[first]
+    starts = np.cumsum([len(points), len(ends), len(sides)])
+
+    def share(a: IntArray, b: IntArray) -> FloatArray:
+        """Of the way from vertices a to b."""
+        return np.asarray(0.5 + nearer[b] - nearer[a])
+
+    i, j = ends.T
+    on_edges = points[i] + share(i, j)[:, None] * (points[j] - points[i])
+    a, b, c, d = circles.T
+    on_faces = _at(points, circles[:, [0, 1, 3, 2]], (share(a, b) + share(d, c)) / 2, (share(a, d) + share(b, c)) / 2)
+    along = [[(a, b) for a, b in np.ndindex(8, 8) if (CORNERS[b] - CORNERS[a] == unit).all()] for unit in np.eye(3)]
+    inside = [np.mean([share(cells[:, p], cells[:, q]) for p, q in pairs], axis=0) for pairs in along]
+    whole = np.concatenate([points, on_edges, on_faces, _at(points, cells[:, X_FIRST], *inside)])
+
+    numbers = np.empty((len(cells), 3, 3, 3), dtype=np.int64)  # of the 27 points of each cell
+    numbers[:, 1, 1, 1] = starts[2] + np.arange(len(cells))
+    for k, at in enumerate(CORNERS):
+        numbers[:, *(2 * at)] = cells[:, k]
+    for of, offset, entities in ((edge, starts[0], EDGES), (face, starts[1], FACES)):
+        for k, corners in enumerate(entities[mesh.cell]):
+            middle = 2 * CORNERS[corners].sum(axis=0) // len(corners)
+            numbers[:, *middle] = offset + of.reshape(len(cells), -1)[:, k]
+    parts = [np.stack([numbers[:, *(low + corner)] for corner in CORNERS], axis=1) for low in CORNERS]
+    edge_keys, side_keys = ends[:, 0] << 32 | ends[:, 1], {tuple(side): n for n, side in enumerate(sides.tolist())}
+
+    def quartered(facets: IntArray) -> IntArray:
+        which = np.array([side_keys[tuple(sorted(facet))] for facet in facets.tolist()])
+        around = circles[which]
+        pairs = np.sort(np.stack([around, np.roll(around, -1, axis=1)], axis=2), axis=2)
+        after = starts[0] + np.searchsorted(edge_keys, pairs[..., 0] << 32 | pairs[..., 1])
+        before = np.roll(after, 1, axis=1)
+        quads = [np.stack([around[:, k], after[:, k], starts[1] + which, before[:, k]], axis=1) for k in range(4)]
+        return np.asarray(np.stack(quads, axis=1).reshape(-1, 4))
+
+    boundaries = {name: quartered(facets) for name, facets in mesh.boundaries.items()}
+    divided = np.stack(parts, axis=1).reshape(-1, 8)
+    return replace(mesh, points=whole, cells=divided, boundaries=boundaries, region=np.repeat(mesh.region, 8))
+
+
+def _at(points: FloatArray, corners: IntArray, *shares: FloatArray) -> FloatArray:
+    """Return multilinear combinations of corners (c, 2^k), x first, at shares (c,) along each of k axes."""
+    found = points[corners]
+    for share in shares[::-1]:
+        low, high = np.split(found, 2, axis=1)
+        found = low + share[:, None, None] * (high - low)
+    return np.asarray(found[:, 0])
+
+
 def divided_contents(found: Contents) -> Contents:
     """Say what a mesh holds whose cells are divided into eight.
 
@@ -260,36 +327,23 @@ def divided_contents(found: Contents) -> Contents:
     middles of opposite edges, the squares of which are a quarter of the sum of those of the six edges. A quadrilateral
     has four, a hexahedron six.
     """
-    if found.cell == "hexahedron":
-        return found.model_copy(
-            update={
-                "vertices": found.vertices + found.edges + found.faces + found.cells,
-                "edges": 2 * found.edges + 4 * found.faces + 6 * found.cells,
-                "faces": 4 * found.faces + 12 * found.cells,
-                "cells": 8 * found.cells,
-                "longest_edge": found.longest_edge / 2,
-            }
-        )
-    return found.model_copy(
-        update={
-            "vertices": found.vertices + found.edges,
-            "edges": 2 * found.edges + 3 * found.faces + found.cells,
-            "faces": 4 * found.faces + 8 * found.cells,
-            "cells": 8 * found.cells,
-            "longest_edge": found.longest_edge / 2**0.5,
-        }
-    )
+    hexahedra = found.cell == "hexahedron"
+    changes = {
+        "vertices": found.vertices + found.edges + (found.faces + found.cells if hexahedra else 0),
+        "edges": 2 * found.edges + (4 * found.faces + 6 * found.cells if hexahedra else 3 * found.faces + found.cells),
+        "faces": 4 * found.faces + (12 if hexahedra else 8) * found.cells,
+        "cells": 8 * found.cells,
+        "longest_edge": found.longest_edge / (2 if hexahedra else 2**0.5),
+    }
+    return found.model_copy(update=changes)
 
 
 def contents(mesh: Loaded, digest: str) -> Contents:
     """Return what a study needs to know about a mesh."""
     points, cells = mesh.points, mesh.cells
-    edges = np.unique(np.sort(cells[:, EDGES[mesh.cell]].reshape(-1, 2), axis=1), axis=0)
-    faces = np.unique(
-        np.sort(cells[:, FACES[mesh.cell]].reshape(len(cells) * len(FACES[mesh.cell]), -1), axis=1), axis=0
-    )
-    corners = [[0, 1, 2, 3]] if mesh.cell == "tetrahedron" else CORNERS
-    at = points[cells[:, corners]]
+    edges, _ = edges_of(cells, mesh.cell)
+    faces = np.unique(np.sort(faces_of(cells, mesh.cell), axis=1), axis=0)
+    at = points[cells[:, AT_CORNERS[mesh.cell]]]
     # Of a hexahedron, the mean of the volumes at its corners: near enough to be shown.
     share = 6 if mesh.cell == "tetrahedron" else 1
     volumes = np.abs(np.linalg.det(at[:, :, 1:] - at[:, :, :1])).mean(axis=1) / share
@@ -311,10 +365,14 @@ def contents(mesh: Loaded, digest: str) -> Contents:
     )
 
 
+def fan(corners: NDArray[T]) -> NDArray[T]:
+    """Return the triangles (n (k − 2), 3, …) that facets (n, k, …) are divided into around their first corners."""
+    return np.concatenate([corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)])
+
+
 def area(corners: FloatArray) -> float:
     """Return the area of facets (n, 3 or 4, 3) together."""
-    around = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
-    a, b, c = np.moveaxis(corners[:, around], 2, 0)
+    a, b, c = np.moveaxis(fan(corners), 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
 
 

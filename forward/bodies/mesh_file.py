@@ -30,8 +30,9 @@ from forward.bodies.mesh import (
     default_quadrature,
     divided,
     divided_contents,
+    fan,
     node_count,
-    surface_faces,
+    surface_of,
 )
 from forward.bodies.mesh_reading import digest_of, load
 from forward.findings import Finding
@@ -232,8 +233,7 @@ class MeshFile(Settings):
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
-        mesh, outer = self.load(), self.surface
-        triangles = np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
+        mesh, triangles = self.load(), fan(self.surface)
         found = np.array(points, dtype=float)
         located = locate(mesh.points[mesh.cells[:, TETRAHEDRA[mesh.cell]].reshape(-1, 4)], found)
         for i in np.flatnonzero(located.distances > CLOSE * max(high - low for low, high in self.bounds)):
@@ -245,7 +245,7 @@ class MeshFile(Settings):
     def surface(self) -> FloatArray:
         """Corners (n, 3 or 4, 3) of all faces that belong to one cell (m)."""
         mesh = self.load()
-        return np.asarray(mesh.points[surface_faces(mesh.cells, mesh.cell)])
+        return np.asarray(mesh.points[surface_of(mesh.cells, mesh.cell)[0]])
 
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""

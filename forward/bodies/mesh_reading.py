@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh import CORNERS, FACES, IntArray, Loaded, opened, slits_of, twins_of
+from forward.bodies.mesh import AT_CORNERS, CORNERS, FACES, IntArray, Loaded, faces_of, opened, slits_of, twins_of
 from forward.files import meshes
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
@@ -195,8 +195,7 @@ def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str, refuse: Any
 
 def _check_geometry(points: FloatArray, cells: IntArray, cell: str, twins: int, refuse: Any) -> None:
     """Refuse cells without volume, and parts that only appear to be joined."""
-    corners = [[0, 1, 2, 3]] if cell == "tetrahedron" else CORNERS
-    edges = points[cells[:, corners]]  # cells, corners, 4, 3
+    edges = points[cells[:, AT_CORNERS[cell]]]  # cells, corners, 4, 3
     sides = edges[:, :, 1:] - edges[:, :, :1]
     volumes = np.linalg.det(sides)
     size = np.linalg.norm(sides, axis=-1).max(axis=(1, 2)) ** 3
@@ -220,9 +219,8 @@ def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    shapes = np.array(FACES[cell])
-    faces = np.sort(cells[:, shapes].reshape(-1, shapes.shape[1]), axis=1)
-    owners = np.repeat(np.arange(len(cells)), len(shapes))
+    faces = np.sort(faces_of(cells, cell), axis=1)
+    owners = np.repeat(np.arange(len(cells)), len(FACES[cell]))
     _, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
     which = which.ravel()
     if (count > 2).any():
@@ -245,7 +243,7 @@ def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -
 
 def _outer(facets: IntArray, groups: dict[str, NDArray[np.bool_]], cells: IntArray, cell: str) -> dict[str, IntArray]:
     """Return the facets of each group that belong to only one cell: those on the surface of the body."""
-    faces = np.sort(cells[:, FACES[cell]].reshape(-1, facets.shape[1]), axis=1)
+    faces = np.sort(faces_of(cells, cell), axis=1)
     sorted_facets = np.sort(facets, axis=1)
     unique, which = np.unique(np.concatenate([faces, sorted_facets]), axis=0, return_inverse=True)
     which = which.ravel()

@@ -197,10 +197,10 @@ class Matern:
         robin: float = ROBIN,
     ) -> None:
         self._smoothness = smoothness
-        self._kappa = inverse_length(length, smoothness)
+        kappa = inverse_length(length, smoothness)
         self._matrix, self._places = mass, places
         self.mass = np.asarray(mass.sum(axis=1)).ravel()
-        self._operator = (self._kappa**2 * mass + laplacian + robin * self._kappa * surface).tocsr()
+        self._operator = (kappa**2 * mass + laplacian + robin * kappa * surface).tocsr()
         self._factor = _factorise(self._operator)
 
     @classmethod
@@ -229,7 +229,7 @@ class Matern:
         return np.asarray(self._factor.solve(self._matrix @ x) if self._smoothness == 4 else x)
 
     @cached_property
-    def _raw_std(self) -> FloatArray:
+    def raw_std(self) -> FloatArray:
         """Point standard deviation (N,) of the solution of the SPDE, exact to rounding.
 
         (A + tM)⁻¹ = A⁻¹ − t A⁻¹MA⁻¹ + …, so that the variances are coefficients of its diagonal, with the other sign.
@@ -238,29 +238,17 @@ class Matern:
         variance = -Dissection(self._matrix, self._places).diagonal_of_inverse(self._operator, self._matrix, order)
         return np.sqrt(variance)
 
-    @property
-    def inflation(self) -> FloatArray:
-        """Variance (N,) of the SPDE before it is set to one, over that in unbounded space."""
-        return self._raw_std**2 / unbounded_variance(self._kappa, self._smoothness)
-
     def root(self, whitened: FloatArray) -> FloatArray:
         """Return the field (N,) of independent standard normal numbers (N,), or (N, k) for k of them."""
-        return np.asarray((self._smooth(self._white @ whitened).T / self._raw_std).T)
+        return np.asarray((self._smooth(self._white @ whitened).T / self.raw_std).T)
 
     def root_transposed(self, g: FloatArray) -> FloatArray:
         """Apply the transpose of `root` to (N,) or (N, k)."""
-        return np.asarray(self._white.T @ self._smooth((g.T / self._raw_std).T))
+        return np.asarray(self._white.T @ self._smooth((g.T / self.raw_std).T))
 
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply the covariance (N, N) with (N,) or (N, k)."""
-        return np.asarray((self._smooth(self._matrix @ self._smooth((g.T / self._raw_std).T)).T / self._raw_std).T)
-
-    def precision(self, x: FloatArray) -> FloatArray:
-        """Multiply the inverse of the covariance with (N,) or (N, k)."""
-        y = self._operator @ (x.T * self._raw_std).T
-        for _ in range(self._smoothness - 1):
-            y = self._operator @ self._mass_factor.solve(y)
-        return np.asarray((y.T * self._raw_std).T)
+        return np.asarray((self._smooth(self._matrix @ self._smooth((g.T / self.raw_std).T)).T / self.raw_std).T)
 
     def modes(self, count: int) -> FloatArray:
         """Return the leading Karhunen–Loève modes (N, count), each times the square root of its eigenvalue.
@@ -315,24 +303,6 @@ def _factorise(matrix: csr_matrix) -> Any:
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _nu(smoothness: Smoothness) -> float:
-    return smoothness - 1.5
-
-
 def inverse_length(length: float, smoothness: Smoothness) -> float:
-    """κ = √(8ν)/length (1/m)."""
-    return float(np.sqrt(8 * _nu(smoothness)) / length)
-
-
-def unbounded_variance(kappa: float, smoothness: Smoothness) -> float:
-    """Variance Γ(ν) / (Γ(α) (4π)^{3/2} κ^{2ν}) of the solution in unbounded space (Lindgren, Rue, Lindström 2011)."""
-    from math import gamma, pi
-
-    nu = _nu(smoothness)
-    return float(gamma(nu) / (gamma(smoothness) * (4 * pi) ** 1.5 * kappa ** (2 * nu)))
-
-
-def correlation(distance: FloatArray, length: float, smoothness: Smoothness) -> FloatArray:
-    """Matérn correlation (κr)^ν K_ν(κr) / (2^{ν−1} Γ(ν)) at distances (m), in closed form for ν = 1/2 and 5/2."""
-    x = inverse_length(length, smoothness) * np.asarray(distance)
-    return np.asarray(np.exp(-x) * (1 if smoothness == 2 else 1 + x + x**2 / 3))
+    """κ = √(8ν)/length (1/m), with ν = α − 3/2."""
+    return float(np.sqrt(8 * (smoothness - 1.5)) / length)

@@ -39,18 +39,13 @@ class Dissection:
     """
 
     def __init__(self, pattern: csr_matrix, places: FloatArray) -> None:
-        self._indptr, self._indices = pattern.indptr, pattern.indices
-        self._places = places
+        self._pattern, self._places = pattern, places
         self._fronts: list[_Front] = []
         self._size = len(places)
-        self._marks = np.zeros(self._size, dtype=np.int64)
         self._divide(np.arange(self._size))
-        del self._marks
 
     def _neighbours(self, vertices: Indices) -> Indices:
-        counts = self._indptr[vertices + 1] - self._indptr[vertices]
-        starts = np.repeat(self._indptr[vertices] - np.cumsum(counts) + counts, counts)
-        return np.asarray(self._indices[starts + np.arange(counts.sum())], dtype=np.int64)
+        return np.asarray(self._pattern[vertices].indices, dtype=np.int64)
 
     def _divide(self, vertices: Indices) -> tuple[int, ...]:
         """Add the fronts of a set of vertices; return the last one, if there are any."""
@@ -63,19 +58,14 @@ class Dissection:
             axis = int(np.ptp(places, axis=0).argmax())
             order = np.argsort(places[:, axis], kind="stable")
             low = vertices[order[: len(order) // 2]]
-            self._marks[low] = 1
             high = vertices[order[len(order) // 2 :]]
             # Those of the upper half that touch the lower half separate the rest of it.
-            touching = np.zeros(len(high), dtype=bool)
-            near = np.unique(self._neighbours(low))
-            touching[np.isin(high, near, assume_unique=True)] = True
-            self._marks[low] = 0
+            touching = np.isin(high, np.unique(self._neighbours(low)), assume_unique=True)
             own = high[touching]
             before = self._divide(low) + self._divide(high[~touching])
         inherited = [self._fronts[k].border for k in before]
         candidates = np.unique(np.concatenate([self._neighbours(own), *inherited]))
-        eliminated = np.concatenate([own, *([vertices] if before else [])])
-        border = candidates[~np.isin(candidates, eliminated)]
+        border = candidates[~np.isin(candidates, vertices)]
         self._fronts.append(_Front(np.sort(own), border, before))
         return (len(self._fronts) - 1,)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.location import nearest_of
+from forward.bodies.mesh import fan
 from forward.model import FloatArray
 
-T = TypeVar("T", bound=np.generic)
 NEAREST = 4  # triangles that are tried first
 AT_ONCE = 200_000  # pairs of a point and a triangle
 FINE = 12  # parts of the edge of a facet at which it is looked at closely
@@ -32,11 +30,6 @@ def facets(body: Body, boundary: str) -> FloatArray:
     lattice = body.place(lattice.reshape(-1, 3)).reshape(lattice.shape)
     corners = [lattice[:-1, :-1], lattice[1:, :-1], lattice[1:, 1:], lattice[:-1, 1:]]
     return np.asarray(np.stack(corners, axis=2).reshape(-1, 4, 3))
-
-
-def fan(corners: NDArray[T]) -> NDArray[T]:
-    """Return the triangles (n (k − 2), 3, …) that facets (n, k, …) are divided into around their first corners."""
-    return np.concatenate([corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)])
 
 
 def edges(corners: FloatArray) -> FloatArray:

@@ -15,8 +15,7 @@ from pydantic import PrivateAttr
 
 from forward.bodies.bisection import Bisected
 from forward.bodies.geometry import AXES, Block, Body, Box
-from forward.bodies.hexahedra import CORNERS, FACES
-from forward.bodies.mesh import Contents, IntArray, Loaded, contents
+from forward.bodies.mesh import CORNERS, Contents, IntArray, Loaded, contents, faces_of
 from forward.bodies.mesh_file import MOST_NODES, MeshFile
 from forward.bodies.mesh_reading import BOUNDARY
 from forward.model import FloatArray, ModelError
@@ -155,7 +154,7 @@ def _hexahedra(body: Box | Block, parts: int, towards: Collection[str], layers: 
         lines.append(np.unique(np.concatenate([np.arange(n * parts + 1) / parts, *ends])) / n)
     lattice, stride, origins = _lattice(np.array([len(line) for line in lines]))
     cells = origins + CORNERS @ stride
-    boundaries = _ends(lattice, cells[:, FACES].reshape(-1, 4))
+    boundaries = _ends(lattice, faces_of(cells, "hexahedron"))
     shares = np.column_stack([line[lattice[:, axis]] for axis, line in enumerate(lines)])
     points = body.place(shares * np.array(body.meshed))
     return Loaded(points, cells, "hexahedron", boundaries, ("body",), np.zeros(len(cells), dtype=np.int64))

@@ -125,6 +125,7 @@ def adapt(
         first, place = tetrahedra(spec.body)
         marked = Bisected.of(first)
     found: Adapted | None = None
+    cycles: tuple[Cycle, ...] = ()
     while True:
         mesh = None
         if marked is not None and place is not None:
@@ -132,26 +133,23 @@ def adapt(
             mesh = replace(mesh, points=place(mesh.points))
         held = comm.bcast(None if mesh is None else contents(mesh, ""))
         finer = spec.model_copy(update={"body": MeshInMemory.of(mesh, held, spec.body)})
-        stopped = _too_large(finer, settings.unknowns) if found is not None else None
-        if found is not None and stopped is None and len(found.cycles) > settings.cycles:
-            stopped = f"cycles = {settings.cycles}"
-        if stopped is not None:
-            assert found is not None
-            return replace(found, stopped=stopped)
+        if found is not None:
+            enough = f"cycles = {settings.cycles}" if len(cycles) > settings.cycles else None
+            if stopped := _too_large(finer, settings.unknowns) or enough:
+                return replace(found, stopped=stopped)
         begin = time.process_time()
         try:
             model = HyperelasticModel(finer, comm, parameters)
             start = None if before is None else moved(before[0], model.equations, before[1])
             solution = model.solve(point, None if start is None else Guess(model.space.scatter(start)[0]))
-            cycle = _cycle(() if found is None else found.cycles, finer, solution)
+            cycle = _cycle(cycles, finer, solution)
             relative = cycle.relative[list(settings.named(spec))]
             indicators = _indicators(model, solution, cycle, mesh)
         except SolveError as error:
             if found is None:
                 raise
             return replace(found, stopped=f"on a mesh of {finer.unknowns:,} unknowns there is no answer: {error}")
-        cycle = replace(cycle, seconds=time.process_time() - begin)
-        cycles = (*(() if found is None else found.cycles), cycle)
+        cycles = (*cycles, replace(cycle, seconds=time.process_time() - begin))
         found = Adapted(mesh, indicators, held, cycles, None)
         before = None if finer.mixed else (model.equations, solution.state[None])
         say(_line(spec, cycle))

@@ -133,24 +133,21 @@ class DiscreteBody(Generic[S]):
         """
         equations = self.equations
         equations.set_state(found.state)
-        for label, penetration in equations.penetrations().items():
-            depth, aim = equations.number(f"loads.{label}.depth"), self._aims[label]
+        penetrations = equations.penetrations()
+        for load in (load for load in self.spec.loads if load.contact):
+            depth, aim = equations.number(f"loads.{load.label}.depth"), load.penetration  # type: ignore[attr-defined]
+            penetration = penetrations[load.label]
             if depth <= 0 or penetration <= aim * depth:
                 continue
             if stiffer >= STIFFER**RAISES:
                 message = (
-                    f"the body enters the tool '{label}' by {penetration / depth:.2g} of its depth, where {aim:g} is "
-                    f"aimed at, even with tools {stiffer:g} times as stiff as the depth and the constants as stated "
+                    f"the body enters the tool '{load.label}' by {penetration / depth:.2g} of its depth, where {aim:g} "
+                    f"is aimed at, even with tools {stiffer:g} times as stiff as the depth and the constants as stated "
                     "ask for: pressures are far above these; state constants, or a depth, near those of the samples"
                 )
                 raise SolveError(message, work=equations.work)
             return True
         return False
-
-    @cached_property
-    def _aims(self) -> dict[str, float]:
-        """Penetrations that are aimed at, relative to the depth, by the labels of the tools."""
-        return {load.label: load.penetration for load in self.spec.loads if load.contact}  # type: ignore[attr-defined]
 
     def refuse_sharp(self, found: Found) -> None:
         """Refuse a body that nothing has moved though a tool is inside it, between the points that are looked at."""

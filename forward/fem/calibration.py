@@ -34,7 +34,7 @@ from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.layout import sorted_by_place
 from forward.fem.mesh_error_cost import Finer, finer
-from forward.fem.solution import FiniteElementSolution
+from forward.fem.solution import LEAST, MOST, FiniteElementSolution
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, ModelError, ReferenceSolution, Saturation, SolveError
 from forward.observables.observable import Functional
@@ -43,7 +43,6 @@ LOWEST, HIGHEST = 1.0, 4.0  # orders
 USUAL = 1.5  # the same where none shows, and no estimate on the finer mesh bounds what is left there
 ORDERS = np.linspace(HIGHEST, LOWEST, 400)
 OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
-LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 THOROUGH = {False: 2e-3, True: 1e-4}  # nonlinearity left where one step is not enough, without pressures and with them
 
 
@@ -138,6 +137,7 @@ class FinerMesh:
     def __init__(self, model: Body, spare: float = math.inf) -> None:
         self._model, self._spare = model, spare
         self._scalars = [i for i, path in enumerate(model.parameters) if path in model.spec.scalars]
+        self._names = tuple(model.parameters[i] for i in self._scalars)
 
     @cached_property
     def _finer(self) -> Finer | None:
@@ -154,10 +154,6 @@ class FinerMesh:
         """The same for one solution."""
         assert self._finer is not None
         return _once(self._model, self._finer.spec, self._names)
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return tuple(self._model.parameters[i] for i in self._scalars)
 
     @cached_property
     def _lifted(self) -> LoadedBody | None:

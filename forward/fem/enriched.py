@@ -144,16 +144,8 @@ class Enriched(EnrichedEquations):
     def _rule(self) -> Rule:
         return RULES[self.way == Way.SMOOTHING, self.equations.spec.mixed]
 
-    def state(self, solution: Linearised, bent: float | None = None) -> EnrichedState:
-        """Find u_h + e; collective.
-
-        Parameters
-        ----------
-        solution
-            A solution of the body.
-        bent
-            Nonlinearity above which another step is made, one where the stiffness at the solution will do; None for
-            the usual one.
+    def state(self, solution: Linearised) -> EnrichedState:
+        """Find u_h + e from a solution of the body; collective.
 
         Raises
         ------
@@ -172,9 +164,7 @@ class Enriched(EnrichedEquations):
         left = self.imbalance(solution, start + change)
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         found = EnrichedState(start + change, change, energy, stored, far, Work(), start, change, start)
-        if bent is None:
-            bent = self._rule.bent
-        return self._nearer(solution, found, left, bent, once=True)
+        return self._nearer(solution, found, left, self._rule.bent, once=True)
 
     def nearer(self, solution: Linearised, found: EnrichedState, bent: float) -> EnrichedState:
         """Go on from a state that was found until its nonlinearity is below `bent`; collective.

@@ -11,14 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
+from forward.fem.dolfinx.linear import Preconditioner
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.equations import Discretisation
-from forward.fem.linearisation import Preconditioner
 from forward.fem.mesh_error_cost import Way, estimate
 from forward.fem.reference import ReferenceFactor
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, ReferenceSolution, Work
-from forward.solvers.anderson import block_galerkin
 from forward.solvers.multigrid import minimised, smoothed
 
 ROUGH = 0.03  # tolerance of solves with the stiffness of the body, relative to the solution
@@ -84,9 +83,7 @@ class EnrichedEquations:
         """Set parameters, loads and state to those of a solution of the body, or to a state (U⁺_local,) near it."""
         equations, key = self.equations, solution if at is None else at
         if equations.linearisation_point.solution is not key:
-            equations.set_parameters(solution.parameters, solution.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(self.up(solution.state) if at is None else at)
+            equations.set_to(solution.parameters, self.up(solution.state) if at is None else at, solution.stiffer)
             equations.linearisation_point.solution = key
         return equations
 
@@ -122,10 +119,22 @@ class EnrichedEquations:
         if self.way == Way.SMOOTHING and at is None:  # where K(u_h) is near
             found = self._solve_by_smoothing(solution, right, close, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
-            found = self._solve_near(solution, solution.reference, right, close, at, transpose=transpose)
+            # With the factor of the enriched stiffness at the reference, unless that is too far away.
+            if self._alone:
+                self.equations.release()
+            known = ReferenceSolution(solution.reference.parameters, self.up(solution.reference.state))
+            factor = self._reference.at(known)
+            R = factor.rotation(self.up(solution.state) if at is None else at)
+            self.visit(solution, at)
+            found = factor.solve_near(R, right, close, ITERATIONS, transpose=transpose)
         if found is None:
-            self._factorise(solution, at)
-            found = self.equations.back_substitute(right, transpose=transpose)
+            equations, key = self.visit(solution, at), solution if at is None else at
+            if equations.linearisation_point.factorised is not key:
+                if self._alone:
+                    self._reference.release()
+                equations.factorise(self.up(solution.state) if at is None else at)
+                equations.linearisation_point.factorised = equations.linearisation_point.solution = key
+            found = equations.back_substitute(right, transpose=transpose)
         return found
 
     def _solve_by_smoothing(
@@ -183,9 +192,7 @@ class EnrichedEquations:
         if self._blocks is None or not self._blocks[0].same(at):
             equations = self.equations
             kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
-            equations.set_parameters(at.parameters)
-            equations.at_load(1.0)
-            equations.set_state(self.up(at.state))
+            equations.set_to(at.parameters, self.up(at.state))
             self._blocks = (at, equations.preconditioner())
             equations.work = kept
         return self._blocks[1]
@@ -193,39 +200,3 @@ class EnrichedEquations:
     @cached_property
     def _reference(self) -> ReferenceFactor:
         return ReferenceFactor(self.equations)
-
-    def _solve_near(
-        self,
-        solution: Linearised,
-        reference: ReferenceSolution,
-        right: FloatArray,
-        close: float,
-        at: FloatArray | None,
-        *,
-        transpose: bool,
-    ) -> FloatArray | None:
-        """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
-        equations = self.equations
-        if self._alone:
-            equations.release()
-        known = ReferenceSolution(reference.parameters, self.up(reference.state))
-        self._reference.prepare(known)
-        R = self._reference.rotation(self.up(solution.state) if at is None else at)
-        self.visit(solution, at)
-        return block_galerkin(
-            lambda x: equations.free_stiffness_times(x, transpose=transpose),
-            self._reference.inverse(R, transpose=transpose),
-            right,
-            equations.total,
-            equations.norms,
-            close,
-            ITERATIONS,
-        )
-
-    def _factorise(self, solution: Linearised, at: FloatArray | None) -> None:
-        equations, key = self.visit(solution, at), solution if at is None else at
-        if equations.linearisation_point.factorised is not key:
-            if self._alone:
-                self._reference.release()
-            equations.factorise(self.up(solution.state) if at is None else at)
-            equations.linearisation_point.factorised = equations.linearisation_point.solution = key

@@ -70,8 +70,7 @@ class Discretisation(Sensitivities):
         for i in self.scalars:  # the other numbers stay
             if (constant := self.constants.get(self.parameters[i])) is not None:
                 constant.value = parameters[i]
-        if self.movers:
-            self._full_targets = np.zeros(len(self.fixed))
+        self._full_targets = np.zeros(len(self.fixed))
         for path, mover in self.movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self.movers)
@@ -190,6 +189,12 @@ class Discretisation(Sensitivities):
         self.linearisation_point.moved()
         self._load.value = fraction
         self._targets = fraction * self._full_targets
+
+    def set_to(self, parameters: FloatArray, state: FloatArray, stiffer: float = 1.0) -> None:
+        """Set parameters (d,), all of the load, and a state (U_local,); the factor as of `set_parameters`."""
+        self.set_parameters(parameters, stiffer)
+        self.at_load(1.0)
+        self.set_state(state)
 
     def on_target(self, u: FloatArray) -> FloatArray:
         """Return u (U_local,) with the prescribed unknowns at their targets."""

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, identity, kron
 
 from forward.bodies.location import locate, shapes
+from forward.bodies.mesh import X_FIRST
 from forward.combine import CombinedSolution, Joined, Mapped, OfOne, Rows, sums_of
 from forward.finer_meshes import OF_EQUAL, TIMES, finer, graded, on_mesh, share
 from forward.joined_models import JoinedMeshes
@@ -41,7 +42,6 @@ Begun = tuple[tuple[FloatArray, ...], tuple[str, tuple[str, ...]] | None]
 Keep = Callable[[str, Callable[[], Begun]], Begun]
 WHOLE = 2.0  # times the difference between meshes that show no order, of which nearly a half counts otherwise
 TANGENTS = 20  # parameters up to which a state is predicted from the first one with its derivatives
-VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
 def extrapolated(
@@ -188,18 +188,13 @@ class FromStart(OfOne):
             parts = here[0][1] if here else tuple(scattered(_meshed(model), rows) for model, rows in pairs)
             self.begun.append((parts, reason))
         begun, reason = self.begun[0]
-        unanswered = None if reason is None else SolveError(*reason)
-        if at_start and unanswered is not None:
-            raise unanswered
-        if at_start:  # where states were kept, this solve was not: it is done as it was begun
+        if reason is not None and (at_start or self.needed):
+            raise SolveError(*reason)
+        if at_start or reason is not None:  # where states were kept, this solve was not: it is done as it was begun
             return here[0][0] if here else self.model.solve(parameters)
-        if unanswered is None:
-            step = parameters - self.start
-            guesses = [Guess(rows[0] + step @ rows[1:] if len(rows) > 1 else rows[0]) for rows in begun]
-            return self.model.solve_each(parameters, guesses)
-        if self.needed:
-            raise unanswered
-        return self.model.solve(parameters)
+        step = parameters - self.start
+        guesses = [Guess(rows[0] + step @ rows[1:] if len(rows) > 1 else rows[0]) for rows in begun]
+        return self.model.solve_each(parameters, guesses)
 
     def _begin(self, start: FloatArray, here: list[tuple[CombinedSolution, tuple[FloatArray, ...]]]) -> Begun:
         """Solve at the start, for all to begin from; states are returned whole, and added with the rank's own part."""
@@ -313,7 +308,7 @@ class OtherMesh(OneByOne):
         vertices = vertices_of(self._own.equations)
         cells, _ = vertices.cells()
         if cells.shape[1] == 8:
-            cells = cells[:, VTK_TO_TENSOR]
+            cells = cells[:, X_FIRST]
         found = locate(vertices.coordinates[cells], vertices_of(self._mesh.equations).coordinates)
         return cells[found.cells], shapes(found.local, cells.shape[1])
 

@@ -11,7 +11,7 @@ import ufl
 from numpy.typing import NDArray
 
 from forward.bodies.inclusions import stiffness_factor
-from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
+from forward.fem.dolfinx import assembly, compile, meshes, spaces
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import PressuresAtVertices, VertexField
@@ -70,7 +70,7 @@ class Forms:
         found = meshes.mesh_body(comm, spec.body) if beside is None else (beside.mesh, beside.facets)
         self.mesh: Any = found[0]
         self.facets: dict[str, NDArray[np.int32]] = found[1]
-        self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
+        self.unknowns = spaces.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
         self.size = self.unknowns.size
         self.space = self.unknowns.displacement
         self.layout = Layout(self.space, comm, self.unknowns.pressure)
@@ -243,7 +243,7 @@ class Forms:
 
     def at_points(self, expression: Any, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at the quadrature points."""
-        return self.at(expression, spaces.quadrature_points(self.space, self.spec.body.quadrature), often=often)
+        return self.at(expression, spaces.quadrature(self.space, self.spec.body.quadrature)[0], often=often)
 
     def at(self, expression: Any, points: FloatArray, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at points (q, 3) of the reference cell."""
@@ -405,8 +405,7 @@ class Forms:
     def stresses_at_vertices(self) -> assembly.PointValues:
         """P (n_cells, 4 · 9) (Pa) at the vertices of this rank's tetrahedra, at the state that is set."""
         corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        stress = self._invariants.inserted(self.stress_of(self._potential))
-        return assembly.PointValues(stress, corners, self.space, self.comm)
+        return self.at(self.stress_of(self._potential), corners)
 
     @cached_property
     def gradients(self) -> assembly.NodalAverages:

@@ -73,32 +73,26 @@ class Items:
         np.add.at(vector, self._unknowns, components[self._mine])
         return vector
 
-    def _now(self) -> list[Now]:
-        """Where each item is; collective."""
+    def _now(self) -> list[tuple[Any, Any, Now]]:
+        """Each load with what acts, and where that is; collective."""
         equations = self._equations
         states = np.split(self._taken(equations.state()).reshape(-1, 3), np.cumsum(self._counts)[:-1])
-        return [
-            Now(
-                state,
-                {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars},
-                equations.load,
-                self._time,
-                past,
-            )
-            for (load, _), state, past in zip(self.acting, states, self._past, strict=True)
-        ]
+        found = []
+        for (load, acting), state, past in zip(self.acting, states, self._past, strict=True):
+            numbers = {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars}
+            found.append((load, acting, Now(state, numbers, equations.load, self._time, past)))
+        return found
 
     # --- forces ------------------------------------------------------------------------------------------------------
 
     def forces(self) -> FloatArray:
         """Forces that they add to the imbalance; collective."""
-        found = [acting.forces(now).ravel() for (_, acting), now in zip(self.acting, self._now(), strict=True)]
-        return self._given(np.concatenate(found))
+        return self._given(np.concatenate([acting.forces(now).ravel() for _, acting, now in self._now()]))
 
     def stiffness(self) -> csr_matrix:
         """Their derivative (3n, 3n) by the displacements of the nodes of all items, on every rank; collective."""
-        each = zip(self.acting, self._now(), self._counts, strict=True)
-        return block_diag([_matrix(one.stiffness(now), 3 * n, 3 * n) for (_, one), now, n in each], format="csr")
+        each = zip(self._now(), self._counts, strict=True)
+        return block_diag([_matrix(one.stiffness(now), 3 * n, 3 * n) for (_, one, now), n in each], format="csr")
 
     def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Product of their stiffness, or its transpose, with a vector; collective."""
@@ -107,7 +101,7 @@ class Items:
 
     def by_number(self) -> Iterator[tuple[str, FloatArray]]:
         """Paths of their numbers with the derivatives of the forces; collective."""
-        for i, ((load, acting), now) in enumerate(zip(self.acting, self._now(), strict=True)):
+        for i, (load, acting, now) in enumerate(self._now()):
             for name, forces in acting.by_number(now).items():
                 parts = [np.zeros(3 * n) for n in self._counts]
                 parts[i] = forces.ravel()
@@ -142,16 +136,14 @@ class Items:
         if not self:
             return ()
         self._equations.set_state(u)
-        every = zip(self.acting, self._now(), strict=True)
         return tuple(
-            now.left(acting.kept(now).values if load.remembers else np.zeros(0)) for (load, acting), now in every
+            now.left(acting.kept(now).values if load.remembers else np.zeros(0)) for load, acting, now in self._now()
         )
 
     def _kept(self) -> list[Kept]:
         """What they keep, with derivatives; collective."""
         nothing = Kept(np.zeros(0), NONE, NONE, {})
-        every = zip(self.acting, self._now(), strict=True)
-        return [acting.kept(now) if load.remembers else nothing for (load, acting), now in every]
+        return [acting.kept(now) if load.remembers else nothing for load, acting, now in self._now()]
 
     @cached_property
     def _sizes(self) -> list[int]:
@@ -167,17 +159,13 @@ class Items:
         """Rows (k, M) of what is kept on every rank; collective."""
         return np.asarray(self._equations.comm.bcast(kept))
 
-    def _here(self, kept: FloatArray) -> FloatArray:
-        """This rank's part (k, M_local) of such rows."""
-        return kept[:, : self.kept_size]
-
     def _by_past(self) -> csr_matrix:
         """Derivative (3n, M) of the forces by what was kept before."""
-        each = zip(self.acting, self._now(), self._counts, self._sizes, strict=True)
+        each = zip(self._now(), self._counts, self._sizes, strict=True)
         return block_diag(
             [
                 _matrix(acting.by_past(now) if load.remembers and now.past is not None else NONE, 3 * n, m)
-                for (load, acting), now, n, m in each
+                for (load, acting, now), n, m in each
             ],
             format="csr",
         )
@@ -214,7 +202,8 @@ class Items:
         """
         by_state, by_past, by_number = self._derivatives()
         moved = np.array([self._taken(row) for row in states])
-        return self._here(moved @ by_state.T + self._everywhere(before) @ by_past.T + directions @ by_number.T)
+        found: FloatArray = moved @ by_state.T + self._everywhere(before) @ by_past.T + directions @ by_number.T
+        return found[:, : self.kept_size]
 
     def kept_adjoint(self, kept: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the transpose of `kept_along` for weights (k, M_local); collective.
@@ -224,7 +213,7 @@ class Items:
         by_state, by_past, by_number = self._derivatives()
         weights = self._everywhere(kept)
         states = np.array([self._given(row) for row in weights @ by_state])
-        return states, self._here(weights @ by_past), weights @ by_number
+        return states, (weights @ by_past)[:, : self.kept_size], weights @ by_number
 
 
 def _matrix(entries: Entries, rows: int, columns: int) -> csr_matrix:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -198,10 +198,10 @@ class SpecimenModel(JoinedBodies):
     """
 
     _: KW_ONLY
-    places: FloatArray
-    axes: NDArray[np.int64]
-    directions: FloatArray
-    cases: NDArray[np.int64]
+    places: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    axes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    directions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    cases: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def observing(
         self,
@@ -215,16 +215,8 @@ class SpecimenModel(JoinedBodies):
 
         Parameters
         ----------
-        places
-            Points (n, 3) at which displacements are observed, in the undeformed body (m); those of other outputs do
-            not count.
-        axes
-            Their components (n,): 0, 1 or 2; 3 and more are the other outputs of the load case, in its order.
-        cases
-            Their load cases (n,) by number, in ascending order.
-        directions
-            Unit vectors (n, 3) along which the components are measured, by default the axes of the body; zeros of other
-            outputs.
+        places, axes, cases, directions
+            As of the class. Cases are in ascending order; directions are the axes of the body by default.
         names
             Names of the outputs; by default load case, number and component.
 
@@ -336,7 +328,6 @@ def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel
         where = [i for i, path in enumerate(parameters) if path in own]
         bodies.append(loaded.build(comm, tuple(own[parameters[i]] for i in where)))
         models.append(taking(bodies[-1], where, parameters))
-    none = np.zeros(0, dtype=np.int64)
     model = SpecimenModel(
         tuple(models),
         (),
@@ -345,10 +336,6 @@ def specimen(spec: Any, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel
         space=JoinedSpace(bodies[0].space, len(bodies), models[0].by.along, 0),  # several states are no field
         spec=spec,
         bodies=tuple(bodies),
-        places=np.zeros((0, 3)),
-        axes=none,
-        directions=np.zeros((0, 3)),
-        cases=none,
     )
     rows = list(spec.rows(lambda boundary: _nodes(bodies[0], boundary)))
     cases, names, axes, places = zip(*rows, strict=True) if rows else ((),) * 4

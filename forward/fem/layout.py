@@ -43,17 +43,7 @@ class Layout:
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
-        if self._comm.size == 1:
-            whole = np.empty_like(rows)
-            whole[:, self._unknowns] = rows
-            return whole
-        parts = self._comm.gather((self._unknowns, rows))
-        if parts is None:
-            return None
-        whole = np.empty((len(rows), self.size))
-        for unknowns, part in parts:
-            whole[:, unknowns] = part
-        return whole
+        return gathered(self._comm, self._unknowns, rows)
 
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U) in canonical order."""
@@ -79,6 +69,17 @@ class Layout:
         """This rank's cells."""
         local, kind = spaces.vtk_cells(self._space)
         return self.nodes()[local], kind
+
+
+def gathered(comm: Any, positions: NDArray[np.int64], rows: FloatArray) -> FloatArray | None:
+    """Collect rows (k, n), of which each rank has those at canonical positions (n,), on the first rank."""
+    parts = [(positions, rows)] if comm.size == 1 else comm.gather((positions, rows))
+    if parts is None:
+        return None
+    whole = np.empty((len(rows), sum(len(theirs) for theirs, _ in parts)), dtype=rows.dtype)
+    for theirs, part in parts:
+        whole[:, theirs] = part
+    return whole
 
 
 def vertices_of(equations: Any) -> Layout:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import ufl
@@ -14,7 +13,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces, unknowns
+from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.items import Items
@@ -67,21 +66,6 @@ class LinearisationPoint:
         self.parameters = self.solution = None
 
 
-class Preconditioner(NamedTuple):
-    """An approximate inverse of a stiffness.
-
-    Attributes
-    ----------
-    apply
-        Its product with forces (U_local,).
-    weights
-        What makes forces comparable (U_local,) where the stiffness is not definite; None where it is.
-    """
-
-    apply: Callable[[FloatArray], FloatArray]
-    weights: FloatArray | None
-
-
 class Linearisation(Forms):
     """The stiffness, assembled at the current state and parameters.
 
@@ -120,7 +104,7 @@ class Linearisation(Forms):
         """Return what solves with a matrix, of a form in UFL, at many states."""
         if self.linear == Linear.FACTOR:
             return linear.DirectSolver(matrix)
-        below = unknowns.Unknowns(self.mesh, 1, mixed=False)
+        below = spaces.Unknowns(self.mesh, 1, mixed=False)
         marks, held = self._held(below)
         ours, theirs = (self._variation, ufl.TrialFunction(self.unknowns.whole)), (below.test, below.trial)
         form = self._bilinear(ufl.replace(form, dict(zip(ours, theirs, strict=True))))
@@ -135,7 +119,7 @@ class Linearisation(Forms):
     def _moduli(self) -> tuple[assembly.PointValues, FloatArray]:
         """∂P along `_along` (n_cells, 9 q) at a few points of the cells, and the weights (q,) of these."""
         changes = self._invariants.derivative_of(self.stress_of(self._potential), self.unknown, self._along)
-        points, weights = (of(self.space, OF_MODULI) for of in (spaces.quadrature_points, spaces.quadrature_weights))
+        points, weights = spaces.quadrature(self.space, OF_MODULI)
         return self.at(ufl.as_vector([changes[a, k] for a in range(3) for k in range(3)]), points, often=True), weights
 
     def moduli(self) -> FloatArray:
@@ -170,7 +154,7 @@ class Linearisation(Forms):
         blocks[nodes, axes, axes] = 1
         return blocks if linear.positive(blocks) else None
 
-    def preconditioner(self) -> Preconditioner | None:
+    def preconditioner(self) -> linear.Preconditioner | None:
         """Return what a few steps at and near the state that is set are preconditioned by; collective.
 
         The 3×3 blocks of the nodes, from means of the moduli of the cells. With pressures a matrix is made, which does
@@ -178,13 +162,11 @@ class Linearisation(Forms):
         """
         if self.p is not None:
             self.work.assemblies += 1
-            saddle = linear.SaddleBlocks(
-                self._new_matrix(self._stiffness, symmetric=self.symmetric), self.nodes_owned, self.fixed
-            )
-            good = ranks.smallest(self.comm, float(saddle.good)) > 0
-            return Preconditioner(saddle.inverse(), saddle.weights) if good else None
+            matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
+            saddle = linear.saddle_blocks(matrix, self.nodes_owned, self.fixed)
+            return saddle if ranks.smallest(self.comm, float(saddle is not None)) > 0 else None
         blocks, fixed = self.nodal_blocks(), self.fixed
-        if ranks.smallest(self.comm, -1.0 if blocks is None else 1.0) < 0 or blocks is None:
+        if not ranks.smallest(self.comm, float(blocks is not None)) > 0 or blocks is None:
             return None
         kept = np.linalg.inv(blocks)
 
@@ -193,7 +175,7 @@ class Linearisation(Forms):
             z[fixed] = 0
             return z
 
-        return Preconditioner(apply, None)
+        return linear.Preconditioner(apply, None)
 
     def _prescribe(self) -> None:
         """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""
@@ -210,7 +192,7 @@ class Linearisation(Forms):
         self._targets = np.zeros(len(self.fixed))
         self._moves = False
 
-    def _held(self, of: unknowns.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
+    def _held(self, of: spaces.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
         """Marks for assembly of prescribed unknowns, and the path that moves each (if any), by node and axis."""
         moved: dict[tuple[int, int], str] = {}
         marks = []
@@ -271,12 +253,10 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_form(self) -> Any:
-        """The symmetric part of the stiffness, in UFL; the stiffness itself if it is symmetric.
+        """The symmetric part of a stiffness that is not symmetric, in UFL.
 
         That of friction is the stiffness at pressures that stay: what slides has no other resistance along the tool.
         """
-        if self.symmetric:
-            return self._of_stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
         works = list(zip(self.spec.loads, self.virtual_works, strict=True))
         rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
@@ -293,7 +273,7 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_stiffness(self) -> Any:
-        return self._stiffness if self.symmetric else self._bilinear(self._symmetric_form)
+        return self._bilinear(self._symmetric_form)
 
     def new_factor(self) -> LinearSolver:
         """Return a solver for the stiffness that makes the factor of a reference, with a matrix of its own.
@@ -307,7 +287,7 @@ class Linearisation(Forms):
         return linear.DirectSolver(matrix)
 
     def new_symmetric_solver(self) -> LinearSolver:
-        """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""
+        """Return a solver for the symmetric part of a stiffness that is not symmetric, with a matrix of its own."""
         matrix = self._new_matrix(self._symmetric_stiffness, symmetric=True, blocked=self.linear != Linear.FACTOR)
         return self._solver_of(matrix, self._symmetric_form)
 
@@ -364,8 +344,8 @@ class Linearisation(Forms):
     @cached_property
     def _expected_gaps(self) -> list[assembly.FacetValues]:
         """As `_gaps`, where the last step was to lead."""
-        every: list[tuple[Any, Any]] = [(load, at) for _, load, at in self._tools]
-        return [self.on_facets(load.expected_gap(at), load.on, load.degree) for load, at in every]
+        found: list[tuple[Any, Any, Any]] = list(self._tools)
+        return [self.on_facets(load.expected_gap(at), load.on, load.degree) for _, load, at in found]
 
     @cached_property
     def _beyond(self) -> assembly.VectorAssembler:
@@ -374,7 +354,7 @@ class Linearisation(Forms):
 
     def release(self) -> None:
         """Free the factor, if there is one."""
-        if "_solver" in vars(self) and self._solver.memory():
+        if self.linearisation_point.factorised is not None:
             self._solver.release()
         self.linearisation_point.factorised = None
 

@@ -18,10 +18,10 @@ from forward.fem.calibration import FinerMesh
 from forward.fem.cost import Linear, together
 from forward.fem.solution import FiniteElementSolution
 from forward.fem.space import Observation
-from forward.model import FloatArray, Guess, InadmissibleError, ReferenceSolution, Solution, SolveError, Work
+from forward.model import FloatArray, Guess, ReferenceSolution, Solution, SolveError, Work
 from forward.pointwise import OneByOne
-from forward.solvers.equilibrium import solve, solving
-from forward.solvers.steps import Task, failed, finish_all
+from forward.solvers.equilibrium import solving
+from forward.solvers.steps import Steps, Task, finish, finish_all
 from forward.solvers.system import Found
 from forward.solvers.way import Way
 
@@ -89,16 +89,14 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         equations.work = Work()
         equations.set_parameters(parameters)
         with equations.time_limit(self.spec.solver.solve_seconds):
-            zero = np.zeros(equations.size)
-            found = solve(equations, self.spec.solver, zero, guess.state, way, guess.iterations, audit=guess.audit)
+            found = finish(self._steps(guess, way), equations.solve if way is None else way.solve)
             stiffer = 1.0
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)
-        solution = self.solution(parameters, found, equations.work, way, stiffer)
-        if (
-            equations.symmetric and equations.linearisation_point.factorised_at is found.state
-        ):  # to count its eigenvalues
-            equations.linearisation_point.factorised = solution
+        solution = FiniteElementSolution(self, parameters, found, equations.work, way, stiffer)
+        point = equations.linearisation_point
+        if equations.symmetric and point.factorised_at is found.state:  # to count its eigenvalues
+            point.factorised = solution
         return solution
 
     def finer_mesh(self, spare: float) -> FinerMesh:
@@ -115,12 +113,11 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
         return Way(self.equations, self.reference, guess.reference, parameters, screen=screen)
 
-    def solution(
-        self, parameters: FloatArray, found: Found, work: Work, way: Way | None, stiffer: float = 1.0
-    ) -> FiniteElementSolution:
-        """Return what was found at `parameters` (d,) as a solution."""
-        # If Newton's method had to take over, the reference is too far away for the derivatives too.
-        return FiniteElementSolution(self, parameters, found, work, way if found.corrected else None, stiffer)
+    def _steps(self, guess: Guess, way: Way | None) -> Steps[Found]:
+        """Return what finds the equilibrium from a guess, at the parameters that are set."""
+        equations, settings = self.equations, self.spec.solver
+        zero = np.zeros(equations.size)
+        return solving(equations, settings, zero, guess.state, way, guess.iterations, audit=guess.audit)
 
     @cached_property
     def together(self) -> int:
@@ -147,35 +144,28 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
                     yield from super().solve_many(point[None], [guess])
 
     def _solve_together(self, starts: Iterable[tuple[FloatArray, Guess]]) -> Iterator[Solution | SolveError]:
-        equations, zero = self.equations, np.zeros(self.equations.size)
-        begun: deque[tuple[FloatArray, Way | None, Work]] = deque()
+        begun: deque[tuple[FloatArray, Way, Work]] = deque()
+
+        def steps(point: FloatArray, guess: Guess, way: Way) -> Steps[Found]:
+            self.require_admissible(point)
+            return (yield from self._steps(guess, way))
 
         def tasks() -> Iterator[Task[Found]]:
             for point, guess in starts:
-                way, work = None, Work()
-                try:
-                    self.require_admissible(point)
-                except InadmissibleError as error:
-                    one = Task[Found](failed(error), lambda _: None)
-                else:
-                    way = self.way(point, guess)
-                    assert way is not None
-                    settings, known = self.spec.solver, guess.iterations
-                    steps = solving(equations, settings, zero, guess.state, way, known, audit=guess.audit)
-                    one = Task(steps, partial(way.resume, work))
+                way, work = self.way(point, guess), Work()
+                assert way is not None
                 begun.append((point, way, work))
-                yield one
+                yield Task(steps(point, guess, way), partial(way.resume, work))
 
         def solve(right: FloatArray) -> FloatArray:
-            way = begun[0][1]
-            if way is not None and self.reference.prepare(way.reference):  # others may have had theirs meanwhile
+            if self.reference.prepare(begun[0][1].reference):  # others may have had theirs meanwhile
                 self.reference.prepare_screen()
             return self.reference.solve_uncounted(right)
 
         for found in finish_all(tasks(), solve, self.together):
-            equations.linearisation_point.begin()  # the last factor may be that of any of them
+            self.equations.linearisation_point.begin()  # the last factor may be that of any of them
             point, way, work = begun.popleft()
-            yield found if isinstance(found, SolveError) else self.solution(point, found, work, way)
+            yield found if isinstance(found, SolveError) else FiniteElementSolution(self, point, found, work, way)
 
     def _kept_out(self, found: Found, parameters: FloatArray) -> tuple[Found, float]:
         """Raise the stiffness of the tools until the body enters none too far; return its factor too.
@@ -187,5 +177,5 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         while self.enters(found, stiffer):
             stiffer *= STIFFER
             equations.set_parameters(parameters, stiffer)
-            found = solve(equations, self.spec.solver, np.zeros(equations.size), found.state)
+            found = finish(self._steps(Guess(found.state), None), equations.solve)
         return found, stiffer

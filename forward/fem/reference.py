@@ -12,11 +12,11 @@ import numpy as np
 
 from forward.fem.equations import Discretisation
 from forward.model import FloatArray, ReferenceSolution, SolveError, Work
-from forward.solvers.anderson import Inverse
+from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, SMOOTH, Rows, Screened, screen, screening_vectors
-from forward.solvers.steps import Steps, finished, through
+from forward.solvers.steps import Steps, finish, through
 from forward.solvers.system import ROUGH, TIGHT, LinearSolver
 from forward.solvers.way import MANY
 
@@ -65,11 +65,8 @@ class ReferenceFactor:
             self._reference = self._slopes = self._lengths = self._rest = self._vectors = None
 
     def _set(self, reference: ReferenceSolution) -> Discretisation:
-        equations = self._equations
-        equations.set_parameters(reference.parameters)
-        equations.at_load(1.0)
-        equations.set_state(reference.state)
-        return equations
+        self._equations.set_to(reference.parameters, reference.state)
+        return self._equations
 
     def slopes(self) -> FloatArray:
         """Derivatives (d, U_local) of the state at the reference; this may change parameters and state."""
@@ -165,9 +162,7 @@ class ReferenceFactor:
             for step in (STEP, -STEP):
                 parameters, state = reference.parameters + step * direction, reference.state + step * slope
                 R = self.rotation(state)
-                equations.set_parameters(parameters)
-                equations.at_load(1.0)
-                equations.set_state(state)
+                equations.set_to(parameters, state)
                 ends.append((step, parameters, state, equations.imbalance(), R))
 
             def multiply(
@@ -200,8 +195,9 @@ class ReferenceFactor:
             free,
             equations.total,
         )
-        # Where the stiffness is not symmetric, its symmetric part has a factor of its own.
-        return steps if equations.symmetric else finished(steps, self._counted(self._definite()))
+        if equations.symmetric:
+            return (yield from steps)
+        return finish(steps, self._counted(self._definite()))  # its symmetric part has a factor of its own
 
     def definite(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Steps[bool]:
         """Whether the stiffness at a state u (U_local,) with its imbalance, rotated by R, is surely positive definite.
@@ -229,9 +225,33 @@ class ReferenceFactor:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
         return rotations(self._equations.gradients_at(u), self._rotations)
 
-    def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
-        """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
-        return Turned(R, self._equations.fixed).by(self._counted(self._solver, transpose=transpose, tolerance=ROUGH))
+    def solve_near(
+        self,
+        R: FloatArray,
+        right: FloatArray,
+        tolerance: float,
+        iterations: int,
+        *,
+        transpose: bool = False,
+        first: FloatArray | None = None,
+    ) -> FloatArray | None:
+        """Solve with the stiffness at the state that is set, rotated by R (3, 3, n_owned) from the reference.
+
+        For rows (k, U_local) that are zero on prescribed unknowns, by products with that stiffness; None without
+        convergence: the reference is too far away. Arguments as of `block_galerkin`.
+        """
+        equations = self._equations
+        inverse = self._counted(self._solver, transpose=transpose, tolerance=ROUGH)
+        return block_galerkin(
+            lambda x: equations.free_stiffness_times(x, transpose=transpose),
+            Turned(R, equations.fixed).by(inverse),
+            right,
+            equations.total,
+            equations.norms,
+            tolerance,
+            iterations,
+            first,
+        )
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve with the factor at the reference; (n,) or (k, n)."""

@@ -20,16 +20,15 @@ from forward.fem.body import Calibrating, DiscreteBody, not_estimated
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
-from forward.model import FloatArray, MeshError, ReferenceSolution, Saturation, SolveError, Stability, Work
+from forward.model import FloatArray, MeshError, Saturation, SolveError, Stability, Work
 from forward.phases import phase
-from forward.solvers.anderson import block_galerkin
 from forward.solvers.rotations import turn
 from forward.solvers.system import Found
 from forward.solvers.way import Way
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
-LEAST, MOST = 0.5, 3.0  # factors
+LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 # Where finding them takes too much memory: of linear elements, which see most, and of others at edges that are held.
 TYPICAL = {1: 1.1, 2: 1.35}
 RATES = np.geomspace(1e-3, 60.0, 2000)  # β
@@ -60,8 +59,10 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self.reference = None if way is None else way.reference
-        self._rotation = None if way is None else way.rotation
+        # If Newton's method had to take over, the reference is too far away for the derivatives too.
+        near = way if way is not None and found.corrected else None
+        self.reference = None if near is None else near.reference
+        self._rotation = None if near is None else near.rotation
         self.visit()
         outputs = np.array([f.value() for f in model.functionals])
         self.outputs = self._seen(model.equations, self.state, lambda: outputs)
@@ -84,9 +85,7 @@ class FiniteElementSolution:
         """Return the equations, set to parameters and state of this solution."""
         equations = self._model.equations
         if equations.linearisation_point.solution is not self:
-            equations.set_parameters(self.parameters, self.stiffer)
-            equations.at_load(1.0)
-            equations.set_state(self.state)
+            equations.set_to(self.parameters, self.state, self.stiffer)
             equations.linearisation_point.solution = self
         equations.work = self.work
         return equations
@@ -142,53 +141,25 @@ class FiniteElementSolution:
 
         For tangents, `directions` (k, d) are given. By default the tolerance is that of derivatives.
         """
-        model = self._model
-        near = self.reference is not None and model.equations.linearisation_point.factorised is not self
-        if near and self.reference is not None and self._rotation is not None and len(right) <= FEW:
+        model, R = self._model, self._rotation
+        factored = model.equations.linearisation_point.factorised is self
+        if self.reference is not None and R is not None and not factored and len(right) <= FEW:
+            # With the factor at the reference, rotated as for the prediction, unless that is too far away.
+            factor, fixed, first = model.reference.at(self.reference), model.equations.fixed, None
+            if directions is not None and directions.shape[1] <= FEW:
+                # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
+                first = turn(directions @ factor.slopes(), R)
+                first[:, fixed] = 0
+            self.visit()
+            free = np.array(right)
+            free[:, fixed] = 0
             if tolerance is None:
                 tolerance = model.spec.solver.derivative_tolerance
-            found = self._solve_near(
-                right, self.reference, self._rotation, tolerance, transpose=transpose, directions=directions
-            )
+            found = factor.solve_near(R, free, tolerance, ITERATIONS, transpose=transpose, first=first)
             if found is not None:
+                found[:, fixed] = right[:, fixed]
                 return found
         return self.linearise().back_substitute(right, transpose=transpose)
-
-    def _solve_near(
-        self,
-        right: FloatArray,
-        reference: ReferenceSolution,
-        R: FloatArray,
-        tolerance: float,
-        *,
-        transpose: bool,
-        directions: FloatArray | None,
-    ) -> FloatArray | None:
-        """Solve with the factor at the reference, rotated as for its prediction; None if that is too far away."""
-        model = self._model
-        factor = model.reference.at(reference)
-        fixed = model.equations.fixed
-        first = None
-        if directions is not None and directions.shape[1] <= FEW:
-            # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
-            first = turn(directions @ factor.slopes(), R)
-            first[:, fixed] = 0
-        equations = self.visit()
-        free = np.array(right)
-        free[:, fixed] = 0
-        found = block_galerkin(
-            lambda x: equations.free_stiffness_times(x, transpose=transpose),
-            factor.inverse(R, transpose=transpose),
-            free,
-            equations.total,
-            equations.norms,
-            tolerance,
-            ITERATIONS,
-            first,
-        )
-        if found is not None:
-            found[:, fixed] = right[:, fixed]
-        return found
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
@@ -366,7 +337,7 @@ class FiniteElementSolution:
         return found.reshape(*np.shape(weights)[:-1], -1)
 
 
-def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.0) -> FloatArray:
+def factors(seen: ArrayLike, more: ArrayLike, degree: int) -> FloatArray:
     """Return what errors seen in elements of one degree more are to be multiplied by, from what two degrees more see.
 
     Beside edges and corners, where stresses are singular, errors fall with a power of the degree p, C p^−β, and twice
@@ -380,14 +351,12 @@ def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.
         Errors (m,) as elements of one and of two degrees more see them.
     degree
         Of the body.
-    otherwise
-        The factor of what is too small beside the others to have one of its own.
     """
     one, two = np.atleast_1d(np.asarray(seen, dtype=float)), np.atleast_1d(np.asarray(more, dtype=float))
     p = float(degree)
     first = p**-RATES - (p + 1) ** -RATES
     ratios = ((p + 1) ** -RATES - (p + 2) ** -RATES) / first  # falls with β
-    found = np.full(one.shape, otherwise)
+    found = np.ones(one.shape)
     good = np.isfinite(one) & np.isfinite(two) & (one != 0)
     step = (two[good] - one[good]) / one[good]
     powers = np.interp(step, ratios[::-1], (p**-RATES / first)[::-1])

@@ -15,7 +15,7 @@ from forward.bodies.geometry import Body
 from forward.bodies.random_fields import Expansion, RandomField
 from forward.fem import ranks
 from forward.fem.dolfinx import spaces
-from forward.fem.layout import sorted_by_place
+from forward.fem.layout import gathered, sorted_by_place
 from forward.model import FloatArray
 
 
@@ -90,13 +90,10 @@ class VertexField:
         """Return derivatives (k,) by this field's parameters from this rank's part of those by vertex values."""
         if self._modes is not None:
             return ranks.total(self._comm, slopes @ self._modes)[self._numbers]
-        parts = self._comm.gather((self._vertices, slopes))
+        whole = gathered(self._comm, self._vertices, slopes[None])
         pulled = None
-        if parts is not None and self._expansion is not None:
-            whole = np.empty(self._count)
-            for vertices, part in parts:
-                whole[vertices] = part
-            pulled = self._expansion.vjp(whole)[self._numbers]
+        if whole is not None and self._expansion is not None:
+            pulled = self._expansion.vjp(whole[0])[self._numbers]
         return np.asarray(self._comm.bcast(pulled))
 
     def factors(self, points: FloatArray, space: Any) -> FloatArray | None:
@@ -109,13 +106,7 @@ class VertexField:
         for point in points:
             self.set(point)
             rows.append(np.exp(spaces.interpolate(self.function, space)))
-        parts = self._comm.gather((positions, np.array(rows)))
-        if parts is None:
-            return None
-        whole = np.empty((len(points), sum(len(nodes) for nodes, _ in parts)))
-        for nodes, part in parts:
-            whole[:, nodes] = part
-        return whole
+        return gathered(self._comm, positions, np.array(rows))
 
     def _values(self, parameters: FloatArray) -> FloatArray:
         """Linear part of the logarithm at this rank's vertices."""

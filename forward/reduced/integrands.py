@@ -250,7 +250,7 @@ class Sampler:
         equations, size = self._equations, int(np.prod(expression.ufl_shape))
         if self.integrand.boundary is not None:
             return equations.on_facets(expression, self.integrand.boundary, self.integrand.degree)
-        points = spaces.quadrature_points(equations.space, self.integrand.degree)
+        points, _ = spaces.quadrature(equations.space, self.integrand.degree)
         values = equations.at(expression, points)
         return lambda: values().reshape(-1, size)
 
@@ -261,7 +261,7 @@ class Sampler:
         at = self._at(ufl.as_vector([jacobian[i, j] for i in range(3) for j in range(3)]))
         J = at().reshape(-1, 3, 3)
         if self.integrand.boundary is None:
-            weights = spaces.quadrature_weights(equations.space, self.integrand.degree)
+            _, weights = spaces.quadrature(equations.space, self.integrand.degree)
             return np.abs(np.linalg.det(J)) * np.tile(weights, len(J) // len(weights)), np.zeros((len(J), 3))
         outward = np.einsum("nji,nj->ni", np.linalg.inv(J), at.outward)  # type: ignore[attr-defined]
         areas = np.linalg.norm(outward, axis=1)

@@ -1,9 +1,9 @@
 """Finding the equilibrium of a discretised body: predict and correct with a reference factor, Newton, load steps.
 
-From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
+From a prediction, `solving` first corrects with the factor of a reference state and Anderson mixing, which needs no
 stiffness; if that is slow it continues with Newton's method, then with adaptive load steps. Without a prediction it
 begins with these. All of them use the same residual test, and the answer is the equilibrium that is joined to rest
-(`joined`), whichever of them finds it. `solve` can also be told to stop after a few iterations, wherever it is then.
+(`joined`), whichever of them finds it. It can also be told to stop after a few iterations, wherever it is then.
 
 Full Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
 the iteration stops when steps grow. A line search on the residual or on the energy, or the natural
@@ -25,26 +25,11 @@ from forward.solvers.corrections import ROUNDED, WINDOW, predict_correct
 from forward.solvers.joined import load_steps, settled
 from forward.solvers.newton import admissible_step, factorise, newton
 from forward.solvers.settings import SolverSettings
-from forward.solvers.steps import Corrector, Steps, finish, plain
+from forward.solvers.steps import Corrector, Steps, plain
 from forward.solvers.system import Found, Residual, System
 from forward.solvers.way import Way
 
 ASTRAY = 100  # relative residual after all allowed corrections: the reference is too far away
-
-
-def solve(
-    system: System,
-    settings: SolverSettings,
-    zero: FloatArray,
-    start: FloatArray | None = None,
-    way: Way | None = None,
-    iterations: int | None = None,
-    *,
-    audit: bool = False,
-) -> Found:
-    """Find the equilibrium as `solving` does, with the factor of the reference at hand."""
-    steps = solving(system, settings, zero, start, way, iterations, audit=audit)
-    return finish(steps, system.solve if way is None else way.solve)
 
 
 def solving(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -258,32 +258,35 @@ def _leads(
     """
     slope = found.state - way.state if way.slope is None else way.slope
     bend = found.state - way.state - slope
-    places = [_Place(system, settings, copy(way), k / STEPS, history) for k in range(1, STEPS + 1)]
-    last = places[-1]
+    ways, shares = [copy(way) for _ in range(STEPS)], [k / STEPS for k in range(1, STEPS + 1)]
+
+    def there(k: int, steps: Steps[T]) -> Task[T]:
+        """Return a solver at a place, among others that use the equations in turn."""
+        return Task(steps, lambda _: ways[k].at(shares[k]))
+
+    def corrected(k: int, start: FloatArray, tolerance: float) -> Task[FloatArray]:
+        return there(k, _corrected(system, settings, start, ways[k], tolerance, history))
+
     try:
-        states = yield from abreast(
-            [
-                place.task(place.corrected(way.state + place.t * (slope + place.t * bend), ROUGH))
-                for place in places[:-1]
-            ]
-        )
+        starts = [way.state + t * (slope + t * bend) for t in shares[:-1]]
+        states = yield from abreast([corrected(k, start, ROUGH) for k, start in enumerate(starts)])
         states.append(found.state)
         known: list[tuple[float, FloatArray]] = []
         predicted = way.state
-        for place, u in zip(places, states, strict=True):
-            predicted = straight(way.state, slope, known, place.t)
+        for t, u in zip(shares, states, strict=True):
+            predicted = straight(way.state, slope, known, t)
             if strayed(system, way.state, predicted, u, way):
                 return False
-            known.append((place.t, ((u - way.state) / place.t - slope) / place.t))
+            known.append((t, ((u - way.state) / t - slope) / t))
         if system.norm(found.state - predicted) > NEAR * system.norm(found.state - states[-2]):
-            (end,) = yield from abreast([last.task(last.corrected(predicted, settings.tolerance))])
+            (end,) = yield from abreast([corrected(STEPS - 1, predicted, settings.tolerance)])
             if not same(system, end, found.state):
                 return False
-        open_ones = list(zip(places, states, strict=True))[: STEPS - (found.stability == Stability.COUNTED)]
-        definite = yield from abreast([place.task(place.definite(u)) for place, u in open_ones])
-        for (place, u), sure in zip(open_ones, definite, strict=True):
-            if not sure and (counted or place is last):
-                place.way.at(place.t)
+        open_ones = list(enumerate(states))[: STEPS - (found.stability == Stability.COUNTED)]
+        definite = yield from abreast([there(k, _definite(system, u, ways[k])) for k, u in open_ones])
+        for (k, u), sure in zip(open_ones, definite, strict=True):
+            if not sure and (counted or k == STEPS - 1):
+                ways[k].at(shares[k])
                 if system.negative_eigenvalues(u) != 0:
                     return False
     except (SolveError, Diverged):
@@ -293,33 +296,21 @@ def _leads(
     return True
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A body after a part t of the way from a reference, among others that use its equations in turn."""
+def _corrected(
+    system: System, settings: SolverSettings, start: FloatArray, way: Way, tolerance: float, history: list[str]
+) -> Steps[FloatArray]:
+    """Correct a prediction with the factor of the reference, or raise `Diverged`."""
+    u = system.on_target(start)
+    residual = system.residual(u)
+    if not np.isfinite(residual.size):
+        raise Diverged("the state has no finite residual")
+    mixed = yield from mix(system, tolerance, u, residual, way.corrector(u), settings.corrections, history)
+    if not mixed.reached:
+        raise Diverged("the reference is too far away")
+    return mixed.state
 
-    system: System
-    settings: SolverSettings
-    way: Way
-    t: float
-    history: list[str]
 
-    def task(self, steps: Steps[T]) -> Task[T]:
-        """Return a solver at this place."""
-        return Task(steps, lambda _: self.way.at(self.t))
-
-    def corrected(self, start: FloatArray, tolerance: float) -> Steps[FloatArray]:
-        """Correct a prediction with the factor of the reference, or raise `Diverged`."""
-        u = self.system.on_target(start)
-        residual = self.system.residual(u)
-        if not np.isfinite(residual.size):
-            raise Diverged("the state has no finite residual")
-        correct, limit = self.way.corrector(u), self.settings.corrections
-        mixed = yield from mix(self.system, tolerance, u, residual, correct, limit, self.history)
-        if not mixed.reached:
-            raise Diverged("the reference is too far away")
-        return mixed.state
-
-    def definite(self, u: FloatArray) -> Steps[bool]:
-        """Whether Lanczos' process shows that the stiffness at a state is positive definite."""
-        self.way.corrector(u)  # remembers the rotations there
-        return (yield from self.way.definite(u, self.system.residual(u)))
+def _definite(system: System, u: FloatArray, way: Way) -> Steps[bool]:
+    """Whether Lanczos' process shows that the stiffness at a state is positive definite."""
+    way.corrector(u)  # remembers the rotations there
+    return (yield from way.definite(u, system.residual(u)))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -67,18 +66,6 @@ class Levels:
         return x, left
 
 
-class Solved(NamedTuple):
-    """What conjugate gradients have found.
-
-    It is definite if no direction of negative energy was met.
-    """
-
-    x: FloatArray
-    converged: bool
-    definite: bool
-    iterations: int
-
-
 def largest_eigenvalue(multiply: Apply, precondition: Apply, start: FloatArray, total: Total) -> float:
     """Return nearly the largest eigenvalue of P⁻¹K, with P⁻¹ positive definite, from below."""
     ritz = finish(process(multiply, start, total, STEPS, lambda _: False), precondition)
@@ -87,28 +74,31 @@ def largest_eigenvalue(multiply: Apply, precondition: Apply, start: FloatArray, 
 
 def conjugate_gradients(
     multiply: Apply, precondition: Apply, right: FloatArray, total: Total, tolerance: float, iterations: int
-) -> Solved:
-    """Solve Kx = b (n,); stop where √(rᵀM⁻¹r), nearly the error in energy, has fallen by the tolerance."""
+) -> tuple[FloatArray, bool, bool]:
+    """Solve Kx = b (n,); stop where √(rᵀM⁻¹r), nearly the error in energy, has fallen by the tolerance.
+
+    Returns x, whether that has converged, and whether no direction of negative energy was met.
+    """
     x, r = np.zeros_like(right), np.array(right)
     z = precondition(r)
     p, size = z, float(total(np.array([r @ z]))[0])
     first = size
     if size == 0:
-        return Solved(x, converged=True, definite=True, iterations=0)
-    for k in range(iterations):
+        return x, True, True
+    for _ in range(iterations):
         if not size > 0:  # the preconditioner is not positive
-            return Solved(x, converged=False, definite=False, iterations=k)
+            return x, False, False
         q = multiply(p)
         energy = float(total(np.array([p @ q]))[0])
         if not energy > 0:
-            return Solved(x, converged=False, definite=False, iterations=k)
+            return x, False, False
         x, r = x + size / energy * p, r - size / energy * q
         z = precondition(r)
         before, size = size, float(total(np.array([r @ z]))[0])
         if abs(size) <= tolerance**2 * first:
-            return Solved(x, converged=True, definite=True, iterations=k + 1)
+            return x, True, True
         p = z + size / before * p
-    return Solved(x, converged=False, definite=True, iterations=iterations)
+    return x, False, True
 
 
 def smoothed(
@@ -184,9 +174,7 @@ def minimised(
     directions, images = (np.empty((iterations, len(right))) for _ in range(2))
     triangle, parts = np.zeros((iterations, iterations)), np.zeros(iterations)  # of QR of the images, Qᵀb
     size = np.sqrt(total(np.array([r @ r]))[0])
-    if size == 0:
-        return np.zeros_like(right), np.array(right), True
-    found, k = False, 0
+    found, k = bool(size == 0), 0
     while k < iterations and not found:
         directions[k] = precondition(r / weights)
         image = weights * multiply(directions[k])

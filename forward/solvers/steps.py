@@ -47,12 +47,6 @@ def through(steps: Steps[T], correct: Corrector) -> Steps[T]:
         return result
 
 
-def finished(steps: Steps[T], solve: Callable[[FloatArray], FloatArray]) -> Steps[T]:
-    """Return a solver that asks for nothing: `finish`."""
-    return finish(steps, solve)
-    yield  # a generator
-
-
 @dataclass(frozen=True, eq=False)
 class Task(Generic[T]):
     """A solver among others that share the equations.
@@ -67,12 +61,6 @@ class Task(Generic[T]):
 
     steps: Steps[T]
     resume: Callable[[int], None]
-
-
-def failed(error: SolveError) -> Steps[T]:
-    """Return a solver that has failed before it asks for anything."""
-    raise error
-    yield  # a generator
 
 
 def _moved(task: Task[T], answer: FloatArray | None, end: Callable[[T], None]) -> FloatArray | None:

@@ -60,9 +60,6 @@ class LinearSolver(Protocol):
             If such a solver cannot tell the lowest eigenvalue from zero.
         """
 
-    def memory(self) -> int:
-        """Return the bytes that the prepared data take on all ranks; 0 before `factorise`."""
-
 
 @dataclass(frozen=True)
 class Residual:

@@ -18,8 +18,7 @@ from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for, signature
 from forward.fem.dolfinx.lanes import Kernel, Numbers
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
-from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_rows
-from forward.fem.dolfinx.unknowns import Unknowns
+from forward.fem.dolfinx.spaces import Unknowns, cell_element, constant, scalar_space, sum_rows
 from forward.model import FloatArray
 
 if TYPE_CHECKING:
@@ -41,8 +40,8 @@ class VectorAssembler:
         self._lanes: Kernel | None = None
         if cells is not None and all(one.subdomain_id() == "everywhere" for one in cells.integrals()):
             space = self._forms[0].function_spaces[0]
-            nodes, size, values = version.numbers_of(space)
-            self._lanes = _kernel(names[0], self._forms[0], space.mesh, comm, Numbers(nodes, size, values))
+            to = Numbers(*version.numbers_of(space), np.empty(0))
+            self._lanes = _kernel(names[0], self._forms[0], space.mesh, comm, to)
         self._of_cells = self._forms[0]
         if self._lanes is not None:
             self._forms.pop(0)
@@ -128,8 +127,8 @@ class PointValues:
 
         None if it cannot be compiled.
         """
-        nodes, _, values = version.numbers_of(space)
-        to = Numbers(nodes, self._size // nodes.shape[1], values)
+        nodes, _ = version.numbers_of(space)
+        to = Numbers(nodes, self._size // nodes.shape[1], np.empty(0))
         kernel = _kernel(self._name, self._expression, self._mesh, self._comm, to)
         return None if kernel is None else lambda sums: kernel(version.constants_of(self._expression), sums)
 

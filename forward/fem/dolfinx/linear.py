@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import basix
 import numpy as np
@@ -14,8 +14,7 @@ from petsc4py import PETSc
 from forward.fem.cost import BYTES_PER_NONZERO, SPARE, Factor
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
-from forward.fem.dolfinx.spaces import owned_nodes
-from forward.fem.dolfinx.unknowns import Unknowns
+from forward.fem.dolfinx.spaces import Unknowns, owned_nodes
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
 from forward.phases import phase
@@ -128,70 +127,69 @@ class BoundaryBlocks:
         self._matrix.zeroEntries()
         fem.petsc.assemble_matrix(self._matrix, self._form)
         self._matrix.assemble()
-        rows, _, values = self._matrix.getValuesCSR()
-        first, last = self._matrix.getOwnershipRange()
-        assert len(values) == 3 * (last - first) == rows[-1]
-        return np.array(values).reshape(-1, 3, 3)
+        return _nodal_blocks(self._matrix)
 
 
-class SaddleBlocks:
-    """What preconditions a stiffness of displacements and pressures: no factor, and little of the matrix is kept.
+class Preconditioner(NamedTuple):
+    """An approximate inverse of a stiffness.
+
+    Attributes
+    ----------
+    apply
+        Its product with forces (U_local,); collective.
+    weights
+        What makes forces comparable (U_local,) where the stiffness is not definite; None where it is.
+    """
+
+    apply: Callable[[FloatArray], FloatArray]
+    weights: FloatArray | None
+
+
+def saddle_blocks(stiffness: StiffnessMatrix, nodes: int, fixed: NDArray[np.int64]) -> Preconditioner | None:
+    """Return what preconditions a stiffness of displacements and pressures: no factor, and little of the matrix.
 
     With A = K_uu, B = K_pu and C = K_pp, pressures are found first, p = −S⁻¹ r_p with the diagonal of
     S = −C + B A_d⁻¹ Bᵀ, then displacements, u = A_d⁻¹ (r_u − Bᵀ p): A_d are the 3×3 blocks on the diagonal of A, and
     in S their diagonal (M. Benzi, G. H. Golub, J. Liesen, Acta Numerica 14 (2005) 1–137, section 10).
 
-    The matrix is assembled and then freed; `nodes` are how many this rank has, `fixed` its prescribed unknowns.
+    The matrix is assembled and then freed; `nodes` are how many this rank has, `fixed` its prescribed unknowns. None
+    if blocks of this rank are not those of a stable body.
     """
+    stiffness.assemble()
+    K, n = stiffness.matrix, 3 * nodes
+    first, last = K.getOwnershipRange()
+    numbers = stiffness.unknowns.take(np.arange(first, last, dtype=np.int32))  # in our order
+    of_u, of_p = (PETSc.IS().createGeneral(part, comm=stiffness.comm) for part in (numbers[:n], numbers[n:]))
+    of_displacements = K.createSubMatrix(of_u, of_u)
+    blocks = _nodal_blocks(of_displacements)
+    of_displacements.destroy()
+    coupling = K.createSubMatrix(of_p, of_u)
+    diagonal = stiffness.unknowns.take(K.getDiagonal().array_r)
+    K.destroy()
+    u, p = coupling.createVecRight(), coupling.createVecLeft()
+    rows, columns, values = coupling.getValuesCSR()
+    squares = coupling.duplicate()
+    squares.setValuesCSR(rows, columns, values**2)
+    squares.assemble()
+    u.array[:] = 1 / diagonal[:n]
+    squares.mult(u, p)
+    squares.destroy()
+    schur = p.array_r - diagonal[n:]
+    if not (positive(blocks) and (schur > 0).all()):
+        return None
+    inverse = np.linalg.inv(blocks)
 
-    def __init__(self, stiffness: StiffnessMatrix, nodes: int, fixed: NDArray[np.int64]) -> None:
-        stiffness.assemble()
-        K, n = stiffness.matrix, 3 * nodes
-        first, last = K.getOwnershipRange()
-        numbers = stiffness.unknowns.take(np.arange(first, last, dtype=np.int32))  # in our order
-        of_u, of_p = (PETSc.IS().createGeneral(part, comm=stiffness.comm) for part in (numbers[:n], numbers[n:]))
-        of_displacements = K.createSubMatrix(of_u, of_u)
-        self._blocks = _nodal_blocks(of_displacements)
-        of_displacements.destroy()
-        self._coupling = K.createSubMatrix(of_p, of_u)
-        diagonal = stiffness.unknowns.take(K.getDiagonal().array_r)
-        K.destroy()
-        self._u, self._p = self._coupling.createVecRight(), self._coupling.createVecLeft()
-        self._fixed, self._n = fixed, n
-        rows, columns, values = self._coupling.getValuesCSR()
-        squares = self._coupling.duplicate()
-        squares.setValuesCSR(rows, columns, values**2)
-        squares.assemble()
-        self._u.array[:] = 1 / diagonal[:n]
-        squares.mult(self._u, self._p)
-        squares.destroy()
-        self._schur = self._p.array_r - diagonal[n:]
+    def apply(r: FloatArray) -> FloatArray:
+        z = np.empty_like(r)
+        z[n:] = p.array[:] = -r[n:] / schur
+        coupling.multTranspose(p, u)
+        rest = r[:n] - u.array_r
+        z[:n] = np.einsum("nij,nj->ni", inverse, rest.reshape(-1, 3)).ravel()
+        z[fixed] = 0
+        return z
 
-    @property
-    def good(self) -> bool:
-        """Whether the blocks of this rank are those of a stable body."""
-        return positive(self._blocks) and bool((self._schur > 0).all())
-
-    def inverse(self) -> Callable[[FloatArray], FloatArray]:
-        """Return r (U_local,) → what solves roughly for it; collective."""
-        blocks, n = np.linalg.inv(self._blocks), self._n
-
-        def apply(r: FloatArray) -> FloatArray:
-            z = np.empty_like(r)
-            z[n:] = self._p.array[:] = -r[n:] / self._schur
-            self._coupling.multTranspose(self._p, self._u)
-            rest = r[:n] - self._u.array_r
-            z[:n] = np.einsum("nij,nj->ni", blocks, rest.reshape(-1, 3)).ravel()
-            z[self._fixed] = 0
-            return z
-
-        return apply
-
-    @property
-    def weights(self) -> FloatArray:
-        """What makes forces and volumes (U_local,) comparable in a norm: roots of one over the diagonals."""
-        diagonals = np.repeat(np.einsum("nii->n", self._blocks) / 3, 3)
-        return np.asarray(1 / np.sqrt(np.concatenate([diagonals, self._schur])))
+    diagonals = np.repeat(np.einsum("nii->n", blocks) / 3, 3)
+    return Preconditioner(apply, np.asarray(1 / np.sqrt(np.concatenate([diagonals, schur]))))
 
 
 def _nodal_blocks(matrix: Any) -> FloatArray:
@@ -220,21 +218,13 @@ class DirectSolver:
         self._stiffness = stiffness
         self._unknowns, self._symmetric = stiffness.unknowns, stiffness.symmetric
         self._room = ROOM
-        self._analysed = self._factorised = False
+        self._analysed = False
         self._ksp = self._new_ksp(stiffness.comm)
         self._right = stiffness.matrix.createVecLeft()
         self._solution = stiffness.matrix.createVecRight()
 
     def factorise(self) -> None:
-        """Assemble and factorise.
-
-        Raises
-        ------
-        SolveError
-            If the matrix is singular or has entries that are not finite.
-        StopError
-            If there is no memory for the factor.
-        """
+        """Assemble and factorise; errors as of `LinearSolver`, also for entries that are not finite."""
         unknowns, ranks = self._stiffness.matrix.getSize()[0], self._ksp.comm.size
         if not self._analysed:  # the analysis crashes without memory
             hopeless = HOPELESS * self._stiffness.expected.bytes / ranks + SPARE
@@ -242,13 +232,12 @@ class DirectSolver:
         self._stiffness.assemble()
         while (status := self._try()) in TOO_LITTLE_ROOM and self._room < MOST_ROOM:
             self._room *= 4
-            self._renew()
+            self.release()
         self._analysed = True
-        self._factorised = status >= 0
-        if self._factorised:
+        if status >= 0:
             return
         needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
-        self._renew()  # or else PETSc would report this failure for ever
+        self.release()  # or else PETSc would report this failure for ever
         if status == SINGULAR:
             raise SolveError("the stiffness is singular")
         if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
@@ -278,8 +267,8 @@ class DirectSolver:
             ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
         return ksp
 
-    def _renew(self) -> None:
-        """Start with a new factor, which is analysed again."""
+    def release(self) -> None:
+        """Free the factor; the next one is analysed again."""
         self._ksp.destroy()
         self._ksp = self._new_ksp(self._stiffness.comm)
         self._analysed = False
@@ -308,22 +297,11 @@ class DirectSolver:
         solutions.destroy()
         return result
 
-    def release(self) -> None:
-        """Free the factor."""
-        self._renew()
-        self._factorised = False
-
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues; None for LU."""
         if not self._symmetric:
             return None
         return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))
-
-    def memory(self) -> int:
-        """Return the bytes of the last factor with its working memory on all ranks, in whole megabytes; 0 before."""
-        if not self._factorised:
-            return 0
-        return 10**6 * int(self._ksp.pc.getFactorMatrix().getMumpsInfog(22))
 
 
 class NodalBlocks:

@@ -11,6 +11,7 @@ from dolfinx import mesh
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
+from forward.bodies.mesh import X_FIRST
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import BYTES_PER_UNKNOWN, SPARE
 from forward.fem.dolfinx import version
@@ -40,8 +41,7 @@ def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int3
     points, cells, boundaries = np.zeros((0, 3)), np.zeros((0, corners), dtype=np.int64), None
     if loaded is not None:
         points, boundaries = loaded.points, loaded.boundaries
-        # From VTK's order of the corners.
-        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, [0, 1, 3, 2, 4, 5, 7, 6]])
+        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, X_FIRST])
     msh = version.mesh_of(comm, body.cell, cells, points)
     boundaries = comm.bcast(boundaries)
     msh.topology.create_entities(2)
@@ -76,22 +76,18 @@ def region_numbers(comm: Any, body: MeshFile, msh: Any) -> NDArray[np.int32]:
     """Return the number of the region of each of this rank's cells, ghosts included; collective."""
     loaded = on_first(comm, body.load)
     region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))
-    return np.asarray(region[_as_given(msh)])
+    return np.asarray(region[msh.topology.original_cell_index])
 
 
 def cells_as_given(msh: Any) -> NDArray[np.int64]:
     """Return the number (n_owned,) that each of this rank's cells had in the arrays that the mesh was made of."""
-    return np.asarray(_as_given(msh)[: owned_cells(msh)], dtype=np.int64)
+    return np.asarray(msh.topology.original_cell_index[: owned_cells(msh)], dtype=np.int64)
 
 
 def corners_as_given(msh: Any) -> NDArray[np.int64]:
     """Return the vertices (n_owned, k) of each of this rank's cells, by their numbers in these arrays."""
     vertices = version.corners_of_cells(msh)[: owned_cells(msh)]
     return np.asarray(np.asarray(msh.geometry.input_global_indices)[vertices], dtype=np.int64)
-
-
-def _as_given(msh: Any) -> NDArray[np.int64]:
-    return np.asarray(msh.topology.original_cell_index)
 
 
 def _box_facets(msh: Any, size: tuple[float, float, float]) -> dict[str, NDArray[np.int32]]:

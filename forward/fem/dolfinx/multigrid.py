@@ -6,8 +6,8 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
+from forward.fem import ranks
 from forward.fem.dolfinx.linear import StiffnessMatrix
 from forward.fem.dolfinx.spaces import Transfer
 from forward.model import FloatArray, SolveError
@@ -43,16 +43,12 @@ class MultigridSolver:
         self._fixed, self._coarse_fixed = fixed, coarse_fixed
         self._in, self._out = stiffness.matrix.createVecs()
         self._levels: Levels | None = None
+        self._total = partial(ranks.total, stiffness.comm)
 
     def factorise(self) -> None:
-        """Assemble both stiffnesses, and factorise the coarse one.
+        """Assemble both stiffnesses, and factorise the coarse one; errors as of `LinearSolver`.
 
-        Raises
-        ------
-        SolveError
-            If that is singular, or a block on the diagonal, or entries are not finite.
-        StopError
-            If there is no memory for the coarse factor.
+        Also if a block on the diagonal is singular, or entries are not finite.
         """
         self._levels = None
         self._stiffness.assemble()
@@ -77,10 +73,6 @@ class MultigridSolver:
         forces[self._fixed] = 0
         return forces
 
-    def _total(self, values: FloatArray) -> FloatArray:
-        comm = self._stiffness.comm
-        return values if comm.size == 1 else np.asarray(comm.allreduce(values))
-
     def _multiply(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
         K = self._stiffness.matrix
         self._in.array[:] = x
@@ -95,44 +87,25 @@ class MultigridSolver:
         return z
 
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
-        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides.
-
-        Raises
-        ------
-        NoConvergence
-            If it does not.
-        """
+        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides; errors as of `LinearSolver`."""
         if right.ndim == 2:
             rows = [self.solve(row, transpose=transpose, tolerance=tolerance) for row in right]
             return np.array(rows).reshape(right.shape)
         assert self._levels is not None, "factorise comes first"
-        levels, free = self._levels, np.array(right)
+        levels, free, definite = self._levels, np.array(right), self._stiffness.symmetric
         free[self._fixed] = 0  # rows and columns of the identity: nothing else depends on them
-        if self._stiffness.symmetric:
-            found = multigrid.conjugate_gradients(
+        if definite:
+            x, converged, definite = multigrid.conjugate_gradients(
                 levels.multiply, levels.cycle, free, self._total, tolerance, ITERATIONS
             )
-            x, converged = found.x, found.converged
-            if not found.definite:
-                x, converged = self._minimised(levels, free, tolerance, transpose=False)
-        else:
-            x, converged = self._minimised(levels, free, tolerance, transpose=transpose)
+        if not definite:
+            multiply = partial(self._multiply, transpose=transpose and not self._stiffness.symmetric)
+            scale = 1 / np.sqrt(np.abs(self._stiffness.matrix.getDiagonal().array_r))  # makes forces comparable
+            x, _, converged = minimised(multiply, levels.cycle, free, scale, self._total, tolerance, RESIDUALS)
         if not converged:
             raise NoConvergence(f"the linear solver did not converge to {tolerance:g}")
         x[self._fixed] = right[self._fixed]
         return x
-
-    def _minimised(
-        self, levels: Levels, right: FloatArray, tolerance: float, *, transpose: bool
-    ) -> tuple[FloatArray, bool]:
-        multiply = partial(self._multiply, transpose=transpose)
-        x, _, converged = minimised(multiply, levels.cycle, right, self._scale, self._total, tolerance, RESIDUALS)
-        return x, converged
-
-    @property
-    def _scale(self) -> FloatArray:
-        """One over the roots of the diagonal, which makes forces comparable."""
-        return np.asarray(1 / np.sqrt(np.abs(self._stiffness.matrix.getDiagonal().array_r)))
 
     def release(self) -> None:
         """Free the coarse factor."""
@@ -140,13 +113,7 @@ class MultigridSolver:
         self._levels = None
 
     def negative_eigenvalues(self) -> int | None:
-        """Return how many negative eigenvalues are found, 0 only if there are none; None if unknown.
-
-        Raises
-        ------
-        NoConvergence
-            If the lowest eigenvalue cannot be told from zero.
-        """
+        """Return how many are found, 0 only if there are none; None if unknown; errors as of `LinearSolver`."""
         if not self._stiffness.symmetric or self._levels is None:
             return None
         below = self._coarse.negative_eigenvalues()
@@ -157,10 +124,3 @@ class MultigridSolver:
         if found is None:
             raise NoConvergence("the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero")
         return found
-
-    def memory(self) -> int:
-        """Return the bytes of the matrix and of the coarse factor on all ranks; 0 before `factorise`."""
-        if self._levels is None:
-            return 0
-        entries = self._stiffness.matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
-        return int(8 * entries) + self._coarse.memory()

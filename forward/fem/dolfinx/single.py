@@ -75,6 +75,8 @@ class SingleSolver:
 
     Attributes
     ----------
+    in_single
+        Whether the factor at hand is in single precision.
     contraction
         That share, of the last factor in single precision that was tested.
     """
@@ -83,26 +85,18 @@ class SingleSolver:
         self._stiffness, self._counted = stiffness, counted
         self._symmetric = stiffness.symmetric
         self._factor: Any = None
-        self._analysed, self._room = False, ROOM
+        self.in_single, self._room = False, ROOM
         self.contraction = np.inf
         self._double: DirectSolver | None = None
-        self._use_double = False
         self._x, self._b = stiffness.matrix.createVecs()
         self._library: Any = library()
 
-    @property
-    def in_single(self) -> bool:
-        """Whether the factor at hand is in single precision."""
-        return self._analysed and not self._use_double
-
     def factorise(self) -> None:
         """Assemble and factorise; errors as of `DirectSolver`."""
-        self._use_double = False
         if self._made_single():
             return
         self._end()
         self._double = self._double or DirectSolver(self._stiffness)
-        self._use_double = True
         self._double.factorise()
 
     def _made_single(self) -> bool:
@@ -127,14 +121,14 @@ class SingleSolver:
         n = self._stiffness.matrix.getSize()[0]
         while True:
             at = [array.ctypes.data for array in (rows, columns, values)]
-            status = found.factorise(self._factor, n, len(values), *at, self._room, not self._analysed)
-            self._analysed = status >= 0
+            status = found.factorise(self._factor, n, len(values), *at, self._room, not self.in_single)
+            self.in_single = status >= 0
             if status not in TOO_LITTLE_ROOM or self._room >= MOST_ROOM:
                 break
             self._room *= 4
         if not self._counted:
-            return bool(self._analysed)
-        self.contraction = self._contracted() if self._analysed else np.inf
+            return bool(self.in_single)
+        self.contraction = self._contracted() if self.in_single else np.inf
         return self.contraction <= CONTRACTION
 
     def _contracted(self) -> float:
@@ -184,7 +178,7 @@ class SingleSolver:
 
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
         """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides; refine unless it may be rough."""
-        if self._use_double:
+        if not self.in_single:
             assert self._double is not None
             return self._double.solve(right, transpose=transpose, tolerance=tolerance)
         rights = self._stiffness.unknowns.reorder(np.atleast_2d(right))
@@ -221,7 +215,7 @@ class SingleSolver:
     def _end(self) -> None:
         if self._factor:
             self._library.end(self._factor)
-        self._factor, self._analysed = None, False
+        self._factor, self.in_single = None, False
 
     def __del__(self) -> None:
         if not MPI.Is_finalized():
@@ -229,17 +223,10 @@ class SingleSolver:
 
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues of K; None for LU."""
-        if self._use_double:
+        if not self.in_single:
             assert self._double is not None
             return self._double.negative_eigenvalues()
         return int(self._library.told(self._factor, 12)) if self._symmetric else None
-
-    def memory(self) -> int:
-        """Return the bytes of the last factor with its working memory, in whole megabytes; 0 before."""
-        if self._use_double:
-            assert self._double is not None
-            return self._double.memory()
-        return 10**6 * int(self._library.told(self._factor, 22)) if self._analysed else 0
 
 
 def _entries(matrix: Any, *, half: bool) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:

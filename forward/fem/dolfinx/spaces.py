@@ -1,4 +1,4 @@
-"""Spaces of functions on a mesh, their nodes, and values at points."""
+"""Spaces of functions on a mesh, their nodes, values at points; the unknowns of a body, in an order of their own."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import basix
 import numpy as np
+import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -112,16 +113,10 @@ def point_rows(space: Any, points: FloatArray) -> tuple[NDArray[np.bool_], NDArr
     return every.argmin(axis=0) == comm.rank, some, np.asarray(values), every.min(axis=0)
 
 
-def quadrature_points(space: Any, degree: int) -> FloatArray:
-    """Reference points (q, 3) of the quadrature rule of the integrals."""
-    points, _ = basix.make_quadrature(version.cell_type(space), degree)
-    return np.asarray(points)
-
-
-def quadrature_weights(space: Any, degree: int) -> FloatArray:
-    """Weights (q,) of these points."""
-    _, weights = basix.make_quadrature(version.cell_type(space), degree)
-    return np.asarray(weights)
+def quadrature(space: Any, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Reference points (q, 3) of the quadrature rule of the integrals, and their weights (q,)."""
+    points, weights = basix.make_quadrature(version.cell_type(space), degree)
+    return np.asarray(points), np.asarray(weights)
 
 
 def constant(msh: Any, value: Any) -> Any:
@@ -147,6 +142,101 @@ def sum_rows(carrier: Any, rows: FloatArray) -> FloatArray:
     return sum_ghosts(carrier).reshape(-1, 3)
 
 
+class Unknowns:
+    """The unknowns of a body: displacements and, in the mixed form, pressures; as spaces and as vectors.
+
+    A vector (U_local,) holds the displacements of the nodes that this rank owns, interleaved, and then the pressures of
+    the vertices that it owns. DOLFINx numbers the unknowns of its mixed space differently; only this class knows how.
+
+    Attributes
+    ----------
+    whole
+        The space of all unknowns.
+    displacement
+        The space of displacements.
+    pressure
+        The space of pressures, continuous and one degree lower (P. Hood, C. Taylor, Navier–Stokes equations using mixed
+        interpolation, 1974); None in the displacement form.
+    size
+        Number of unknowns that this rank owns.
+    pressures
+        Number of pressures on all ranks.
+    """
+
+    def __init__(self, msh: Any, degree: int, *, mixed: bool) -> None:
+        self._numbers: NDArray[np.int32] | None = None  # of displacements, ghosts included, in the mixed space
+        self._order: NDArray[np.int32] | None = None
+        self.pressure = None
+        self.pressures = 0
+        if not mixed:
+            self.whole = self.displacement = vector_space(msh, degree)
+            self.size = 3 * owned_nodes(self.displacement)
+            return
+        cell = msh.ufl_cell()
+        elements = [version.lagrange(cell, degree, vector=True), version.lagrange(cell, degree - 1, vector=False)]
+        self.whole = new_space(msh, version.mixed(elements))
+        self.displacement, self.pressure = vector_space(msh, degree), scalar_space(msh, degree - 1)
+        self.pressures = int(self.pressure.dofmap.index_map.size_global)
+        parts = [self.whole.sub(0).sub(axis) for axis in range(3)]
+        self._numbers = np.column_stack([_numbers(self.displacement, part) for part in parts]).ravel()
+        owned = self._numbers[: 3 * owned_nodes(self.displacement)]
+        self._order = np.concatenate([owned, _numbers(self.pressure, self.whole.sub(1))[: owned_nodes(self.pressure)]])
+        self.size = len(self._order)
+
+    @property
+    def test(self) -> Any:
+        """A test function, in UFL."""
+        return ufl.TestFunction(self.whole)
+
+    @property
+    def trial(self) -> Any:
+        """A trial function, in UFL."""
+        return ufl.TrialFunction(self.whole)
+
+    def split(self, all_of_them: Any) -> tuple[Any, Any]:
+        """Displacement and pressure of a UFL argument or function of the whole space; no pressure if there is none."""
+        return tuple(ufl.split(all_of_them)) if self.pressure is not None else (all_of_them, None)
+
+    def constraint(self, axis: int, nodes: NDArray[np.int32]) -> Any:
+        """Mark a component of nodes as prescribed, for the assembly of matrices."""
+        numbers, space = 3 * nodes + axis, self.whole
+        if self._numbers is not None:
+            numbers, space = self._numbers[numbers], space.sub(0)
+        return fem.dirichletbc(fem.Constant(space.mesh, PETSc.ScalarType(0)), numbers, space.sub(axis))
+
+    def give(self, function: Any, values: FloatArray) -> None:
+        """Set a function of the whole space to a vector (U_local,), ghosts included; collective."""
+        if self._order is None:
+            function.x.array[: self.size] = values
+        else:
+            function.x.array[self._order] = values
+        function.x.scatter_forward()
+
+    def take(self, values: FloatArray) -> FloatArray:
+        """Copy values of DOLFINx or PETSc on the whole space into a vector (U_local,), or rows (k, U_local)."""
+        return np.array(values[..., : self.size]) if self._order is None else np.asarray(values[..., self._order])
+
+    def reorder(self, values: FloatArray) -> FloatArray:
+        """Return a vector (U_local,), or rows (k, U_local), in PETSc's order."""
+        if self._order is None:
+            return values
+        reordered = np.empty_like(values)
+        reordered[..., self._order] = values
+        return reordered
+
+
+def _numbers(space: Any, part: Any) -> NDArray[np.int32]:
+    """Return the numbers (n,) that the nodes of a space, ghosts included, have in a part of a mixed space.
+
+    (The map of DOLFINx's `collapse` is wrong from degree 3 on: it does not permute the nodes of edges and faces.)
+    """
+    count = len(cell_element(space).points)
+    index_map = space.dofmap.index_map
+    found = np.empty(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    found[version.nodes_of_cells(space, count)] = version.nodes_of_cells(part, count)
+    return found
+
+
 class Transfer:
     """Interpolation from one continuous Lagrange space into another on the same mesh, as a sparse matrix.
 
@@ -164,9 +254,7 @@ class Transfer:
         from_nodes = version.nodes_of_cells(source, len(here.points))
         to_nodes = version.nodes_of_cells(target, len(there.points))
         owned = owned_nodes(target)
-        every = to_nodes.ravel()
-        first = np.empty(every.max(initial=-1) + 1, dtype=np.int64)
-        first[every[::-1]] = np.arange(len(every))[::-1]  # of several places the first is written last
+        _, first = np.unique(to_nodes, return_index=True)  # of the places of each node
         cells, places = np.divmod(first[:owned], to_nodes.shape[1])
         index_map = source.dofmap.index_map
         columns = from_nodes[cells]

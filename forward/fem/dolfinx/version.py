@@ -163,14 +163,14 @@ def coefficients_of(made: Any) -> list[tuple[NDArray[np.int32], int, FloatArray]
         found = [functions[i]._cpp_object for i in places]
     else:
         found = getattr(made, "_cpp_object", made).coefficients
-    return [(*numbers_of(function.function_space)[:2], function.x.array) for function in found]
+    return [(*numbers_of(function.function_space), function.x.array) for function in found]
 
 
-def numbers_of(space: Any) -> tuple[NDArray[np.int32], int, FloatArray]:
-    """Nodes (n_cells, k) of this rank's cells, ghosts included, in a compiled space, and numbers at each; no values."""
+def numbers_of(space: Any) -> tuple[NDArray[np.int32], int]:
+    """Nodes (n_cells, k) of this rank's cells, ghosts included, in a compiled space, and how many numbers at each."""
     dofmap = space.dofmap
     if FIVE:
         nodes = dofmap.list() if callable(dofmap.list) else dofmap.list
         cells = space.mesh.topology.index_map(3)
-        return np.asarray(nodes.array).reshape(cells.size_local + cells.num_ghosts, -1), dofmap.bs, np.empty(0)
-    return np.asarray(getattr(dofmap, "_cpp_object", dofmap).map()), dofmap.bs, np.empty(0)
+        return np.asarray(nodes.array).reshape(cells.size_local + cells.num_ghosts, -1), dofmap.bs
+    return np.asarray(getattr(dofmap, "_cpp_object", dofmap).map()), dofmap.bs

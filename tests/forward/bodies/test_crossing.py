@@ -6,8 +6,7 @@ import pytest
 from mpi4py import MPI
 
 from forward.bodies.crossing import deepest, least_stretch
-from forward.bodies.hexahedra import CORNERS
-from forward.bodies.mesh import TETRAHEDRA, surface_of
+from forward.bodies.mesh import CORNERS, TETRAHEDRA, surface_of
 from forward.hyperelastic import Hyperelastic
 from tests.forward.bodies.test_slits import CELLS, NAMES, block
 from uq.evaluation.evaluate import Recorder, SerialEvaluate

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from forward.bodies.bisection import FACES as TRIANGLES
 from forward.bodies.geometry import Block, Box
-from forward.bodies.hexahedra import FACES
 from forward.bodies.location import locate, shapes
+from forward.bodies.mesh import faces_of
 from forward.bodies.tetrahedra import RATIO, layers_of, within
 from forward.model import ModelError
 
@@ -46,10 +45,7 @@ def test_fields_between_vertices_are_the_same(name, cell):
     gaps = np.linalg.norm(coarse.points[:, None] - fine.points, axis=2).min(axis=1)
     assert gaps.max() < 1e-12
     if name == "box" or cell == "hexahedron":
-        faces = fine.cells[:, FACES if cell == "hexahedron" else TRIANGLES].reshape(
-            -1, 4 if cell == "hexahedron" else 3
-        )
-        unique, count = np.unique(np.sort(faces, axis=1), axis=0, return_counts=True)
+        unique, count = np.unique(np.sort(faces_of(fine.cells, cell), axis=1), axis=0, return_counts=True)
         assert count.max() == 2  # conforming
         outer = {tuple(face) for face in unique[count == 1].tolist()}
         named = [tuple(sorted(facet)) for facets in fine.boundaries.values() for facet in facets.tolist()]

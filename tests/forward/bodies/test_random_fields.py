@@ -7,11 +7,12 @@ import pytest
 from mpi4py import MPI
 
 from forward.bodies.geometry import Block, Box
-from forward.bodies.random_fields import ROBIN, Matern, RandomField, correlation
+from forward.bodies.random_fields import ROBIN, Matern, RandomField
 from forward.conformance import check_derivatives
 from forward.model import Stability
 from tests.bodies import loaded_body
 from tests.launch import on_kept_ranks
+from tests.matern import correlation, inflation, precision
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
@@ -55,7 +56,7 @@ def test_point_variance_and_correlation_are_those_of_matern_inside(smoothness, i
     body = cube(12)
     matern = Matern.on(body, 0.4, smoothness)
     centre = at(body, 0.5, 0.5, 0.5)
-    assert matern.inflation[centre] == pytest.approx(1, abs=inside)  # before it is set to one
+    assert inflation(matern, 0.4, smoothness)[centre] == pytest.approx(1, abs=inside)  # before it is set to one
     row = matern.covariance(np.eye(len(matern.mass))[centre])
     assert row[centre] == pytest.approx(1, abs=1e-12)
     distance = np.linalg.norm(vertices(body) - 0.5, axis=1)
@@ -66,7 +67,7 @@ def test_point_variance_and_correlation_are_those_of_matern_inside(smoothness, i
 
 def test_the_boundary_condition_keeps_the_variance_near_faces():
     body = cube(8)
-    robin, neumann = (Matern.on(body, 0.4, 2, beta).inflation for beta in (ROBIN, 0.0))
+    robin, neumann = (inflation(Matern.on(body, 0.4, 2, beta), 0.4) for beta in (ROBIN, 0.0))
     face, corner = at(body, 0, 0.5, 0.5), at(body, 0, 0, 0)
     assert neumann[face] > 2  # the images: 2 and, in a corner, 8 times the variance inside
     assert neumann[corner] > 8
@@ -93,7 +94,7 @@ def test_a_root_of_the_covariance_makes_samples(smoothness):
     np.testing.assert_allclose(root @ root.T, matern.covariance(identity), atol=1e-12)
     np.testing.assert_allclose(root.T, matern.root_transposed(identity), atol=1e-12)
     np.testing.assert_allclose(np.diag(root @ root.T), 1, rtol=1e-12)
-    np.testing.assert_allclose(matern.precision(root @ root.T), identity, atol=1e-9)
+    np.testing.assert_allclose(precision(matern, root @ root.T, smoothness), identity, atol=1e-9)
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])

@@ -9,7 +9,8 @@ from forward.bodies.geometry import Block, Box, outside
 from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.hyperelastic import Hyperelastic
-from forward.solvers.equilibrium import solve
+from forward.solvers.equilibrium import solving
+from forward.solvers.steps import finish
 from tests.bodies import MATERIALS, OUTPUTS, loaded_body
 from tests.launch import ROOT, on_kept_ranks
 from workflows.config.study import load
@@ -136,7 +137,7 @@ def test_patch_of_distorted_cells(corners, cell, degree):
     body = MovedBoundary(spec, MPI.COMM_SELF, ())
     body.set_parameters(np.empty(0))
     body.at_load(1.0)
-    u = solve(body, spec.solver, np.zeros(spec.unknowns)).state
+    u = finish(solving(body, spec.solver, np.zeros(spec.unknowns)), body.solve).state
     places = np.asarray(body.space.tabulate_dof_coordinates())
     np.testing.assert_allclose(
         u[: places.size].reshape(-1, 3), places @ (body.deformation - np.eye(3)).T, rtol=0, atol=1e-9

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.bodies.hexahedra import FACES
+from forward.bodies.mesh import FACES
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, saturation
 from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
@@ -123,9 +123,9 @@ def arch(folder, parts):
         here = [number.setdefault(tuple(np.round(w @ images, 9) + 0.0), len(number)) for w in weights]
         corners.append(here)
         if j == 0:
-            facets[0].append([here[n] for n in FACES[2]])
+            facets[0].append([here[n] for n in FACES["hexahedron"][2]])
         if j == 3 * parts - 1:
-            facets[1].append([here[n] for n in FACES[3]])
+            facets[1].append([here[n] for n in FACES["hexahedron"][3]])
     quads = [*facets[0], *facets[1]]
     tags = np.repeat([7, 8], parts**2)
     mesh = meshio.Mesh(

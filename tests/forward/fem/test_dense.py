@@ -43,10 +43,7 @@ class Equations:
         self.P[:, :, 0] = 0
         self.at, self.linearisation_point, self.symmetric = 0, LinearisationPoint(), False
 
-    def set_parameters(self, parameters, stiffer):
-        pass
-
-    def at_load(self, fraction):
+    def set_to(self, parameters, state, stiffer):
         pass
 
     def total(self, values):

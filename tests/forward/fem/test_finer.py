@@ -6,8 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
-from forward.bodies.hexahedra import FACES
-from forward.bodies.mesh import contents, divided
+from forward.bodies.mesh import contents, divided, faces_of
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.finer import OtherMesh, extrapolated
 from forward.finer_meshes import HALVED, OF_LINEAR, counted, finer, graded, held, share
@@ -117,7 +116,7 @@ def test_hexahedra_are_divided_into_eight(tmp_path):
         parts, least = inside(fine.points, fine.cells)
         assert least > 0
         np.testing.assert_allclose(parts.reshape(-1, 8).sum(axis=1), before, rtol=1e-12)
-        faces = np.sort(fine.cells[:, FACES].reshape(-1, 4), axis=1)
+        faces = np.sort(faces_of(fine.cells, "hexahedron"), axis=1)
         unique, count = np.unique(faces, axis=0, return_counts=True)
         assert count.max() == 2  # conforming
         outer = {tuple(face) for face in unique[count == 1].tolist()}

@@ -12,7 +12,8 @@ from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout
 from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS as REGISTERED
-from forward.solvers.equilibrium import solve
+from forward.solvers.equilibrium import solving
+from forward.solvers.steps import finish
 from tests import textbook
 from tests.bodies import (
     CELLS,
@@ -149,7 +150,7 @@ def test_affine_deformations(material, deformation):
     equations.deformation = F = np.array(deformation, dtype=float)
     equations.set_parameters(np.empty(0))
     equations.at_load(1.0)
-    u = solve(equations, spec.solver, np.zeros(equations.size)).state
+    u = finish(solving(equations, spec.solver, np.zeros(equations.size)), equations.solve).state
     equations.at_load(1.0)
     equations.set_state(u)
     places = np.asarray(equations.space.tabulate_dof_coordinates())

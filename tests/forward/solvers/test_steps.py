@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forward.model import SolveError
-from forward.solvers.steps import Task, abreast, failed, finish, finish_all, through
+from forward.solvers.steps import Task, abreast, finish, finish_all, through
 
 
 def asking(times, value):
@@ -13,6 +13,12 @@ def asking(times, value):
     for _ in range(times):
         x = yield x
     return float(x[0])
+
+
+def failed():
+    """A solver that has failed before it asks for anything."""
+    raise SolveError("broken")
+    yield  # a generator
 
 
 def run(lengths, most, broken=()):
@@ -25,7 +31,7 @@ def run(lengths, most, broken=()):
     def tasks():
         for i, length in enumerate(lengths):
             begun.append(i)
-            yield Task(failed(SolveError("broken")) if i in broken else asking(length, i), lambda _: None)
+            yield Task(failed() if i in broken else asking(length, i), lambda _: None)
 
     seen = []
     for result in finish_all(tasks(), doubled, most):
@@ -100,6 +106,6 @@ def test_a_solver_asks_for_several_at_once():
 
 @pytest.mark.unit
 def test_of_several_at_once_one_that_fails_ends_all():
-    tasks = [Task(asking(2, 1), lambda _: None), Task(failed(SolveError("broken")), lambda _: None)]
+    tasks = [Task(asking(2, 1), lambda _: None), Task(failed(), lambda _: None)]
     with pytest.raises(SolveError, match="broken"):
         finish(abreast(tasks), lambda right: right)

@@ -21,6 +21,7 @@ from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import CLOSE, find_mode
 from tests.launch import on_kept_ranks
+from tests.matern import inflation
 
 POINTS = 9  # along each edge of the cube
 SMALL = {"size": (1.0, 0.7, 0.8), "cells": (2, 2, 2), "degree": 1}
@@ -170,7 +171,7 @@ def test_the_prior_has_the_variance_that_was_asked_and_the_closed_form_inside():
     np.testing.assert_allclose(prior.variance, np.log1p(0.6**2))
     np.testing.assert_allclose(prior.root_transposed(identity), root.T, atol=1e-12)
     # Before it is divided by its standard deviation, the field at the centre has the variance of unbounded space.
-    assert Matern.on(body, 0.4).inflation[364] == pytest.approx(1, abs=0.1)
+    assert inflation(Matern.on(body, 0.4), 0.4)[364] == pytest.approx(1, abs=0.1)
 
 
 # --- inversion -------------------------------------------------------------------------------------------------------
