@@ -275,7 +275,7 @@ def _joined(
 
     how: Any = {"join": "outer", "data_vars": "all"}  # newer versions of xarray warn where it is not said
     several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
-    whole = xr.concat(several, "model", **how)
+    whole: xr.Dataset = xr.concat(several, "model", **how)
     return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
 
 
