@@ -17,8 +17,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from forward.graph import Tape, from_arrays, to_arrays
+from forward.hyperelastic import Hyperelastic
 from forward.machine import write_whole
 from forward.model import FloatArray, ModelError
 
@@ -194,6 +196,22 @@ def load(path: Path) -> ReducedData:
     if found is None:
         raise ModelError(f"{path}: made by another version, expected format {FORMAT}; run `tissuq reduce` again")
     return found
+
+
+def body_of(table: Mapping[str, Any], name: str = "") -> Hyperelastic:
+    """Return the body that a reduced model was made of, from its table; a name says of which file.
+
+    Raises
+    ------
+    ModelError
+        If it has kinds of its own, whose module is not there.
+    """
+    try:
+        return Hyperelastic.model_validate(table)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ModelError(f"{name or 'the reduced model'}: its body: {place}: {first['msg']}") from None
 
 
 _CLASSES = (Points, Output, LevelData, ReducedData)

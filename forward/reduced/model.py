@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from forward.combine import Joined
-from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError, Stability, Work
 from forward.pointwise import ExplicitSolution, OneByOne
-from forward.reduced.data import ReducedData, ReducedSpace
+from forward.reduced.data import ReducedData, ReducedSpace, body_of
 from forward.reduced.lockstep import SINGLE, TOGETHER, TOLERANCE, equilibria
 from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
 from forward.reduced.reduced_equations import At, ReducedEquations
@@ -102,7 +101,7 @@ class ReducedModel(OneByOne):
             self.base[data.parameters.index(path)] = value
         self.alone = alone
         self.level = ReducedEquations(data, data.levels[-1 if alone else 0], self.which)
-        self.spec = Hyperelastic.model_validate(data.spec)
+        self.spec = body_of(data.spec)
         self.space = ReducedSpace(data, self.places, self.base)
         self.differentiable = True
         self.asked: list[FloatArray] = []  # all parameters (d,) at which the full model was asked

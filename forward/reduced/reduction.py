@@ -10,10 +10,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from forward.fem.model import HyperelasticModel
-from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError
 from forward.phases import phase
-from forward.reduced.data import ReducedData
+from forward.reduced.data import ReducedData, body_of
 from forward.reduced.integrands import Integrand, of_form
 from forward.reduced.modes import AtRest, boxes, enough
 from forward.reduced.newton import stable
@@ -359,6 +358,6 @@ def enriched(data: ReducedData, points: FloatArray, cubature: float = 1e-3) -> R
     SolveError
         Where the full model has no answer.
     """
-    model: HyperelasticModel = Hyperelastic.model_validate(data.spec).build(MPI.COMM_SELF, data.parameters)
+    model: HyperelasticModel = body_of(data.spec).build(MPI.COMM_SELF, data.parameters)
     answers = solved(model, points, data.spread)
     return Reduction(model, data.nominal, data.spread).enriched(data, answers, Sizes(cubature=cubature))

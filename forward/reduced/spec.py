@@ -8,6 +8,7 @@ from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,6 +18,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.loaded import LoadedBody
 from forward.materials.admissible import Materials
 from forward.model import FloatArray, ModelError
+from forward.reduced.data import body_of
 from forward.registry import named
 from forward.scalars import Ranges, Scalar
 from forward.spec import ModelSpec
@@ -105,11 +107,11 @@ class Reduced(ModelSpec):
                 told, body = parts["about"]["table"], parts["spec"]["table"]
                 names = tuple(parts["parameters"]["tuple"])
                 arrays = [file[f".{name}"] for name in ("nominal", "spread", "lower", "upper")]
-        except (KeyError, ValueError, TypeError, OSError):
+        except (KeyError, ValueError, TypeError, OSError, BadZipFile):
             message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
             raise ModelError(message) from None
         nominal, spread, lower, upper = arrays
-        return _About(Hyperelastic.model_validate(body), names, nominal, spread, lower, upper, told, digest)
+        return _About(body_of(body, self.file), names, nominal, spread, lower, upper, told, digest)
 
     @property
     def outputs(self) -> Sequence[Any]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mpi4py import MPI
+from pydantic import ValidationError
 
 from forward.conformance import check_derivatives
 from forward.fem.forms import Forms
@@ -20,7 +21,7 @@ from forward.reduced.newton import outside_of
 from forward.reduced.outputs import NEAR_PEAK
 from forward.reduced.reduction import Reduction, Sizes, enriched
 from forward.reduced.snapshots import Snapshots, adjoint_states, directions
-from forward.reduced.spec import mistakes
+from forward.reduced.spec import Reduced, mistakes
 from tests.steps import STEPS
 
 pytestmark = pytest.mark.fem
@@ -311,6 +312,15 @@ def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path):
         load(tmp_path / "model.npz")
     with pytest.raises(ModelError, match="cannot be read: No such file"):
         load(tmp_path / "none.npz")
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(ValidationError, match="is not a reduced model"):
+        Reduced(file=str(tmp_path / "cut.npz"))
+
+
+def test_a_body_of_a_kind_that_is_not_there_is_one_line(small):
+    strange = replace(small, spec=small.spec | {"material": {"kind": "of-my-own", "mu": 1e3}})
+    with pytest.raises(ModelError, match=r"^the reduced model: its body: material.*of-my-own"):
+        ReducedModel(strange, strange.parameters)
 
 
 CONSTANTS = {
