@@ -23,6 +23,7 @@ from forward.graph import Tape, from_arrays, to_arrays
 from forward.hyperelastic import Hyperelastic
 from forward.machine import write_whole
 from forward.model import FloatArray, ModelError
+from forward.settings import shown
 
 FORMAT = 1
 
@@ -210,8 +211,8 @@ def body_of(table: Mapping[str, Any], name: str = "") -> Hyperelastic:
         return Hyperelastic.model_validate(table)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ModelError(f"{name or 'the reduced model'}: its body: {place}: {first['msg']}") from None
+        said = f"{'.'.join(map(str, first['loc']))}: {first['msg']}; given {shown(first['input'])}"
+        raise ModelError(f"{name or 'the reduced model'}: its body: {said}") from None
 
 
 _CLASSES = (Points, Output, LevelData, ReducedData)
