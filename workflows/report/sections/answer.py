@@ -30,12 +30,13 @@ ENDS = (0.025, 0.975)
 LEAST = 40  # samples of which quantiles are told
 TILES = 12  # answers; the others are in the tables
 DRIVERS = 3  # parameters named in a line
-UNSEEN = 0.01  # part of an error that is not worth a word
+UNSEEN = 0.1  # part of an error that is not worth a word: without it, the whole is less by half a percent
 SAID = 0.02  # share of the variance that is worth a word
 NAMED = 4  # names in a question
 MODES = 2  # of a field, from which on they are named together
 GOALS = 4  # predictions on the card
-SEVERAL = 3  # candidates of which evidences are told beside their probabilities
+SEVERAL = 3  # candidates with lines of their own; the others are told together
+WEIGHED = 1e-3  # probability, or weight in stacking, that is worth a line
 LAPLACE = 0  # value of `source`, see docs/results.md
 
 
@@ -79,7 +80,7 @@ def forward(results: Results) -> Card:
         value, errors = float(one[name]), {source: float(e[k]) for source, e in sources.items()}
         errors |= {"reduced model": own[output]} if output in own else {}
         spread = distribution(one) if sampled else None
-        lines = [] if spread is None else [f"95\u00a0%: {interval(*spread.inside, unit, value)}{spread.by}"]
+        lines = [] if spread is None else [f"{spread.by}: {interval(*spread.inside, unit, value)}"]
         lines += known(errors, unit, value, mesh=output not in results.meshes_unknown)
         estimate = single(one, name)
         if np.isfinite(estimate.corrected):
@@ -133,10 +134,10 @@ def known(errors: dict[str, float], unit: str, value: float, *, mesh: bool) -> I
 
 
 class Distribution(NamedTuple):
-    """The ends of the 95 % interval of an output, where they are from if not from it, and places (m,) and a density."""
+    """The ends of the 95 % interval of an output, what they are in words, and places (m,) and a density."""
 
     inside: tuple[float, float]
-    by: str = ""
+    by: str = "95\u00a0%"
     curve: tuple[FloatArray, FloatArray] | None = None
 
 
@@ -156,7 +157,7 @@ def distribution(one: xr.Dataset) -> Distribution:
             still = np.ptp(values) <= 1e-12 * np.abs(values).max()
             return Distribution((float(low), float(high)), curve=None if still else smooth(values))
     mean, reach = float(one["mean"]), 1.96 * float(one["std"])
-    return Distribution((mean - reach, mean + reach), " (mean ± 1.96 standard deviations)")
+    return Distribution((mean - reach, mean + reach), "mean ± 1.96 std")
 
 
 def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
@@ -300,23 +301,31 @@ def selection(results: Results) -> Card:
         str(of.attrs.get("quantity")), "measured values"
     )
     question = f"Which of {len(order)} models do {data:,} {kind} support?"
-    answers = []
-    for rank, model in enumerate(order):
-        one = of.sel(model=model)
-        error = float(one["log_evidence_error"])
-        lines = [f"ln Z {with_error(float(one['log_evidence']), error)}"] if rank < SEVERAL else []
+    answers, others = [], order[SEVERAL:] if len(order) > SEVERAL + 1 else []
+    for rank, model in enumerate(order[: len(order) - len(others)]):
+        one, lines = of.sel(model=model), []
+        if float(one["probability"]) >= WEIGHED:
+            lines.append(f"ln Z {with_error(float(one['log_evidence']), float(one['log_evidence_error']))}")
         if rank == 0 and len(order) > 1:
             ln_B, _ = bayes_factor(of, model, order[1])
             lines.append(f"{odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
-        elif rank:
+        elif rank > 1:  # of the second the first has said it
             lines.append(f"{odds(bayes_factor(of, order[0], model)[0])} against it")
-        if "stacking" in one and rank < SEVERAL:
+        if "stacking" in one and float(one["stacking"]) >= WEIGHED:
             lines.append(f"stacking {percent(float(one['stacking']))}")
         if "mesh_checked" in one and not bool(one["mesh_checked"].all()):
             lines.append(NOT_KNOWN)
         elif not bool(one["trusted"].all()):
             lines.append("not to be trusted")
         answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
+    if others:
+        chance = percent(float(of["probability"].sel(model=others).sum()))
+        said = f"{odds(bayes_factor(of, order[0], others[0])[0])} against {others[0]}, more against the others"
+        doubted = [model for model in others if not bool(of["trusted"].sel(model=model).all())]
+        lines = [said, *([f"not to be trusted: {', '.join(doubted)}"] if doubted else [])]
+        unseen = "mesh_checked" in of and not bool(of["mesh_checked"].sel(model=others).all())
+        lines += [NOT_KNOWN] if unseen else []
+        answers.append(Answer(f"the other {len(others)}", chance, lines))
     return Card(question, answers)
 
 

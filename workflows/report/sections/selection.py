@@ -241,7 +241,7 @@ def curves(results: Results) -> Iterator[Block]:
     tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
     if dataset.attrs["quantity"] == "stress":
         yield Heading("Curves over the data")
-        names = ", ".join(str(test) for _, test in tests)
+        names = ", ".join(dict.fromkeys(str(test) for _, test in tests))
         figure = plots.fits(dataset, [(str(group), str(test)) for group, test in tests])
         yield Pictures.of((figure, f"{names}: mean and 90 % band of each model."))
         return
