@@ -193,7 +193,7 @@ def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():
     known = {"prior_mean": 500.0, "prior_std": 250.0, "true": 450.0}
     lines = "\n".join(answer._unknown(xr.Dataset(posterior | known), "material.C1", "Pa").lines).replace("\u00a0", " ")
     assert "truth 450 Pa, inside" in lines
-    assert "before the data 500 ± 250 Pa" in lines
+    assert "prior 500 ± 250 Pa" in lines
 
 
 def test_what_is_to_be_read_first_stands_before_the_numbers():

@@ -226,7 +226,7 @@ def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
     if not np.isfinite(mean):
         return Answer(f"{name}, predicted", "no answer", ("it could not be predicted; the reason is below",))
     if np.isfinite(before):
-        lines.append(f"before the data {and_error(before, wide, unit)}")
+        lines.append(f"prior {and_error(before, wide, unit)}")
     if np.isfinite(mesh):
         lines.append(f"to be added for the mesh: {size(mesh, unit, like=mean)}")
     elif not known_mesh:
@@ -267,9 +267,9 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     before, wide = float(one["prior_mean"]), float(one["prior_std"])
     narrower = wide / std if std > 0 else np.inf
     said = f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"
-    lines = [f"before the data {and_error(before, wide, unit, like=mean)}: {said}"]
+    lines = [f"prior {and_error(before, wide, unit, like=mean)}: {said}"]
     if np.isfinite(one["true"]):
-        inside = "inside" if lower <= float(one["true"]) <= upper else "outside the interval"
+        inside = "inside" if lower <= float(one["true"]) <= upper else "outside"
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
     drawn = None
     if "draw" in one and one["draw"].ndim == 1:
