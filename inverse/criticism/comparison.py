@@ -16,7 +16,7 @@ Probabilities, averages and residual tests share this file because all come from
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -248,12 +248,13 @@ def comparison(
     of_outputs = _joined(found, candidates, data_groups, _of_outputs, "output")
     mean, std = (of_outputs[f"prediction_{name}"].to_numpy() for name in ("mean", "std"))
     average = P @ mean
+    first = of_model[names[0]]
     variables |= {
-        "output_group": ("output", np.repeat(groups, [len(data) for data in data_groups.values()])),
-        **{
-            name: ("output", np.concatenate(several))
-            for name, several in _of_data(data_groups, of_model[names[0]]).items()
-        },
+        "output_group": ("output", np.repeat(groups, [len(one.data) for one in first])),
+        "output_test": ("output", np.concatenate([one.data.tests for one in first])),
+        "output_at": ("output", np.concatenate([one.data.positions for one in first])),
+        "measured": ("output", np.concatenate([one.data.values for one in first])),
+        "sigma": ("output", np.concatenate([_beyond(one.posterior.noise.sigma, len(one.data)) for one in first])),
         "average_mean": ("output", average),
         "average_within": ("output", P @ std**2),
         "average_between": ("output", P @ (mean - average) ** 2),
@@ -277,18 +278,6 @@ def _joined(
     several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
     whole: xr.Dataset = xr.concat(several, "model", **how)
     return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
-
-
-def _of_data(data_groups: Mapping[str, Measurements], found: Sequence[Compared]) -> dict[str, list[Any]]:
-    """What was measured, and where, of each group; of what is only predicted the errors are NaN."""
-    several = list(data_groups.values())
-    sigma = [one.posterior.noise.sigma for one in found]
-    return {
-        "output_test": [one.tests for one in several],
-        "output_at": [one.positions for one in several],
-        "measured": [one.values for one in several],
-        "sigma": [_beyond(one, len(data)) for one, data in zip(sigma, several, strict=True)],
-    }
 
 
 def _beyond(values: FloatArray, count: int) -> FloatArray:
