@@ -25,6 +25,7 @@ from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.record import noise_of
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -167,7 +168,7 @@ def again(case: Case, assumed: Sequence[Assumption], std: FloatArray) -> Iterato
                 by = Sparse(eye(d + len(moved), d, format="csr"), np.append(np.zeros(d), taken.values + moved))
                 model = Mapped(observing(numbers, data), by, case.inputs.names)
             problem = Problem(data, METHOD)
-            posterior = Posterior(case.inputs, SerialEvaluate(model), data.values, problem.noise)
+            posterior = Posterior(case.inputs, SerialEvaluate(model), data.values, noise_of(problem))
             ends.append(posterior.physical(laplace(posterior, starts=1).mode[None])[0])
         yield (ends[0] - ends[1]) / (2 * OF_SIZE) / std
 

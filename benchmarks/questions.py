@@ -20,6 +20,7 @@ from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
+from inverse.methods.record import noise_of
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -95,7 +96,7 @@ class Cube:
         sigma = np.full(len(right), NOISE * np.abs(right).max())
         data = replace(self.data, values=right + sigma * rng.standard_normal(len(right)), sigma=sigma)
         problem = Problem(data, Invert())
-        posterior = Posterior(INPUTS, self.evaluate, data.values, problem.noise, start=self.start)
+        posterior = Posterior(INPUTS, self.evaluate, data.values, noise_of(problem), start=self.start)
         gaussian = laplace(posterior, starts=1)
         at = posterior.at(gaussian.mode[None], derivatives=True)
         return asked(posterior, gaussian, at, self.asked(data), 0)

@@ -63,12 +63,14 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         def problem(name: str, group: str) -> Problem[Select]:
             pair, label = (name, group), f"{name}/{group}"
             recorder, motion, one, learnt = recorders[label], motions.get(pair), taken[pair], study.learnt.get(name)
-            finer = None if not why else Finer(None, why[name])
-            if pair in checked:
-                finer = Finer.by(recorder.on(f"{label}/{FINER}"))
-            assumed = None
+            assumed = truth = None
             if method.assumptions or study.uncertain:
                 assumed = one.of(one.data, by_evaluation(evaluate.on(f"{label}/{ASSUMED}")) if one.asked else None)
+            if learnt is not None:
+                truth = Truth(evaluate.on(f"{label}/{TRUTH}"), learnt.solves, method.seed)
+            finer = None if not why else Finer(None, why[name])
+            if pair in checked:  # last, since it is asked first, and one of these models is in memory at a time
+                finer = Finer.by(recorder.on(f"{label}/{FINER}"))
             moved = None if motion is None else motion.errors_by(evaluate.on(f"{label}/{MOVED}"))
             return Problem(
                 study.data_groups[group].seen(),
@@ -79,7 +81,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
                 say=lambda line: ensemble.say(f"{name}: {line}"),
                 steps=Steps(kept, recorder, label, ensemble.count),
                 assumed=assumed,
-                truth=None if learnt is None else Truth(evaluate.on(f"{label}/{TRUTH}"), learnt.solves, method.seed),
+                truth=truth,
             )
 
         return method.run(study.models, study.data_groups, recorded, problem, free)
