@@ -171,11 +171,8 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
     """
     method: Inference = problem.method
     shared, truth, assumed = problem.shared, problem.truth, problem.assumed
-    start, steps, model = (
-        problem.start or by_tangents(posterior.inputs, posterior.evaluate),
-        problem.steps,
-        problem.model,
-    )
+    start = problem.start or by_tangents(posterior.inputs, posterior.evaluate)
+    steps, model = problem.steps, problem.model
     samples = method.solves(len(posterior.names), field=False)
     d = len(posterior.inputs.names)
     if shared is not None:
