@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from forward.bodies.geometry import AXES
 from forward.fem.cost import BYTES_PER_NONZERO, BYTES_PER_UNKNOWN, MOST_BYTES, REPORT, START, factor, times
 
 if TYPE_CHECKING:
@@ -22,7 +23,8 @@ COPIES = 4  # of the matrix, while what preconditions steps is taken from it
 
 # The finer mesh by which estimates are calibrated.
 MOST_UNKNOWNS = 40_000
-TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough
+TWICE = 2.0  # what a mesh in a file, and a single layer of cells, can be divided by
+TIMES = (TWICE, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough
 ALONE = 1.5  # the same of a mesh without an estimate of its own, where none of these is: with it the order shows best
 SHARE = 0.2  # of what a study takes without its solves
 OF_ALONE = 0.35  # the same for that mesh: without any, half of what is seen would be in doubt
@@ -154,7 +156,7 @@ def finer(spec: Any, spare: float = math.inf) -> Finer | None:
 
 def _there(spec: Any, more: float, *, estimated: bool) -> Finer | None:
     """Return a body on a mesh with so many times the cells along edges; None without one, or if it is too large."""
-    body = _with_cells(spec, more)
+    body = with_cells(spec, more)
     if body is None:
         return None
     formulation = "mixed" if spec.mixed else "displacement"
@@ -169,10 +171,16 @@ def _there(spec: Any, more: float, *, estimated: bool) -> Finer | None:
     return Finer(there, more, seconds, size, estimated)
 
 
-def _with_cells(spec: Any, more: float) -> Any | None:
-    """Return the body with so many times the cells along each edge; None where it cannot be."""
+def with_cells(spec: Any, more: float) -> Any | None:
+    """Return the body with so many times the cells along each edge; None where it cannot be.
+
+    Cells of a file are divided into eight. So is a single layer of cells, or two would be the finer mesh of one while
+    the other edges are divided by less: the order that shows then is of neither.
+    """
+    body = spec.body
+    thin = body.structured and any(n == 1 for axis, n in zip(AXES, body.cells, strict=True) if axis not in spec.plane)
+    if more != TWICE and (thin or not body.structured):
+        return None
     with suppress(ValueError):  # it is divided already, or too large
-        if spec.body.structured:
-            return spec.body.with_cells(more, spec.plane)
-        return spec.body.refined(1) if more == TIMES[0] else None  # cells of a file are divided into eight
+        return body.with_cells(more, spec.plane) if body.structured else body.refined(1)
     return None

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from forward.bodies.mesh import FACES
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, saturation
-from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer
+from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer, with_cells
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import OUTPUTS, loaded_body
 from tests.launch import on_kept_ranks
@@ -281,6 +281,15 @@ def test_layers_of_plane_strain_are_not_cut():
     assert block((4, 4, 1)).plane == ()  # between plates that hold it, it bulges
     ball = {"kind": "sphere", "x": 0.5, "y": 0.5, "z": 0.3, "radius": 0.2, "width": 0.1, "contrast": 3.0}
     assert block((4, 4, 1), **plane, inclusions=(ball,)).plane == ()
+
+
+@pytest.mark.unit
+def test_a_single_layer_is_halved_or_there_is_no_finer_mesh():
+    """Two layers in its place, beside edges divided by 1.5, show an order that is of neither."""
+    thin, thick = block(cells=(10, 5, 1), degree=2), block(cells=(10, 5, 2), degree=2)
+    assert finer(thin).spec.body.cells == (20, 10, 2)
+    assert with_cells(thin, 1.5) is None
+    assert with_cells(thick, 1.5).cells == (15, 8, 3)
 
 
 @pytest.mark.unit
