@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Row = TypeVar("Row")
 Level = Literal[1, 2, 3]  # of a heading
+Tone = Literal["", "lead", "warning", "error"]
 CURVE = 48  # points
 ALIKE = 1e-12  # standard deviation over the mean up to which values are the same
 HALF = 8.0  # inches: wider pictures are not legible on half a page
@@ -57,10 +58,11 @@ class Heading(Block):
 
 @dataclass(frozen=True)
 class Text(Block):
-    """A paragraph."""
+    """A paragraph, of which `more` is folded."""
 
     text: str
-    tone: Literal["", "lead", "warning", "error"] = ""
+    tone: Tone = ""
+    more: str = ""
 
     @property
     def lines(self) -> Sequence[str]:

@@ -52,7 +52,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any], study: StudyKind
     notes = [line for severity, line in said if severity == "note"]
     if len(lines) + len(notes) > MOST:
         kept = notes[: max(MOST - 1 - len(lines), 0)]
-        notes = [*kept, f"notes: {len(notes) - len(kept)} more in report.html"]
+        notes = [*kept, f"notes: {len(notes) - len(kept)} more in summary.json"]
     return "\n".join([*lines, *notes]) + "\n"
 
 
@@ -86,7 +86,7 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
             rows.append((f"  {name}", value, *_of_mesh(one, known=output not in unknown)))
     yield from _table(rows)
     if len(told) < len(outputs):
-        yield f"and {len(outputs) - len(told)} outputs that vary less, in results.nc and report.html"
+        yield f"and {len(outputs) - len(told)} outputs that vary less, in results.nc"
 
 
 def _of_mesh(one: Estimate[float], *, known: bool) -> list[str]:

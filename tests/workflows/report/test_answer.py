@@ -9,14 +9,14 @@ import pytest
 import xarray as xr
 from scipy import integrate, stats
 
-from forward.findings import Finding
+from forward.findings import FREE, Finding
 from forward.readable import and_error, interval, percent, quantity, rounded, scale, size, spoken
 from tests.workflows.report.test_report import SVG, solve, study, study_of, write
 from uq.findings import add
 from workflows.report import blocks, plots
 from workflows.report.page import write_report
 from workflows.report.sections import answer, inversions
-from workflows.report.sections.frame import gravest
+from workflows.report.sections.frame import gravest, told
 from workflows.results import summary
 from workflows.run import closing
 
@@ -168,7 +168,7 @@ def test_numbers_that_nothing_stands_in_place_of_are_said_to_be_by_laplace(trust
 def test_the_terminal_says_how_many_answers_it_leaves_to_the_report(monkeypatch):
     found = blocks.Card("How?", [blocks.Answer(f"a{k}", "1 m", ()) for k in range(answer.TILES + 3)])
     monkeypatch.setitem(answer.CARDS, "many", lambda results: found)
-    monkeypatch.setattr(answer, "gravest", lambda results: None)
+    monkeypatch.setattr(answer, "gravest", lambda results: [])
     *listed, last = closing.answers(xr.Dataset({"many": 1.0}), {}, None)
     assert listed == [f"a{k}: 1 m" for k in range(answer.TILES)]
     assert last == "The other 3 are in the tables of the report."
@@ -184,7 +184,7 @@ def test_the_end_of_a_run_is_twelve_lines_and_notes_are_what_gives_way(monkeypat
     assert lines[:2] == ["warning: w0", "warning: w1"]
     assert sum(line.startswith("note: ") for line in lines) == shown
     assert len(lines) <= 11
-    assert lines[-1] == (f"notes: {notes - shown} more in report.html" if notes > shown else f"note: n{notes - 1}")
+    assert lines[-1] == (f"notes: {notes - shown} more in summary.json" if notes > shown else f"note: n{notes - 1}")
 
 
 def test_what_is_known_keeps_its_digits_beside_a_wide_posterior():
@@ -207,8 +207,25 @@ def test_what_is_to_be_read_first_stands_before_the_numbers():
     results = SimpleNamespace(dataset=xr.Dataset())
     add(results.dataset, *of)
     said = gravest(results)
-    assert [one.tone for one in said] == ["warning", "warning"]
+    assert [one.severity for one in said] == ["warning", "warning"]
     assert sorted(one.text.partition(":")[0] for one in said) == [
         "Best of bad models",
         "The error of the mesh is not known",
     ]
+
+
+@pytest.mark.parametrize(
+    ("text", "read", "folded"),
+    [
+        ("It errs. " + "Here is why and what to do about it. " * 4, "It errs.", "Here is why"),
+        ("It errs. Take more cells.", "It errs. Take more cells.", ""),
+        ("One sentence alone, " + "as long as it may be, " * 8 + "stays.", "One sentence alone", ""),
+    ],
+)
+def test_of_a_long_finding_the_first_sentence_is_read_at_once(text, read, folded):
+    found = told(Finding(FREE, "warning", {"text": text.strip()}))
+    assert found.tone == "warning"
+    assert found.text.startswith(read)
+    assert found.more.startswith(folded)
+    assert bool(found.more) == bool(folded)
+    assert f"{found.text} {found.more}".strip() == text.strip()

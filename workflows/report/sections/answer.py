@@ -15,7 +15,7 @@ from workflows.report.blocks import CURVE, Answer, Block, Card, Curve, Text, cur
 from workflows.report.section import Results, section
 from workflows.report.sections.cost import reduced_card
 from workflows.report.sections.errors import counting, parts_of
-from workflows.report.sections.frame import gravest
+from workflows.report.sections.frame import gravest, told
 from workflows.report.sections.inversions import design_card, population_card
 from workflows.report.sections.posterior import measured_kind
 from workflows.results.comparison import bayes_factor, by_probability, grade, odds
@@ -47,7 +47,7 @@ def answer_first(results: Results) -> Iterator[Block]:
     card = next((card for has, card in CARDS.items() if has in dataset or has in dataset.dims), None)
     if card is not None:
         found = card(results)
-        yield Card(found.question, found.answers[:TILES], gravest(results))
+        yield Card(found.question, found.answers[:TILES], [told(one) for one in gravest(results)])
         if len(found.answers) > TILES:
             yield Text(f"The other {len(found.answers) - TILES} are in the tables of the report.")
 
@@ -320,7 +320,7 @@ def selection(results: Results) -> Card:
         answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
     if others:
         chance = percent(float(of["probability"].sel(model=others).sum()))
-        said = f"{odds(bayes_factor(of, order[0], others[0])[0])} against {others[0]}, more against the others"
+        said = f"{odds(bayes_factor(of, order[0], others[0])[0])} against {others[0]}, no less against the others"
         doubted = [model for model in others if not bool(of["trusted"].sel(model=model).all())]
         lines = [said, *([f"not to be trusted: {', '.join(doubted)}"] if doubted else [])]
         unseen = "mesh_checked" in of and not bool(of["mesh_checked"].sel(model=others).all())

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from forward.findings import Finding
 from forward.readable import NONE, duration, number, settings, size, with_unit
 from uq import findings as of_results
-from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text
+from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text, Tone
 from workflows.report.section import Results, section
 from workflows.report.words import counted, joined, law, solves, stability
 
@@ -33,6 +34,7 @@ def header(results: Results) -> Iterator[Block]:
 
 NOTES = 1  # that are read at once, unless there is something graver
 FIRST = 2  # findings that stand before the answers: errors, and these
+LONG = 25  # words of a finding that is read at once
 BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
 
 
@@ -43,23 +45,29 @@ def findings(results: Results) -> Iterator[Block]:
     """Findings, the most severe first."""
     if "note" in results.summary:
         yield Text(results.summary["note"], "warning")
-    found = of_results.findings(results.dataset)
-    said = [one.text for one in gravest(results)]
-    grave = [Text(one.text, one.severity) for one in found if one.severity != "note"]
-    yield from (one for one in grave if one.text not in said)
-    notes = [Text(one.text) for one in found if one.severity == "note"]
-    first = 0 if grave else NOTES
-    yield from notes[:first]
+    before = gravest(results)
+    found = [one for one in of_results.findings(results.dataset) if one not in before]
+    grave = [one for one in found if one.severity != "note"]
+    notes = [one for one in found if one.severity == "note"]
+    first = 0 if before or grave else NOTES
+    yield from map(told, [*grave, *notes[:first]])
     if len(notes) > first:
         more = len(notes) - first
-        yield Folded(f"{more} {'more ' * bool(first)}note{'s' * (more > 1)}", notes[first:])
+        yield Folded(f"{more} {'more ' * bool(first)}note{'s' * (more > 1)}", [Text(one.text) for one in notes[first:]])
 
 
-def gravest(results: Results) -> list[Text]:
+def gravest(results: Results) -> list[Finding]:
     """Return the first of what is to be read before any number: that it cannot be trusted, or does not hold all."""
     found = of_results.findings(results.dataset)
-    heard = [one for one in found if one.severity == "error" or (one.severity == "warning" and one.code in BEFORE)]
-    return [Text(one.text, one.severity) for one in heard[:FIRST] if one.severity != "note"]
+    first = [one for one in found if one.severity == "error" or (one.severity == "warning" and one.code in BEFORE)]
+    return first[:FIRST]
+
+
+def told(one: Finding) -> Text:
+    """Write a finding; of a long one, what follows the first sentence is folded."""
+    first, _, more = one.text.partition(". ")
+    tone: Tone = "" if one.severity == "note" else one.severity
+    return Text(f"{first}.", tone, more) if more and len(one.text.split()) > LONG else Text(one.text, tone)
 
 
 @section("nominal", heading="What was computed")
