@@ -51,7 +51,6 @@ class _Fibres(Term):
     kind: str = "fibres"
 
     def potential(self, at: Place) -> Any:
-        """Return its energy (J)."""
         C = at.F.T * at.F
         # Components of E, those off the diagonal twice, with the two axes of each.
         strains = [(C[a, a] - 1) / 2 if a == b else C[a, b] for a, b in PAIRS]

@@ -76,11 +76,9 @@ class Hyperelastic(LoadedBody):
     kind: Literal["hyperelastic"] = "hyperelastic"
 
     def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
-        """Refine the mesh at a point (d,) of parameters by their paths, as `forward.fem.adapt` does; collective."""
         return named("forward.fem.adapt:adapt")(self, comm, parameters, point, say)
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
-        """Say for a report what was solved."""
         yield from in_words(self, said, where)
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
@@ -147,7 +145,6 @@ class Path(Hyperelastic):
 
     @property
     def stepped(self) -> Mapping[str, tuple[float, ...]]:
-        """The lists by the paths of the numbers."""
         return self.steps
 
     @property
@@ -162,7 +159,6 @@ class Path(Hyperelastic):
 
     @property
     def whole(self) -> Hyperelastic:
-        """The body at the last step, with the numbers that change among the others."""
         names = Hyperelastic.model_fields.keys() - {"kind"}
         return Hyperelastic(**{name: value for name, value in self if name in names})
 
@@ -194,7 +190,6 @@ class Path(Hyperelastic):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Which step each is, and the numbers there."""
         where = [", ".join(f"{p} = {v[k]:g}" for p, v in self.steps.items()) for k in range(self.count)]
         return tuple(f"step {k} of {self.count} ({numbers})" for k, numbers in enumerate(where, 1))
 
@@ -211,7 +206,6 @@ class Path(Hyperelastic):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings before anything is solved."""
         ends = {path: (min(values), max(values)) for path, values in self.steps.items()}
         return tuple(dict.fromkeys((*super().findings, *too_far(self.body, ends))))
 
@@ -221,7 +215,6 @@ class Path(Hyperelastic):
         return found if self.path_dependent else sum_of([replace(found, contact=False)] * self.count)
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
-        """Predict what an estimate of the error of the mesh takes in all steps."""
         return sum_of([super().mesh_error_cost(spare)] * self.count)
 
     def described(self, ranges: Any) -> Iterator[tuple[str, str]]:
@@ -243,7 +236,6 @@ class Path(Hyperelastic):
         return f"{with_unit(listed, unit)} in {len(said)} steps"
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
-        """Say for a report what was solved."""
         return super().words(lambda path: self.in_words(path) if path in self.steps else said(path), where)
 
     def _mistakes(self) -> Iterator[Mistake]:

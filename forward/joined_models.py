@@ -39,7 +39,6 @@ class JoinedModels(ModelSpec):
     shared: tuple[str, ...] = ()
 
     def path_of(self, name: str, path: str) -> str:
-        """Return the path of a number of one of the models among those of all."""
         return path if path in self.shared else f"{name}.{path}"
 
     def own(self, name: str, ranges: Ranges) -> dict[str, Any]:
@@ -49,7 +48,6 @@ class JoinedModels(ModelSpec):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """The numbers of all models, those that are shared once."""
         found: dict[str, Scalar] = {}
         for name, model in self.models.items():
             for path, scalar in model.scalars.items():
@@ -58,7 +56,6 @@ class JoinedModels(ModelSpec):
 
     @property
     def unavailable(self) -> Mapping[str, str]:
-        """Why some of its numbers cannot be parameters, by their paths."""
         pairs = ((name, model.unavailable.items()) for name, model in self.models.items())
         return {self.path_of(name, path): why for name, every in pairs for path, why in every}
 
@@ -73,7 +70,6 @@ class JoinedModels(ModelSpec):
 
     @property
     def parts(self) -> Mapping[str, ModelSpec]:
-        """The models by name."""
         return self.models
 
     @property
@@ -96,43 +92,35 @@ class JoinedModels(ModelSpec):
         return Materials(energy, places) if places else None
 
     def over(self, ranges: Ranges) -> JoinedModels:
-        """Return the same models in the forms that suit all values of parameters within ranges, by their paths."""
         models = {name: model.over(self.own(name, ranges)) for name, model in self.models.items()}
         return self.model_copy(update={"models": models})
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """Findings about each model before anything is solved."""
         every = ((name, model.findings_over(self.own(name, ranges))) for name, model in self.models.items())
         return tuple(one.of(f"Model '{name}'") for name, found in every for one in found)
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
-        """Find what is impossible with random parameters in any of the models."""
         for name, model in self.models.items():
             for (_, *place), message, given in model.mistakes_of_samples():
                 yield ("model", "models", name, *place), message, given
 
     @property
     def description(self) -> str:
-        """The models in words."""
         return "; ".join(f"{name}: {model.description}" for name, model in self.models.items())
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Describe each model."""
         for name, model in self.models.items():
             for what, words in model.described(self.own(name, ranges)):
                 yield what, f"{name}: {words}"
 
     def cost(self) -> Times | None:
-        """Predict the cost of a solve of all models of which it is known."""
         known = [cost for model in self.models.values() if (cost := model.cost()) is not None]
         return sum_of(known) if known else None
 
     def identity(self) -> dict[str, Any]:
-        """Return everything that results depend on, as a table."""
         return super().identity() | {"models": {name: model.identity() for name, model in self.models.items()}}
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Joined:
-        """Make all models; collective."""
         made = []
         for name, model in self.models.items():
             own = [(path, self.path_of(name, path)) for path in model.scalars]

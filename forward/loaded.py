@@ -65,7 +65,6 @@ class LoadedBody(Solid):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """Every number that can be made a parameter, by its path."""
         found = self.own_scalars
         for load in self.loads:
             for name, scalar in load.scalars.items():
@@ -110,7 +109,6 @@ class LoadedBody(Solid):
 
     @property
     def unavailable(self) -> Mapping[str, str]:
-        """Why some of its numbers cannot be parameters, by their paths."""
         smooth = [load.label for load in self.loads if load.contact and load.symmetric]
         why = "a tool without friction has no such number, expected a friction above 0 in the load too"
         return {f"loads.{label}.friction": why for label in smooth}
@@ -133,7 +131,6 @@ class LoadedBody(Solid):
 
     @property
     def touched(self) -> bool:
-        """Whether tools touch it."""
         return any(load.contact for load in self.loads)
 
     @property
@@ -190,12 +187,10 @@ class LoadedBody(Solid):
 
     @property
     def adaptive(self) -> bool:
-        """Whether the mesh is refined before anything else is solved."""
         return self.adapt is not None
 
     @property
     def unrefined(self) -> bool:
-        """Whether that is still to be done."""
         return self.adapt is not None and not self.adapt.refined
 
     @property
@@ -284,11 +279,9 @@ class LoadedBody(Solid):
 
     @property
     def solver_tolerance(self) -> float:
-        """Residual that solutions may have, relative to the loads."""
         return self.solver.tolerance
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         of_loads: list[Finding] = []
         for load in self.loads:
             own = f"loads.{load.label}."
@@ -301,7 +294,6 @@ class LoadedBody(Solid):
         return self.model_copy(update={"solver": self.solver.model_copy(update={"kind": "newton"})})
 
     def tighter(self, factor: float) -> Self:
-        """Return the same problem with the solver's tolerances multiplied by a factor."""
         solver = self.solver
         tolerances = {
             "tolerance": factor * solver.tolerance,
@@ -310,7 +302,6 @@ class LoadedBody(Solid):
         return self.model_copy(update={"solver": solver.model_copy(update=tolerances)})
 
     def solved_to(self, tolerance: Any) -> Self:
-        """Return the same problem with another tolerance of its solver."""
         solver = SolverSettings.model_validate(self.solver.model_dump() | {"tolerance": tolerance})
         return self.model_copy(update={"solver": solver})
 
@@ -335,7 +326,6 @@ class LoadedBody(Solid):
         return replace(whole, setup=one.setup, bytes=one.bytes)
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
-        """Predict what an estimate of the error of the mesh takes, and what calibrates it."""
         own, calibrating = own_estimate(self), finer(self, spare)
         if calibrating is None:
             return own

@@ -80,22 +80,18 @@ class MaterialTests(ModelSpec):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """The constants, by their paths."""
         made, values = block(self.energy), self.fixed
         return {path: Scalar(values.get(name, math.nan), made, name) for name, path in self.paths.items()}
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
-        """Return the material as a function of some constants, by their paths."""
         varied = {name: path for name, path in self.paths.items() if path in parameters}
         return Materials(self.energy, {"material": {**self.fixed, **varied}})
 
     @property
     def description(self) -> str:
-        """The model in words."""
         return f"{self.energy}, in {', '.join(test.label for test in self.tests)}"
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Say what is tested."""
         yield "material", self.description
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> HomogeneousModel:
@@ -161,10 +157,8 @@ class CandidateTests(MaterialTests):
 
     @property
     def paths(self) -> dict[str, str]:
-        """Names of the parameters, by themselves."""
         return {name: name for name in self.parameters}
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The parameters."""
         return self.parameters

@@ -111,7 +111,6 @@ class Solid(ModelSpec):
 
     @property
     def bodies(self) -> tuple[Solid, ...]:
-        """Itself."""
         return (self,)
 
     @property
@@ -126,8 +125,6 @@ class Solid(ModelSpec):
         return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
-        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
-
         def own(place: str, values: Mapping[str, float]) -> dict[str, float | str]:
             paths = {name: f"{place}.{name}" for name in values}
             return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
@@ -176,7 +173,6 @@ class Solid(ModelSpec):
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
 
     def over(self, ranges: Ranges) -> Self:
-        """Return the same body with the formulation that suits all values of parameters within ranges."""
         return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
 
     def linearised(self) -> Self:

@@ -209,12 +209,10 @@ class Specimen(Solid):
         yield from super().mistakes_of_samples()
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         return (*self.findings, *self.locking(ranges))
 
     @property
     def description(self) -> str:
-        """The model in words."""
         cases = ", ".join(case.name for case in self.cases)
         return f"{self.body.description}, {self.body.cells_in_words} cells, in the load cases {cases}"
 
@@ -262,7 +260,6 @@ class Specimen(Solid):
         return sum_of([self.loaded(case).cost(factors=1) for case in self.cases])
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
-        """Predict what an estimate of the error of the mesh takes in all load cases."""
         return sum_of([own_estimate(self.loaded(case)) for case in self.cases])
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
@@ -273,7 +270,6 @@ class Specimen(Solid):
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
-        """Mesh the body and compile the forms of every case, as `Hyperelastic.build` does of one; collective."""
         return named("forward.fem.joined:specimen")(self, comm, parameters)
 
     def _mistakes(self) -> Iterator[Mistake]:

@@ -249,7 +249,6 @@ class Box(_SixSided):
 
     @property
     def meshed(self) -> tuple[Length, Length, Length]:
-        """Edge lengths of the box that is meshed."""
         return self.size
 
     @property
@@ -260,7 +259,6 @@ class Box(_SixSided):
 
     @property
     def description(self) -> str:
-        """The shape in words."""
         return f"box of {' × '.join(f'{x:g}' for x in self.size)} m"
 
     def shaped(self, points: FloatArray) -> FloatArray:
@@ -268,7 +266,6 @@ class Box(_SixSided):
         return points
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         return np.asarray(np.clip(points, 0.0, self.size))
 
 
@@ -311,7 +308,6 @@ class Block(_SixSided):
 
     @property
     def meshed(self) -> tuple[Length, Length, Length]:
-        """Edge lengths of the cube."""
         return 1.0, 1.0, 1.0
 
     @property
@@ -321,7 +317,6 @@ class Block(_SixSided):
 
     @property
     def description(self) -> str:
-        """The shape in words."""
         return f"block with the corners {', '.join('(' + ', '.join(f'{x:g}' for x in c) + ')' for c in self.corners)} m"
 
     def shaped(self, points: FloatArray) -> FloatArray:
@@ -329,7 +324,6 @@ class Block(_SixSided):
         return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         from scipy.optimize import lsq_linear
 
         steps = np.linspace(0, 1, 5)

@@ -97,7 +97,6 @@ class _External(ModelSpec):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """Every number that can be a parameter, by name."""
         return {name: Scalar(value) for name, value in self.parameters.items()}
 
     @abstractmethod
@@ -178,16 +177,13 @@ class PythonModel(_External):
 
     @property
     def description(self) -> str:
-        """The model in words."""
         return f"Python function {self.function}{f', derivatives {self.jacobian}' if self.jacobian else ''}"
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """The modules of the function and its Jacobian."""
         return tuple(path.rpartition(".")[0] for path in (self.function, self.jacobian) if path)
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
-        """Import the function and its Jacobian."""
         names, seconds = tuple(self.parameters), self.solve_seconds
         function = _guarded(self.function, "function", names, seconds)
         return function, _guarded(self.jacobian, "jacobian", names, seconds) if self.jacobian else None
@@ -276,7 +272,6 @@ class UmBridgeModel(_External):
 
     @property
     def description(self) -> str:
-        """The model in words."""
         options = ", ".join(f"{key} = {value}" for key, value in self.config.items())
         return f"UM-Bridge model{f' {self.name}' if self.name else ''} at {self.url}{f', {options}' if options else ''}"
 

@@ -287,7 +287,6 @@ class SpecimenSolution(CombinedSolution):
     of_places: NDArray[np.bool_]
 
     def mesh_error(self) -> MeshError | None:
-        """Estimate the error of the mesh in the observations and the states of all cases; collective."""
         found = super().mesh_error()
         return None if found is None else replace(found, relative=relative(found.energy, found.stored))
 

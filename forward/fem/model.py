@@ -100,7 +100,6 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         return solution
 
     def finer_mesh(self, spare: float) -> FinerMesh:
-        """Return the body on a finer mesh, which may cost so many solves."""
         return FinerMesh(self, spare)
 
     def way(self, parameters: FloatArray, guess: Guess) -> Way | None:

@@ -42,7 +42,6 @@ class ContactArea(Observable):
     tool: str = "indenter"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return _Touched(equations, self.tool)
 
 

@@ -23,7 +23,6 @@ class PointDisplacement(Observable):
     component: Axis
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         from forward.fem.dolfinx import spaces
 
         (mine,), (nodes,), (weights,), (distance,) = spaces.point_rows(equations.space, np.array([self.at]))
@@ -51,7 +50,6 @@ class MeanDisplacement(Observable):
     component: Axis
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         import ufl
 
         from forward.fem.dolfinx import spaces
@@ -71,7 +69,6 @@ class Reaction(Observable):
     component: Axis
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         from forward.fem.dolfinx import spaces
 
         nodes = spaces.boundary_nodes(equations.space, equations.facets[self.on])
@@ -119,7 +116,6 @@ class StrainEnergy(Observable):
     unit: ClassVar[str] = "J"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return Integral(equations, equations.stored_energy)
 
 
@@ -130,7 +126,6 @@ class VolumeChange(Observable):
     unit: ClassVar[str] = "1"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return Integral(equations, equations.dilation, equations.volume)
 
 
@@ -162,7 +157,6 @@ class Force(Observable):
         return self.component != "along"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         import ufl
 
         tool, at = equations.tool(self.tool)

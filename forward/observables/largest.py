@@ -27,7 +27,6 @@ class MaxDisplacement(Observable):
     component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return _MaxDisplacement(equations, None if self.component == "magnitude" else AXES.index(self.component))
 
 
@@ -40,7 +39,6 @@ class MaxVonMises(Observable):
     negative: ClassVar[bool] = False
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return _MaxVonMises(equations)
 
 
@@ -59,7 +57,6 @@ class MaxPressure(Observable):
     tool: str = "indenter"
 
     def functional(self, equations: Equations) -> Functional:
-        """Prepare the evaluation."""
         return _MaxPressure(equations, self.tool)
 
 

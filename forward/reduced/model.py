@@ -285,7 +285,6 @@ class ReducedSolution(ExplicitSolution):
 
     @cached_property
     def state(self) -> FloatArray:
-        """Displacements (U,) of the nodes."""
         found = self.c @ self._model.data.fields[: len(self.c)]
         found.flags.writeable = False
         return np.asarray(found)
@@ -304,7 +303,6 @@ class ReducedSolution(ExplicitSolution):
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Derivatives (m, d) of the outputs."""
         if self._model.observed is None:
             return self._own_jacobian()
         seen, rows = self._model.observed
@@ -317,7 +315,6 @@ class ReducedSolution(ExplicitSolution):
         return np.asarray(by_state[:, free] @ self.slopes[free] + directly[:, model.places])
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state (U,) along a `direction` (d,), or (k, U) for k of them."""
         return np.asarray(direction) @ self.slopes.T @ self._model.data.fields[: len(self.c)]
 
     @cached_property

@@ -120,14 +120,12 @@ class Reduced(ModelSpec):
 
     @property
     def scalars(self) -> Mapping[str, Scalar]:
-        """Its parameters that are numbers of the body, with their means."""
         about, known = self._about, self._about.body.scalars
         pairs = zip(about.parameters, about.nominal, strict=True)
         return {path: known[path]._replace(value=float(value)) for path, value in pairs if path in known}
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Its parameters that are coefficients of random fields."""
         return tuple(path for path in self._about.parameters if path not in self._about.body.scalars)
 
     @property
@@ -150,7 +148,6 @@ class Reduced(ModelSpec):
         return float(5e-4 + 9e-9 * points * modes)
 
     def materials(self, parameters: Collection[str] = ()) -> Materials:
-        """Return the materials of the body as functions of some of its numbers, by their paths."""
         return self._about.body.materials(parameters)
 
     @property
@@ -160,7 +157,6 @@ class Reduced(ModelSpec):
 
     @property
     def description(self) -> str:
-        """The model in words."""
         told = self._about.told
         size = f"{told['modes']} modes, {told['points']} points, from {told['snapshots']} snapshots"
         return f"reduced model of a body of {told['unknowns']:,} unknowns: {size}"

@@ -107,7 +107,6 @@ class Indenter(Term):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """Its numbers that can be parameters, the place among them."""
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
@@ -393,7 +392,6 @@ class Indenter(Term):
         return [(place, unit_vector(self.direction)) for place in places]
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports."""
         shape = {"flat": "flat punch"}.get(self.shape, self.shape)
         sizes = ", ".join(f"{name} {numbers[name]}" for name in ("radius", "edge", "angle", "tip") if name in numbers)
         place = ", ".join(numbers[axis] for axis in "xyz")

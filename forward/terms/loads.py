@@ -32,7 +32,6 @@ class Gravity(Term):
         return -at.numbers["density"] * at.density * ufl.dot(pull, at.u) * at.dx
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Describe it for reports."""
         return f"gravity: density {numbers['density']} × {self.acceleration:g} m/s² along {listed(self.direction)}"
 
 
@@ -51,7 +50,6 @@ class Traction(Term):
         return -at.numbers["size"] * ufl.dot(at.constant(unit_vector(self.direction)), at.u) * at.on(self.on)
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports."""
         return f"traction on {self.on}: {numbers['size']} along {listed(self.direction)}"
 
 
@@ -70,7 +68,6 @@ class Pressure(Term):
         return at.numbers["size"] * ufl.dot(normal, at.v) * at.on(self.on)
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Describe it for reports."""
         return f"pressure on {self.on}: {numbers['size']}"
 
 
@@ -107,7 +104,6 @@ class Spot(Term):
             yield Finding("spot-narrow", "warning", {"label": self.label, "wide": wide, "apart": apart})
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports."""
         place = ", ".join(numbers[name] for name in "xyz")
         force = f"{numbers['size']} along {listed(self.direction)}"
         return f"spot on {self.on}: {force}, within {numbers['width']} of ({place})"

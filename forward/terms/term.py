@@ -222,12 +222,10 @@ class Item(Term):
 
     @property
     def symmetric(self) -> bool:
-        """Whether its stiffness is symmetric."""
         return True
 
     @property
     def remembers(self) -> bool:
-        """Whether it keeps something for the next step."""
         return False
 
 

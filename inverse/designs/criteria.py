@@ -107,7 +107,6 @@ class _Conditioned(Criterion):
         self.roots = [np.eye(one.shape[-1]) for one in candidates]
 
     def take(self, one: int) -> None:
-        """Add a candidate to the set."""
         pairs = zip(self.roots, self._candidates, strict=True)
         self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
 
@@ -137,11 +136,9 @@ class Information(_Conditioned):
         return found if self._beside is None else found - self._beside.of_draws(which)
 
     def gains(self, which: IntArray) -> FloatArray:
-        """Return what each of some candidates (w,) would add (w,)."""
         return np.asarray(self.of_draws(which).mean(axis=0))
 
     def take(self, one: int) -> None:
-        """Add a candidate to the set."""
         super().take(one)
         if self._beside is not None:
             self._beside.take(one)
@@ -169,7 +166,6 @@ class Variance(_Conditioned):
         return np.array([np.trace(root.T @ goal @ root) for goal, root in pairs])
 
     def gains(self, which: IntArray) -> FloatArray:
-        """Return what each of some candidates (w,) would take away (w,)."""
         found = np.zeros(len(which))
         for rows, goal, root in zip(self._candidates, self._goals, self.roots, strict=True):
             seen = rows[which] @ root

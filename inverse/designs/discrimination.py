@@ -128,13 +128,11 @@ class Discrimination(Criterion):
         return np.asarray((self._p[:, None] * others * self.pairs(sums)).sum(axis=(-2, -1)))
 
     def gains(self, which: IntArray) -> FloatArray:
-        """Return what each of some candidates (w,) would add (w,)."""
         parts = [which[i : i + TOGETHER] for i in range(0, len(which), TOGETHER)]
         return np.concatenate(
             [self._value(self._sum + np.array([self._products(int(one)) for one in part])) for part in parts]
         ) - (self._worth)
 
     def take(self, one: int) -> None:
-        """Add a candidate to the set."""
         self._sum = self._sum + self._products(one)
         self._worth = float(self._value(self._sum))

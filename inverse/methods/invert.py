@@ -150,7 +150,6 @@ class Invert(Inference):
         return self
 
     def solves(self, size: int, *, field: bool) -> int:
-        """Number of solves for a data set with `size` unknown parameters that correct the Gaussian."""
         if self.samples is not None:
             return self.samples
         return 0 if field else usual(size)

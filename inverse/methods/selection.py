@@ -147,7 +147,6 @@ class Select(Inference):
         return 1 + len(self.other_noises) + len(self.subsets)
 
     def solves(self, size: int, *, field: bool) -> int:
-        """Number of solves for each evidence, whatever is unknown."""
         return self.samples
 
     def chain_solves(self, size: int) -> int:

@@ -21,7 +21,6 @@ class Uniform(Bounded):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Expected value and standard deviation."""
         return self.lower + (self.upper - self.lower) / 2, float((self.upper - self.lower) / np.sqrt(12))
 
     def recurrence(self, degree: int) -> FloatArray:
@@ -47,12 +46,10 @@ class LogUniform(Bounded):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As for every distribution."""
         return True
 
     @cached_property
     def of_coordinate(self) -> tuple[float, float]:
-        """As for every distribution."""
         return float(np.log(self.lower) + self._length / 2), float(self._length / np.sqrt(12))
 
     @property
@@ -62,7 +59,6 @@ class LogUniform(Bounded):
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As for every distribution."""
         logs, weights = panels([0.0, self._length])
         return self.lower, self.lower * np.expm1(logs), weights / weights.sum()
 
@@ -92,7 +88,6 @@ class Triangular(Bounded):
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As for every distribution."""
         unit, c = self.upper - self.lower, self._peak
         u, weights = panels([0.0, c, 1.0])
         weights = weights * np.where(u < c, u / c if c else 1.0, (1 - u) / (1 - c) if c < 1 else 1.0)
@@ -119,7 +114,6 @@ class Triangular(Bounded):
             return np.where(rising, from_lower, 1 - from_upper), np.log(2 * height)
 
     def check_numbers(self) -> None:
-        """Raise a ValueError if the numbers do not go together."""
         super().check_numbers()
         if not self.lower <= self.mode <= self.upper:
             raise ValueError(f"mode = {self.mode:g}, expected a value between lower and upper")
@@ -135,7 +129,6 @@ class Beta(Bounded):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Expected value and standard deviation."""
         a, b, unit = self.a, self.b, self.upper - self.lower
         share = a / (a + b)
         return self.lower + unit * share, float(unit * np.sqrt(share * (b / (a + b)) / (a + b + 1)))
@@ -184,7 +177,6 @@ class TruncatedNormal(Bounded):
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As for every distribution."""
         nodes, weights, _ = self._cut.rule
         return self._cut.origin, self._cut.unit * nodes, weights
 
@@ -223,7 +215,6 @@ class Normal(Univariate):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Expected value and standard deviation."""
         return self.mean, self.std
 
     def recurrence(self, degree: int) -> FloatArray:
@@ -263,18 +254,15 @@ class LogNormal(Univariate):
 
     @cached_property
     def of_coordinate(self) -> tuple[float, float]:
-        """As for every distribution."""
         variance = np.log1p((self.std / self.mean) ** 2)
         return float(np.log(self.mean) - variance / 2), float(np.sqrt(variance))
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Expected value and standard deviation."""
         return self.mean, self.std
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As for every distribution."""
         return True
 
     def _log_density(self, u: FloatArray) -> FloatArray:
@@ -315,7 +303,6 @@ class Gamma(Univariate):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Expected value and standard deviation."""
         return self.shift + self.shape * self.scale, float(np.sqrt(self.shape) * self.scale)
 
     def recurrence(self, degree: int) -> FloatArray:

@@ -166,7 +166,6 @@ class Bounded(Univariate):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Ends of the range."""
         return self.lower, self.upper
 
     @property
@@ -179,7 +178,6 @@ class Bounded(Univariate):
         return not self.closed and self.lower > 0 and self.at(1 - RARE) > WIDE * self.at(RARE)
 
     def quantile(self, probability: FloatArray) -> FloatArray:
-        """Inverse of the distribution function, of any shape."""
         return np.clip(super().quantile(probability), self.lower, self.upper)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -188,7 +186,6 @@ class Bounded(Univariate):
         return np.clip(values, self.lower, self.upper), slopes
 
     def check_numbers(self) -> None:
-        """Raise a ValueError if the numbers do not go together."""
         if not self.lower < self.upper:
             raise ValueError(f"lower = {self.lower:g} and upper = {self.upper:g}, expected lower < upper")
         if not np.isfinite(self.upper - self.lower):
@@ -249,7 +246,6 @@ class Chaospy(Univariate):
 
     @property
     def support(self) -> tuple[float, float] | None:
-        """As of every distribution."""
         if not {"lower", "upper"} <= set(inspect.signature(type(self.dist)).parameters):
             return None
         return float(self.dist.lower[0]), float(self.dist.upper[0])

@@ -80,16 +80,13 @@ class Automatic(Method):
     fields: bool = True
 
     def planned(self, dimension: int) -> int:
-        """Number of solves of the first expansion."""
         terms = comb(dimension + 2, 2)
         return 1 + max(4, -(-2 * terms // (1 + dimension)))
 
     def with_tangents(self, samples: int) -> int:
-        """All of them."""
         return samples
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Without a tolerance nothing can be chosen."""
         raise ValueError(UNASKED)
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:

@@ -99,7 +99,6 @@ class Chaos(Amount):
     fields: bool = True
 
     def check_amount(self) -> None:
-        """Raise a ValueError if no amount is given, or one that a projection cannot respect."""
         if self.fit == "regression":
             super().check_amount()
         elif self.asked:
@@ -119,7 +118,6 @@ class Chaos(Amount):
         return self.max_order or ORDER
 
     def with_tangents(self, samples: int) -> int:
-        """All samples, if gradients are fitted."""
         return samples if self.gradients and self.fit == "regression" else 0
 
     @property
@@ -128,11 +126,9 @@ class Chaos(Amount):
         return super().aims and self.fit == "regression"
 
     def stream(self) -> tuple[Any, ...] | None:
-        """Points of the design."""
         return "design", self.gradients
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why an expansion in these parameters is impossible, or None."""
         if inputs.draws is not None and self.fit == "projection":
             return "parameters given by draws have no Gauss rules, expected method.fit = 'regression'"
         return objection(inputs, f"method.kind = '{self.kind}'")

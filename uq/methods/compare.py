@@ -222,7 +222,6 @@ class Compare(Method):
         return True
 
     def planned(self, dimension: int) -> int:
-        """Largest number of different solves with that many parameters."""
         shared: dict[tuple[object, ...], int] = {}
         apart = 0
         for entry in self.methods:
@@ -237,7 +236,6 @@ class Compare(Method):
         return 1 + reference + others + self.repeats * (sum(shared.values()) + apart)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why one of the methods cannot take these parameters, or None if all can."""
         methods = [self.reference, *(entry.sampling for entry in self.methods)]
         return next(filter(None, (method.objection(inputs) for method in methods)), None)
 
@@ -277,7 +275,6 @@ class Compare(Method):
                 yield ("method", "reference", *place), message, given
 
     def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
-        """Predict the processor time (s) of all samples, those by the textbook, and the one on a finer mesh."""
         own, samples = costs[OWN], self.planned(dimension) - 1 - self.textbook
         refined = costs[REFINED].first - own.sample if self.mesh_error else 0.0
         return samples * own.sample + refined + self.textbook * own.textbook

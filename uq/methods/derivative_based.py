@@ -115,7 +115,6 @@ class DerivativeBased(Amount):
         return 1 + (self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles))
 
     def with_tangents(self, samples: int) -> int:
-        """All of them."""
         return samples
 
     def objection(self, inputs: Inputs) -> str | None:

@@ -195,7 +195,6 @@ class Fidelities(Team):
         self.variances = np.einsum("mi,ij,mj->m", self.slopes, inputs.correlation, self.slopes)
 
     def solved(self, k: int, points: FloatArray, reasons: set[str], *, tangents: bool = False) -> FloatArray:
-        """Solve a model at points, as every team does, and pay for it."""
         self.spent += len(points) * self.members[k].cost
         return super().solved(k, points, reasons, tangents=tangents)
 

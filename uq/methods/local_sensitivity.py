@@ -24,11 +24,9 @@ class LocalSensitivity(Method):
     kind: Literal["local-sensitivity"] = "local-sensitivity"
 
     def planned(self, dimension: int) -> int:
-        """Number of solves, whatever the number of parameters."""
         return 1
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Linearise at the mean parameters."""
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
             raise ModelError(message)

@@ -100,13 +100,11 @@ class Coarser(CheapModel):
 
     @property
     def label(self) -> str:
-        """Its name in results."""
         cells = "" if self.coarser == 1 else f"cells × {self.coarser:g}"
         degree = "" if self.degree is None else f"degree {self.degree}"
         return self.name or ", ".join(filter(None, (cells, degree))) or "mesh"
 
     def of(self, spec: ModelSpec) -> ModelSpec:
-        """Return the body on the coarser mesh."""
         found = spec.coarser(self.coarser, self.degree)
         if found.unknowns >= spec.unknowns:
             raise ModelError(f"{self.label}: {found.unknowns:,} unknowns, expected fewer than {spec.unknowns:,}")
@@ -127,23 +125,19 @@ class FewIterations(CheapModel):
 
     @property
     def label(self) -> str:
-        """Its name in results."""
         return self.name or f"{self.iterations} iteration{'s' if self.iterations > 1 else ''}"
 
     @property
     def stopped_after(self) -> int:
-        """Iterations of the solver."""
         return self.iterations
 
     def of(self, spec: ModelSpec) -> None:
         """Return none: it is the model of the study."""
 
     def predicted(self, unknowns: int, own: int) -> float | None:
-        """Return the share of the corrections that a solve takes."""
         return min(1.0, self.iterations / CORRECTIONS) if self.cost is None else self.cost
 
     def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find that there are no iterations."""
         if not spec.iterative:
             yield ("kind",), f"a model of kind '{spec.kind}' has no iterations of a solver", self.kind
 
@@ -216,11 +210,9 @@ class OtherModel(CheapModel):
 
     @property
     def label(self) -> str:
-        """Its name in results."""
         return self.name or self.model.kind
 
     def of(self, spec: ModelSpec) -> ModelSpec:
-        """Return the model."""
         return self.model
 
 

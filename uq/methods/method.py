@@ -204,7 +204,6 @@ class Amount(Method):
 
     @property
     def open_ended(self) -> bool:
-        """Whether the study may end before the largest number of samples."""
         return self.tolerance is not None or self.budget_seconds is not None
 
     def met(self, reached: float) -> bool:

@@ -79,7 +79,6 @@ class MonteCarlo(Amount):
         return 1 + self.limit
 
     def stream(self) -> tuple[Any, ...] | None:
-        """Random points."""
         return ("random",)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:

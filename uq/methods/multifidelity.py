@@ -132,7 +132,6 @@ class Multifidelity(Amount):
         return [one for one in self.cheap if one.stopped_after is None]
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
-        """Return the cheap models."""
         found = {one.label: one.of(spec) for one in self._separate}
         return {label: model for label, model in found.items() if model is not None}
 

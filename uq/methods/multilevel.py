@@ -85,7 +85,6 @@ class MultilevelMonteCarlo(Amount):
         return self.levels + self.pilot * (2 * self.levels - 1)
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
-        """Return the body on the finer meshes."""
         return {name_of(level): spec.refined(level) for level in range(1, self.levels)}
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
@@ -97,7 +96,6 @@ class MultilevelMonteCarlo(Amount):
             yield ("model", "fields"), message, self.kind
 
     def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
-        """Predict the processor time (s) of the pilots."""
         each = [costs[name_of(level)].sample for level in range(self.levels)]
         return self.pilot * (2 * sum(each) - each[-1])
 

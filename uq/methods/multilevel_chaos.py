@@ -98,11 +98,9 @@ class MultilevelChaos(Amount):
         return 1 << (SAMPLES_PER_TERM * hyperbolic_count(dimension, self.order, 1.0) - 1).bit_length()
 
     def planned(self, dimension: int) -> int:
-        """Number of solves, with all levels."""
         return 1 + self.max_levels * self.per_level(dimension)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why an expansion in these parameters is impossible, or None."""
         if self.order > inputs.largest_degree:
             most = inputs.largest_degree
             return f"the draws tell polynomials up to degree {most} apart, expected at most that as method.order"
@@ -115,7 +113,6 @@ class MultilevelChaos(Amount):
             yield ("method", "kind"), message, self.kind
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find too few samples, too."""
         yield from super().mistakes(inputs, spec)
         shortage = self.shortage(len(inputs.names))
         if shortage is not None:

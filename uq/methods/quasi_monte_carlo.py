@@ -102,19 +102,15 @@ class QuasiMonteCarlo(MonteCarlo):
 
     @property
     def limit(self) -> int:
-        """Number of samples; the largest, if a tolerance may end the study earlier."""
         return self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles)
 
     def planned(self, dimension: int) -> int:
-        """Number of solves with so many parameters; the largest, if a tolerance may end the study earlier."""
         return 1 + self.limit + self._fitted(dimension)
 
     def with_tangents(self, samples: int) -> int:
-        """Number of samples to which the control variate is fitted."""
         return max(0, samples - self.limit)
 
     def stream(self) -> tuple[Any, ...] | None:
-        """Scrambled Sobol' points."""
         return "sobol", self.scrambles
 
     def _fitted(self, dimension: int) -> int:

@@ -93,7 +93,6 @@ class Sobol(Amount):
     results: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)  # those of `source`
 
     def check_amount(self) -> None:
-        """Raise a ValueError if design, amount and source are inconsistent."""
         if self.design == "given-data":
             if self.source is None or self.asked:
                 raise ValueError(
@@ -108,7 +107,6 @@ class Sobol(Amount):
             check_scrambles(self.samples, self.scrambles)
 
     def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
-        """Return the same with the results that it uses."""
         return self if self.source is None else self.model_copy(update={"results": read(self.source)})
 
     def planned(self, dimension: int) -> int:
@@ -121,7 +119,6 @@ class Sobol(Amount):
         return 1 + size * (self.samples or self.scrambles * power_of_two(UNLIMITED // size // self.scrambles))
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters have no Sobol' indices, or None."""
         if len(inputs.joint) > 1:
             return (
                 "parameters given by the same draws depend on each other and have no Sobol' indices, expected "
@@ -132,7 +129,6 @@ class Sobol(Amount):
         return None
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Also find groups with unknown parameters."""
         yield from super().mistakes(inputs, spec)
         stranger = self.unknown(inputs)
         if stranger is not None:

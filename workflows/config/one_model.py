@@ -272,7 +272,6 @@ class Sourced(OneModel):
 
     @cached_property
     def draws(self) -> Draws | None:
-        """Draws of numbers of the model, if there is a source of them."""
         return None if self.source is None else self.source.draws_of(self.model.scalars)
 
     @property

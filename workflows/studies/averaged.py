@@ -87,34 +87,28 @@ class AveragedStudy(Study):
 
     @property
     def planned(self) -> int:
-        """Number of solves of all candidates."""
         return sum(part.planned for part in self.parts.values())
 
     @property
     def estimates(self) -> int:
-        """There are none of the error of the mesh."""
         return 0
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
-        """The model of each candidate."""
         return tuple(part.spec for part in self.parts.values())
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about each candidate, and about those that are left out."""
         found = [one.of(f"Candidate '{name}'") for name, part in self.parts.items() for one in part.findings]
         if self.model.meshed:
             found.append(Finding("averaged-without-mesh", "note"))
         return tuple(found)
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is averaged, and what the first candidate is."""
         shares = ", ".join(f"{one.name} ({100 * one.probability:.3g} %)" for one in self.candidates)
         return [f"averaged    {shares}; below, the first", *self._first.plan(rank_groups)]
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the random parameters of a candidate."""
         return self.parts[label].inputs.names
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
@@ -153,7 +147,6 @@ class AveragedStudy(Study):
         return MethodJob(model, others, task, recorders, labelled=labelled, finished=finished, told=told)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be averaged."""
         assert self.source is not None
         place, said = ("parameters", "from"), self.source.model
         for what, wrong in (

@@ -94,12 +94,10 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     @cached_property
     def of_candidates(self) -> Mapping[str, ModelSpec]:
-        """The model of each candidate, or the one model."""
         return {"/": self.spec} if self.candidates is None else super().of_candidates
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
-        """The model, or those of all candidates."""
         return tuple(self.of_candidates.values())
 
     @property
@@ -109,7 +107,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     @property
     def field(self) -> bool:
-        """Whether values of a field at the vertices are what is unknown, of one model."""
         return self.candidates is None and super().field
 
     def takes(self, name: str, values: Measurements | None) -> TakenForGranted:
@@ -126,7 +123,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about models and priors before anything is solved, each once."""
         if self.candidates is not None:
             return tuple(dict.fromkeys(self.findings_of_models))
         model: Any = self.model
@@ -135,7 +131,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         return (*model.findings_over(ranges(self.given)), *findings_of_materials(inputs), *of_draws)
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what can be chosen, to know what or tell what apart, and how long that will take."""
         method, costs = self.method, [spec.cost() for spec in self.specs]
         draw = sum(cost.textbook for cost in costs if cost is not None)
         if self.candidates is None:
@@ -203,11 +198,9 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknowns, of a candidate if there are some."""
         return self.inputs.names if self.candidates is None else super().parameters_of(label)
 
     def units_of(self, label: str) -> dict[str, str]:
-        """SI units of the numbers of the model, or of that of a candidate."""
         return StudyKind.units_of(self, label) if self.candidates is None else super().units_of(label)
 
     def identity(self) -> dict[str, Any]:
@@ -215,7 +208,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         return super().identity() | (self.by_contents if self.candidates is None else {})
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
         wrong = list(self._of_model() if self.candidates is None else self._of_candidates())
         yield from wrong
         if self.uncertain and not wrong:

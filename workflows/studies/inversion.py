@@ -66,7 +66,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
 
     @property
     def sampled(self) -> Sampled | None:
-        """A model with outputs, with its priors."""
         return None if self.specimen is not None else Sampled(self.inputs, self.spec)
 
     @property
@@ -98,7 +97,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Inversion:
-        """Check the blocks of an inversion, and read its data."""
         return cls.model_validate(blocks).with_data(folder)
 
     @property
@@ -107,19 +105,16 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         return self.solves if self.together else len(self.data.sets) + 1
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is inverted, and how long that will take."""
         from workflows.studies.plans import of_inversion
 
         return of_inversion(self)
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
-        """Make the model, and what is done for each data set; collective."""
         from workflows.studies.inversion_job import job
 
         return job(self, ensemble, directory, checkpoint)
 
     def arviz_groups(self, found: xr.Dataset) -> Mapping[str, xr.Dataset]:
-        """Return prior and posterior, the likelihood of each datum, and the data."""
         from workflows.studies.inversion_results import arviz_groups
 
         return arviz_groups(self, found)
@@ -137,7 +132,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the model before anything is solved."""
         reach = ranges(self.parameters)
         found = (*self.model.findings_over(reach), *findings_of_materials(self.inputs))
         if self.specimen is not None:
@@ -167,7 +161,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         yield Finding("ratios-only", "warning", {"sought": sought, "source": source})
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
         if self.specimen is not None:
             yield from self._of_specimen()
         else:

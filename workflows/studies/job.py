@@ -106,7 +106,6 @@ class MethodJob(Job):
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was evaluated, by the name that it is kept under."""
         found: dict[str, Evaluations] = {}
         for name, recorder in self.recorders.items():
             parts: dict[str, list[Evaluations]] = {}
@@ -162,13 +161,11 @@ class TasksJob(Job):
 
     @property
     def own_seconds(self) -> float:
-        """Processor time (s) of the tasks besides their solves."""
         solves = sum(float(one.seconds.sum()) for one in self.evaluations.values())
         return max(sum(one.seconds for one in self.outcomes) - solves, 0.0)
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was solved for each task, by its name."""
         pairs = zip(self.names, self.outcomes, strict=True)
         return {name: one.evaluations for name, one in pairs if one.evaluations is not None}
 

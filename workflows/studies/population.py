@@ -92,12 +92,10 @@ class PopulationStudy(FromPython, StudyKind):
 
     @property
     def solves(self) -> int:
-        """There are none that could be counted before."""
         return 0
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Say which specimens are known by few draws."""
         every = self.posteriors if self._there else {}
         few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
         return tuple(once_for_outputs(few, every))
@@ -107,7 +105,6 @@ class PopulationStudy(FromPython, StudyKind):
         return Path(self.method.source).exists()
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is taken from where."""
         names = prior_names(self.posteriors)
         return [
             f"method      {self.method.kind}, {self.method.distribution}",
@@ -118,12 +115,10 @@ class PopulationStudy(FromPython, StudyKind):
         ]
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the parameters."""
         return prior_names(self.posteriors)
 
     @cached_property
     def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the models of the specimens."""
         with suppress(*GONE):
             found: tuple[str, ...] = self.of_specimens.modules
             return found
@@ -235,7 +230,6 @@ class PopulationJob(Job):
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was solved for specimens, by their names and how often it was."""
         return self.solved
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:

@@ -53,7 +53,6 @@ class ReductionStudy(Study):
         return False
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is reduced, from how many solves, and how long these take."""
         method, times = self.method, times_of(self.spec)
         modes = "as many modes as are needed" if method.modes is None else f"{method.modes} modes"
         seconds = times.first + (self.planned - 1) * times.sample / rank_groups
@@ -67,7 +66,6 @@ class ReductionStudy(Study):
         ]
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
-        """Make the body; collective."""
         from workflows.studies.reduction_job import job
 
         return job(self.method, self.spec, self.inputs, ensemble, directory, checkpoint)

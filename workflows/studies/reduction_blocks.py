@@ -85,7 +85,6 @@ class Reduce(Method):
     seed: Annotated[int, Field(ge=0)] = 0
 
     def planned(self, dimension: int) -> int:
-        """Snapshots, unseen samples, and the solve at the mean."""
         return self.snapshots + self.unseen + 1
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -93,7 +92,6 @@ class Reduce(Method):
         raise ValueError("method.kind = 'reduce' is run by a study of its own")
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of a model cannot be reduced."""
         if spec.kind != "hyperelastic":
             yield ("model", "kind"), "only a body can be reduced, expected 'hyperelastic'", spec.kind
             return

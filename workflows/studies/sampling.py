@@ -53,12 +53,10 @@ class Study(SamplingBlocks, FromPython, StudyKind):
 
     @property
     def sampled(self) -> Sampled:
-        """The model with its random parameters."""
         return Sampled(self.inputs, self.spec)
 
     @property
     def memory(self) -> float:
-        """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
         return super().memory + (self.bytes_of_estimates if self.estimates else 0.0)
 
     @property
@@ -74,7 +72,6 @@ class Study(SamplingBlocks, FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_materials(self.inputs.within(materials), fail=True)
         found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
@@ -101,7 +98,6 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield Finding("mesh-with-memory", "warning", {"what": self.spec.unestimated_with})
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is sampled, how often, and how long that will take."""
         from workflows.studies.plans import of_sampling
 
         return of_sampling(self, self.memory, rank_groups)
@@ -130,7 +126,6 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         return self.of(self.model.on_mesh(MESH, self.solid.body.contents))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
-        """Make the model, and others that the method may want, at the points of the method; collective."""
         from workflows.studies.sampling_job import job
 
         return job(self, ensemble, directory)
@@ -157,7 +152,6 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         return completed(value)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
         if self.source is not None:
             wrong = list(self.source.mistakes(self.model, tuple(self.parameters)))
             yield from wrong

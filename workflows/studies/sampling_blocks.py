@@ -48,7 +48,6 @@ class SamplingBlocks(Sourced):
 
     @cached_property
     def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters, solved as exactly as a tolerance needs."""
         spec, asked = self.model.over(ranges(self.given)), self.accuracy.tolerance
         solver = spec.solver_tolerance
         return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
@@ -115,7 +114,6 @@ class SamplingBlocks(Sourced):
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
-        """The model, and those beside it."""
         return self.spec, *self.models.values()
 
     def of(self, model: ModelSpec) -> Self:

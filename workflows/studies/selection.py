@@ -102,7 +102,6 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
-        """The models of all candidates, and the finer meshes that they are looked at on."""
         truths = (self.truth(name) for name in self.learnt)
         return *self.of_candidates.values(), *truths, *(fine for several in self.finer_meshes for fine in several)
 
@@ -154,7 +153,6 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         return seconds * self.evidences / len(self.of_candidates) + chains
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is compared, and how long that will take."""
         method, evidences = self.method, self.evidences
         sizes = {group: len(one.seen()) for group, one in self.data_groups.items()}
         own = sum(
@@ -185,13 +183,11 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         ]
 
     def arviz_groups(self, found: xr.Dataset) -> Mapping[str, xr.Dataset]:
-        """Return prior and posterior of each model, the likelihood of each datum, and the data."""
         from workflows.results.comparison import arviz_groups
 
         return arviz_groups(self.models, self.method.noise.factor, self.method.seed, found)
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
-        """Make the candidates, each for each group of data; collective."""
         from workflows.studies.selection_job import job
 
         return job(self, ensemble, checkpoint)
@@ -200,7 +196,6 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the models before anything is solved, each once."""
         of_all = [found.of(name) for name, inputs in self.priors.items() for found in findings_of_materials(inputs)]
         return tuple(dict.fromkeys([*self.findings_of_models, *of_all, *self._of_outputs()]))
 
@@ -213,7 +208,6 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         yield from not_estimable(names) if names and self.unchecked else ()
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
         if self.model is None:
             yield from self._of_tests()
             yield from self.mistakes_of_data()

@@ -52,16 +52,13 @@ class Synthesis(OneModel, FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the model before anything is solved."""
         return self.model.findings_over(ranges(self.parameters))
 
     @property
     def planned(self) -> int:
-        """Number of solves."""
         return len(self.method.fraction) + 1
 
     def plan(self, rank_groups: int) -> list[str]:
-        """Say what is made, and how long that will take."""
         sets, cost = len(self.method.fraction), self.spec.cost()
         names = [] if self.model.placed else [output.name for output in self.model.returned]
         return [
@@ -73,7 +70,6 @@ class Synthesis(OneModel, FromPython, StudyKind):
         ]
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
-        """Make the model; collective."""
         model = self.spec.build(ensemble.group, self.inputs.names)
         if self.model.placed:
             of_specimen = named("workflows.data.synthetic_displacements:displacements")
@@ -93,7 +89,6 @@ class Synthesis(OneModel, FromPython, StudyKind):
         return MethodJob(made.model, {}, task, recorders, labelled=made.labelled, texts=texts)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Find what cannot be asked together."""
         if self.model.placed:
             yield from self._mistakes_of_specimen(self.model)
         yield from self.model.mistakes_of_mesh()
