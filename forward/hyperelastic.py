@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from typing import Any, Literal
 
 from annotated_types import Gt
@@ -212,7 +211,7 @@ class Path(Hyperelastic):
     def cost(self, factors: int = 1) -> Times:
         """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
         found = super().cost(factors)
-        return found if self.path_dependent else sum_of([replace(found, contact=False)] * self.count)
+        return found if self.path_dependent else sum_of([found] * self.count)
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
         return sum_of([super().mesh_error_cost(spare)] * self.count)

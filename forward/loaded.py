@@ -322,7 +322,7 @@ class LoadedBody(Solid):
             alone = contact or self.linear == Linear.MULTIGRID
             held = held_together(self.unknowns) if predicted and factors > 1 and not alone else 0
             return replace(one, bytes=one.bytes + held)
-        whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
+        whole = sum_of([one] * self.increments)  # each from the one before
         return replace(whole, setup=one.setup, bytes=one.bytes)
 
     def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
