@@ -125,7 +125,7 @@ TABLE: dict[str, str | Words] = {
     "parameters, and its doubt is as large as it is. More solves allow more estimates; a finer mesh makes it smaller.",
     "solver-tolerance": "The solver's tolerance of {tolerance:g} may leave larger errors than the mesh in {about}: "
     "the error of the mesh is not known to better than that. Take a smaller model.solver.tolerance.",
-    "mesh-estimates-failed": "{lost} of {n} estimates of the error of the mesh failed ({reason}); {rest}.",
+    "mesh-estimates-failed": "{lost} of {n} estimates of the error of the mesh failed; {rest}. Why: {reason}.",
     "mesh-never-estimated": "The error of the mesh is not estimated of {about}: such outputs need not converge as "
     "cells become smaller (the largest stress at an edge that is held grows without limit).",
     "mesh-estimates-missing": "There is no estimate of the error of the mesh at some points of {about}, and so none "
@@ -136,9 +136,9 @@ TABLE: dict[str, str | Words] = {
     "mesh-error-uncalibrated": "What part of the error of the mesh estimates see is not measured on a finer mesh, "
     "which would take too long for so few solves or too much memory, but typical: they are multiplied by "
     "{factor:.2g}, and half of them is doubted, or more where errors of several places cancel (mesh_error_doubt).",
-    "facets": "The surface is curved, and the faces of its cells are flat: what lies between them changes outputs at "
-    "the mean parameters by about this much: {about}. Estimates of the error of the mesh do not see it, nor does a "
-    "mesh that is divided here; it is part of their doubt (mesh_error_doubt). Mesh the body again with smaller cells.",
+    "facets": "Flat faces of cells on a curved surface change outputs by about this much: {about}. That is so at the "
+    "mean parameters; estimates of the error of the mesh do not see it, nor does a mesh that is divided here, so it is "
+    "part of their doubt (mesh_error_doubt). Mesh the body again with smaller cells.",
     "facets-unknown": "The surface is curved, and the faces of its cells are flat: the effect of what lies between is "
     "not known, since there is no answer with the surface moved by as much. Compare with smaller cells.",
     "solves-chosen": "Full solves were chosen where cheap models differ: {chosen:,} of {points:,} points, with "

@@ -120,13 +120,10 @@ def whole(errors: dict[str, float]) -> float:
 def known(errors: dict[str, float], unit: str, value: float, *, mesh: bool) -> Iterator[str]:
     """Say how well a number is known, and the parts of its error; or that of its `mesh` it is not."""
     total = whole(errors)
-    parts = [
-        f"{source} {margin(e, unit, like=value)}"
-        for source, e in errors.items()
-        if source != "total" and np.isfinite(e) and e >= UNSEEN * total
-    ]
+    parts = {k: e for k, e in errors.items() if k != "total" and np.isfinite(e) and e >= UNSEEN * total}
     if total > 0:
-        all_parts = f": {', '.join(parts)}" if parts else ""
+        said = ", ".join(f"{source} {margin(e, unit, like=value)}" for source, e in parts.items())
+        all_parts = f": {said}" if len(parts) > 1 else "".join(f" ({source})" for source in parts)
         error = f"± {margin(total, unit, like=value)}"
         yield f"known to {error}{all_parts}" if mesh else f"{NOT_KNOWN}; {error} without it{all_parts}"
     elif not mesh:

@@ -66,7 +66,7 @@ def body(results: Results) -> Iterator[Block]:
     scene = forward_scene(dataset, results.study)
     by = f"{scene.motion_name}, {largest(dataset)}" + (", by the reduced model" if reduced is not None else "")
     yield turning(scene, f"The body, deformed by {scene.motion_name}", largest(dataset))
-    yield Text(f"Deformed by {by}, to scale. Drag to turn it.")
+    yield Text(f"{by[0].upper()}{by[1:]}, to scale. Drag to turn it.")
 
 
 def _file(results: Results) -> Path | None:
