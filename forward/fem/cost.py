@@ -120,7 +120,7 @@ class Times:
     predicted
         Whether samples are solved from predictions rather than by the textbook solver.
     contact
-        Whether tools are pressed against it from afar, rather than a step at a time.
+        Whether tools touch it: what they touch changes at every step.
     bytes
         Memory of mesh, matrices and factors.
     linear
