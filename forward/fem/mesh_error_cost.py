@@ -174,8 +174,8 @@ def _there(spec: Any, more: float, *, estimated: bool) -> Finer | None:
 def with_cells(spec: Any, more: float) -> Any | None:
     """Return the body with so many times the cells along each edge; None where it cannot be.
 
-    Cells of a file are divided into eight. So is a single layer of cells, or two would be the finer mesh of one while
-    the other edges are divided by less: the order that shows then is of neither.
+    Cells of a file are halved along each edge, and so are those of a single layer: two layers beside edges that are
+    divided by less would show an order that is of neither direction.
     """
     body = spec.body
     thin = body.structured and any(n == 1 for axis, n in zip(AXES, body.cells, strict=True) if axis not in spec.plane)
