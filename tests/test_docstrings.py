@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import ast
 
-from tests.house import PACKAGES, ROOT
+from tests.house import files
 
 
 def test_methods_are_documented_where_they_are_first():
     methods: dict[str, dict[str, bool]] = {}
     bases: dict[str, set[str]] = {}
-    trees = (ast.parse(path.read_text(encoding="utf-8")) for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
-    for one in (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+    for one in (node for file in files() for node in file.classes()):
         found = {node.name: bool(ast.get_docstring(node)) for node in one.body if isinstance(node, ast.FunctionDef)}
         methods.setdefault(one.name, {}).update(found)
         names = (base.value if isinstance(base, ast.Subscript) else base for base in one.bases)
