@@ -125,17 +125,28 @@ class Compared:
     ----------
     posterior, data, assessment
         The posterior, its data, and what was found around the mode.
+    asked
+        Places, among the unknowns, of those that are asked for.
     mesh
         What finer meshes have said; None where they were not asked.
     assumed
         What is taken for granted, and how far it moves the posterior; None where it is not looked at.
+    sampled
+        Which of that are unknowns too.
     """
 
     posterior: Posterior
     data: Measurements
     assessment: Assessment
+    asked: list[int]
     mesh: MeshFound | None
     assumed: tuple[Assumptions, Moves] | None = None
+    sampled: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the unknowns that are asked for."""
+        return [self.posterior.names[k] for k in self.asked]
 
     @cached_property
     def points(self) -> Points:
@@ -229,7 +240,7 @@ def comparison(
             pairs = [(totals({pair: whole[pair] for pair in rest})[k], totals(rest)[k]) for rest in left_out.values()]
             rows = [np.hypot(ours, without) if k else ours - without for ours, without in pairs]
             variables[f"held_out_score{end}"] = (("left_out", "model"), np.array(rows))
-    parameters = list(dict.fromkeys(p for one in found.values() for p in one.posterior.names))
+    parameters = list(dict.fromkeys(p for one in found.values() for p in one.names))
     taken = [one.assumed[0] for one in found.values() if one.assumed]
     held = {one.name: one.unit for several in taken for one in several.shown[0]}
     bends = list(dict.fromkeys(name for one in taken for name in one.groups))
@@ -331,7 +342,7 @@ def _of_group(one: Compared) -> xr.Dataset:
 
     posterior, assessment, mesh, by = one.posterior, one.assessment, one.mesh, "parameter"
     gaussian, evidence, chains = assessment.gaussian, assessment.evidence, assessment.chains
-    known, d, c = answer(posterior, assessment), len(posterior.inputs.names), len(posterior.names)
+    known, which, c = answer(posterior, assessment), one.asked, len(one.asked)
     found: dict[str, Any] = {
         "group_log_evidence": assessment.log_evidence[0],
         "group_log_evidence_error": assessment.log_evidence[1],
@@ -346,12 +357,12 @@ def _of_group(one: Compared) -> xr.Dataset:
         "verdict": one.verdict.why,
         "misfit_probability": one.critic.misfit,
         "correlation_probability": one.critic.correlation,
-        "constant_mode": (by, posterior.physical(gaussian.mode[None, :])[0]),
-        "constant_mean": (by, known.mean),
-        "constant_std": (by, known.std),
-        "constant_outermost": (by, known.outermost),
-        "constant_quantiles": (("quantile", by), known.quantiles(QUANTILES).T),
-        "point_values": (("point", by), one.points.values),
+        "constant_mode": (by, posterior.physical(gaussian.mode[None, :])[0, which]),
+        "constant_mean": (by, known.mean[which]),
+        "constant_std": (by, known.std[which]),
+        "constant_outermost": (by, known.outermost[which]),
+        "constant_quantiles": (("quantile", by), known.quantiles(QUANTILES)[which].T),
+        "point_values": (("point", by), one.points.values[:, which]),
         "point_weight": ("point", one.points.weights),
         "chains": 0 if chains is None else len(chains.draws) * chains.mixed,
         "chain_rhat": np.nan if chains is None else chains.rhat.max(),
@@ -366,17 +377,18 @@ def _of_group(one: Compared) -> xr.Dataset:
             "mesh_shift": (by, _beyond(mesh.shift, c)),
             "mesh_left": (by, _beyond(mesh.left, c)),
         }
-    shown, groups, moves = list[Assumption](), list[str](), Moves(np.zeros((0, d)), np.zeros(0), np.zeros((0, d)))
+    shown, groups, moves = list[Assumption](), list[str](), Moves(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
     if one.assumed is not None:
         taken, moves = one.assumed
         shown, groups = taken.shown[0], list(taken.groups)
-    over = known.std[:d]
+    over = known.std[which][: moves.parameters.shape[1]]
     found |= {
         "assumption_shift": (("assumption", by), _beyond((moves.parameters / over).T, c).T),
         "assumption_bend": (("uncertain", by), _beyond((moves.bends / over).T, c).T),
         "assumption_log_evidence": ("assumption", moves.log_evidence),
         "assumption_size": ("assumption", [each.size for each in shown]),
         "assumption_part": ("assumption", [each.part for each in shown]),
+        "uncertain_sampled": ("uncertain", [float(name in one.sampled) for name in groups]),
     }
-    names = {by: list(posterior.names), "assumption": [each.name for each in shown], "uncertain": groups}
+    names = {by: one.names, "assumption": [each.name for each in shown], "uncertain": groups}
     return xr.Dataset(found, {**names, "point": np.arange(len(one.points.weights))})

@@ -47,12 +47,12 @@ class Sampled:
     ----------
     names
         Of these (s,), among the groups of what is taken for granted.
-    model, evaluate
-        The model of the parameters and these, as `Inputs.beside` puts them, and its evaluation.
+    make, evaluate
+        Makes the model of the parameters and these, as `Inputs.beside` puts them, and its evaluation.
     """
 
     names: tuple[str, ...]
-    model: ForwardModel
+    make: Callable[[], ForwardModel]
     evaluate: Evaluate
 
 
@@ -138,8 +138,7 @@ class Inferred:
     moves
         How far what is taken for granted moves the first of them, if it is looked at.
     sampled, solves
-        Where first order was not enough: places of the parameters, and of what is uncertain, among the unknowns; and
-        solves for these.
+        What first order was not enough of, by name, which are unknowns too; and solves for these.
     """
 
     found: AtMode
@@ -150,13 +149,18 @@ class Inferred:
     before: float | None
     process: Process | None = None
     moves: Moves | None = None
-    sampled: tuple[list[int], list[int]] | None = None
+    sampled: tuple[str, ...] = ()
     solves: int = 0
 
     @property
     def posterior(self) -> Posterior:
         """The posterior as it was corrected."""
         return self.found.posterior
+
+    @property
+    def asked(self) -> list[int]:
+        """Places, among the unknowns, of those that are asked for: the parameters, and the size of the errors."""
+        return [k for k, name in enumerate(self.posterior.names) if name not in self.sampled]
 
 
 def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
@@ -199,7 +203,8 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
         posterior, gaussian, process = with_process(posterior, gaussian, problem.data)
     found = first = AtMode(posterior, gaussian)
     moves = None if assumed is None else moved_by(posterior, gaussian, first.at, assumed)
-    places, recorder, sampled = None, None, problem.sampled
+    unknown: tuple[str, ...] = ()
+    recorder, sampled = None, problem.sampled
     if sampled is not None and assumed is not None:
         recorder = Recorder(sampled.evaluate)
         with suppress(SolveError):  # there is no answer to any of them at the mode
@@ -207,8 +212,8 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
             if not (np.abs(missed(wider)) <= BENT).all():  # or it is not known
                 gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
                 problem.say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
-                found, places = AtMode(wider.posterior, gaussian), (wider.own, wider.new)
-                model, steps = sampled.model, parts
+                found, unknown = AtMode(wider.posterior, gaussian), sampled.names
+                model, steps = sampled.make() if method.chains == "hmc" else None, parts
     one = assess(
         found.posterior,
         gaussian,
@@ -220,7 +225,7 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
         steps=steps,
     )
     solves = 0 if recorder is None else recorder.solves
-    return Inferred(found, first, searched, one, mesh, before, process, moves, places, solves)
+    return Inferred(found, first, searched, one, mesh, before, process, moves, unknown, solves)
 
 
 def _sampling(first: AtMode, assumed: Assumptions, sampled: Sampled, evaluate: Evaluate) -> Wider:

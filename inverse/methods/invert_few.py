@@ -123,8 +123,8 @@ def invert_few(
     inferred = infer(of_data_set, replace(problem, start=start, steps=steps))
     posterior, one, mesh, first = inferred.posterior, inferred.assessment, inferred.mesh, inferred.first
     gaussian, found, chains, at = one.gaussian, one.evidence, one.chains, inferred.found.at
-    own, new = inferred.sampled or (list(range(d)), [])
-    kept = [*own, *range(len(posterior.inputs.names), len(posterior.names))]
+    kept = inferred.asked
+    own = kept[:d]
     spectrum = spectrum_of(posterior, at)
     scale = posterior.scale(at.x)[0]
     raw = posterior.residuals(at.outputs, at.x)[0]
@@ -157,7 +157,7 @@ def invert_few(
         **({} if look is None else _stiffness(posterior, one, known, points, lambda values: look(values[:, own]))),
         **({} if inferred.moves is None else _of_assumed(inferred.moves, std, others)),
         **({} if problem.questions is None else _asked(*asking, problem.questions, others, method.seed, steps)),
-        **_of_uncertain(posterior, points, gaussian.mode, problem, new),
+        **_of_uncertain(posterior, points, gaussian.mode, problem, inferred.sampled),
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
         **diagnosed(chains, used=known.source == "chains"),
@@ -269,22 +269,23 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
 
 
 def _of_uncertain(
-    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem[Invert], new: Sequence[int]
+    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem[Invert], names: Sequence[str]
 ) -> Record:
     """Moments of what is uncertain beside the parameters, in its deviations, at each point and over all.
 
     With the most probable size of the errors, for which it was made; what was sampled is known at each point.
     """
-    pull, seen, sampled = posterior.noise.pull, points.weights[:, None] > 0, np.zeros(0, dtype=int)
-    count = len(pull) + len(new)
+    pull, seen = posterior.noise.pull, points.weights[:, None] > 0
+    count = len(pull) + len(names)
     if not count:
         return {}
-    if new and problem.assumed is not None and problem.sampled is not None:
-        sampled = np.array([list(problem.assumed.groups).index(name) for name in problem.sampled.names])
+    groups = [] if problem.assumed is None else list(problem.assumed.groups)
+    new = [posterior.names.index(name) for name in names]
+    sampled = np.array([groups.index(name) for name in names], dtype=int)
     others = np.delete(np.arange(count), sampled)
     there, covariance = np.zeros((len(points.values), count)), np.zeros((count, count))
     there[:, others] = -posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None]) @ pull.T
-    there[:, sampled] = np.where(seen, points.values[:, list(new)], 0.0)
+    there[:, sampled] = np.where(seen, points.values[:, new], 0.0)
     covariance[np.ix_(others, others)] = np.eye(len(pull)) - pull @ pull.T
     mean = points.weights @ there
     squares = np.diag(covariance) + points.weights @ (there - mean) ** 2

@@ -31,7 +31,7 @@ from inverse.methods.infer import Inferred, Problem, by_tangents, infer
 from inverse.methods.invert import Inference
 from inverse.methods.model_error import Truth
 from inverse.methods.record import of_learnt
-from uq.evaluation.evaluate import Steps
+from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
 
@@ -201,16 +201,20 @@ class Select(Inference):
         quick = self.model_copy(update={"chains": None})
 
         def value(changed: Posterior, pair: Pair, label: str) -> tuple[float, float]:
-            def found() -> tuple[float, float]:
-                again = Problem(one.data, quick, finer=None, start=one.start, steps=parts)
-                return infer(changed, again).assessment.log_evidence
+            def again() -> tuple[float, float]:
+                other = Problem(one.data, quick, finer=None, start=start, steps=parts)
+                return infer(changed, other).assessment.log_evidence
 
             one = problems[pair]
+            start = None if found[pair].sampled else one.start  # which is of the parameters alone
             parts = one.steps.of(label)
             with _of(pair):
-                return parts("evidence", found)
+                return parts("evidence", again)
 
-        def checked(one: Posterior, parts: Steps) -> tuple[float, float]:
+        def checked(pair: Pair) -> tuple[float, float]:
+            parts, wider = problems[pair].steps, problems[pair].sampled if found[pair].sampled else None
+            cheap = (free or evaluate)(*pair) if wider is None else SerialEvaluate(wider.make())
+            one = replace(posteriors[pair], evaluate=cheap)
             return parts("nested", lambda: nested(one, seed=self.seed, kept=parts.rows("likelihoods")))
 
         variants: dict[str, dict[Pair, tuple[float, float]]] = {
@@ -219,7 +223,7 @@ class Select(Inference):
         for width in WIDTHS:
             label = f"priors × {width:g}"
             variants[label] = {
-                pair: one.reweighted(partial(_rescaled, posteriors[pair], width)) for pair, one in stated.items()
+                pair: one.reweighted(partial(_rescaled, found[pair], width)) for pair, one in stated.items()
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
@@ -238,13 +242,7 @@ class Select(Inference):
 
         for label, tests in self.subsets.items():
             variants[label] = some(label, set(tests).intersection)
-        checks = {}
-        if self.check is not None:
-            source = free or evaluate
-            checks = {
-                pair: checked(replace(posteriors[pair], evaluate=source(*pair)), one.steps)
-                for pair, one in problems.items()
-            }
+        checks = {} if self.check is None else {pair: checked(pair) for pair in pairs}
         tests_of = [test for data in data_groups.values() for test in data.measured_tests] if self.held_out else []
         left_out = {
             test: some(f"without {test}", lambda those, test=test: {*those} - {test} if test in those else set())  # type: ignore[misc]
@@ -254,7 +252,8 @@ class Select(Inference):
         for pair, it in found.items():
             taken = problems[pair].assumed
             moves = None if taken is None or it.moves is None else (taken, it.moves)
-            compared[pair] = Compared(it.posterior, data_groups[pair[1]], it.assessment, it.mesh, moves)
+            known = it.posterior, data_groups[pair[1]], it.assessment
+            compared[pair] = Compared(*known, it.asked, it.mesh, moves, it.sampled)
         result = comparison(candidates, data_groups, compared, variants, checks, left_out)
         result = result.assign(_learnt(posteriors, {pair: one.truth for pair, one in problems.items()}, data_groups))
         if any(one.noise.shared is None for one in posteriors.values()):
@@ -310,10 +309,10 @@ def _only(posterior: Posterior, data: Measurements, tests: Collection[str]) -> P
     return replace(posterior, data=posterior.data[which], noise=posterior.noise.of(which), which=which)
 
 
-def _rescaled(posterior: Posterior, width: float, points: FloatArray) -> FloatArray:
-    """Return what priors of another width add to ln of the prior density at points (n, c)."""
-    inputs = posterior.inputs
-    x = points[:, : len(inputs.names)]
+def _rescaled(found: Inferred, width: float, points: FloatArray) -> FloatArray:
+    """Return what priors of another width add to ln of the prior density at points (n, c); what is uncertain stays."""
+    inputs = found.first.posterior.inputs
+    x = points[:, found.asked[: len(inputs.names)]]
     change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
     return np.asarray(change + np.log(inputs.admitted / inputs.admitted_at(width)))
 

@@ -260,6 +260,8 @@ class TakenForGranted:
         for name, how in self.stated.items():
             if name in self.unknown:
                 yield ("uncertain", name), "is a parameter too, expected one of both", name
+            elif how.group in self.unknown:
+                yield ("uncertain", name, "group"), "is the name of a parameter, expected another", how.group
             elif not any(means(name, path) for path in known):
                 yield ("uncertain", name), f"not a number that is taken for granted; {nearest(name, known)}", name
             elif how.relative is not None and not name.startswith("data.scale"):

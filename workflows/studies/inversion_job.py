@@ -248,7 +248,7 @@ def _problem(
             ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
         assumed = taken.of(data, ask)
         shared = together(shared, assumed.shared)
-        sampled = None if wider is None else Sampled(taken.sampled, wider, on(SAMPLED, wider))
+        sampled = None if wider is None else Sampled(taken.sampled, lambda: wider, on(SAMPLED, wider))
     truth = None
     if seen.truth is not None and study.model_error is not None:
         truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)

@@ -130,6 +130,11 @@ class SelectionBlocks(OfCandidates):
         spec = self.truth(name)
         return observing(spec.build(comm, tuple(self.candidates[name].parameters)), self.data_as_in(spec))
 
+    def build_wider(self, name: str, group: str, comm: Any = None) -> ForwardModel:
+        """Make the model of a candidate of which what is uncertain can be sampled; collective."""
+        taken = self.taken(name, group)
+        return taken.sampling(observing(taken.build(comm), taken.data), self.models[name].inputs)
+
     def truth(self, name: str) -> ModelSpec:
         """The model against which the errors of a candidate are learnt; a ValidationError says no."""
         one = self.candidates[name]

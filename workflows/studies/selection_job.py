@@ -15,7 +15,7 @@ from forward.model import FloatArray, ForwardModel
 from inverse.criticism.assumptions import by_evaluation
 from inverse.criticism.finer import Finer
 from inverse.data.shared_motion import together
-from inverse.methods.infer import Problem
+from inverse.methods.infer import Problem, Sampled
 from inverse.methods.model_error import Truth
 from inverse.methods.selection import Select
 from uq.evaluation.evaluate import Recorder, SerialEvaluate, Steps
@@ -23,7 +23,7 @@ from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
-from workflows.studies.assumptions import ASSUMED
+from workflows.studies.assumptions import ASSUMED, SAMPLED
 from workflows.studies.job import MOVED, MethodJob, kept_starts
 from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, of_file
@@ -49,6 +49,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
     kept = Kept(checkpoint, MPI.COMM_SELF, "steps")  # of the method, which runs on the first rank
     checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
     taken = {pair: study.taken(*pair) for pair in study.pairs}
+    wider = {f"{n}/{g}/{SAMPLED}": partial(study.build_wider, n, g) for (n, g), one in taken.items() if one.sampled}
     motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -63,9 +64,13 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         def problem(name: str, group: str) -> Problem[Select]:
             pair, label = (name, group), f"{name}/{group}"
             recorder, motion, one, learnt = recorders[label], motions.get(pair), taken[pair], study.learnt.get(name)
-            assumed = truth = None
+            assumed = truth = sampled = None
             if method.assumptions or study.uncertain:
                 assumed = one.of(one.data, by_evaluation(evaluate.on(f"{label}/{ASSUMED}")) if one.asked else None)
+            there = f"{label}/{SAMPLED}"
+            if there in wider:
+                recorders[there] = Recorder(evaluate.on(there))
+                sampled = Sampled(one.sampled, wider[there], recorders[there])
             if learnt is not None:
                 truth = Truth(evaluate.on(f"{label}/{TRUTH}"), learnt.solves, method.seed)
             finer = None if not why else Finer(None, why[name])
@@ -81,6 +86,7 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
                 say=lambda line: ensemble.say(f"{name}: {line}"),
                 steps=Steps(kept, recorder, label, ensemble.count),
                 assumed=assumed,
+                sampled=sampled,
                 truth=truth,
             )
 
@@ -111,14 +117,16 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         f"{n}/{g}/{TRUTH}": partial(study.build_truth, n, ensemble.group) for n, g in study.pairs if n in study.learnt
     }
     held_ones = {f"{n}/{g}/{ASSUMED}": partial(one.model, ensemble.group) for (n, g), one in taken.items() if one.asked}
+    wider_ones = {name: partial(make, ensemble.group) for name, make in wider.items()}
+    passing = finer_ones | held_ones | wider_ones | true_ones
     return MethodJob(
         makers[study.pairs[0]](),
-        {"/".join(pair): make for pair, make in makers.items()} | finer_ones | moved_ones | held_ones | true_ones,
+        {"/".join(pair): make for pair, make in makers.items()} | moved_ones | passing,
         task,
         recorders,
         labelled=labelled,
         costly=study.model is not None or method.chains in {"pcn", "emcee"},  # whose one step may take minutes
-        passing=frozenset({*finer_ones, *held_ones, *true_ones}),
+        passing=frozenset(passing),
     )
 
 

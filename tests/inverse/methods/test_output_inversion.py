@@ -189,6 +189,7 @@ def test_what_is_uncertain_is_among_the_errors(folder):
         ("uncertain={'data.scales'=0.1}", "uncertain.data.scales: not a number that is taken for granted; did you"),
         ("uncertain={'data.shift.x'={std=1e-3}}", "uncertain.data.shift.x: not a number that is taken for granted"),
         ("uncertain={'data.scale'={}}", "uncertain.data.scale: expected either relative or std"),
+        ("uncertain={'data.scale'={std=0.1,group='a'}}", "uncertain.data.scale.group: is the name of a parameter"),
     ],
 )
 def test_what_cannot_be_uncertain_is_refused(folder, given, told):

@@ -136,6 +136,38 @@ def test_a_number_that_is_uncertain_counts_as_one_that_is_inferred(folder):
         np.testing.assert_allclose(modes.sel(model="one-alone"), modes.sel(model="one"), rtol=1e-6)
 
 
+def test_what_is_too_uncertain_for_first_order_is_sampled(folder, looked_at):
+    """As if it were inferred: evidence, variants and constants are those of the candidate that infers it."""
+    scaled = LINES.replace("ONE @ p", "ONE @ p[:2] * np.exp(p[2] - 2)").replace(
+        "return ONE\n", "return np.column_stack([ONE, ONE @ p[:2]]) * np.exp(p[2] - 2)\n"
+    )
+    (folder / "rival_scaled.py").write_text(scaled)
+    head, *_ = STUDY.replace("rival_lines", "rival_scaled").partition("[candidates.one-alone]")
+    head = head.replace("b = -1.0 }", "b = -1.0, s = 2.0 }")
+    one = "[candidates.one]" + head.partition("[candidates.one]")[2]
+    known = one.replace("one]", "known]") + 'parameters.s = { kind = "normal", mean = 2.0, std = 0.4 }\n'
+    method = STUDY[STUDY.index("[method]") :].replace("samples = 32", "samples = 256")
+    more = "other_noises.larger = { absolute = 0.4 }\nsubsets.only = ['w']\nheld_out = true\n"
+    (folder / "scaled.toml").write_text(f"{head}\n{known}\n{method}{more}\n[uncertain]\ns = 0.4\n")
+    out = folder / "scaled"
+    assert main(["run", str(folder / "scaled.toml"), "--out", str(out), "--quiet"]) == 0
+    with xr.open_dataset(out / "results.nc", engine="h5netcdf") as found:
+        one, known = (found.sel(model=name, parameter=["a", "b"]).isel(group=0) for name in ("one", "known"))
+        close = np.testing.assert_allclose
+        close(one["log_evidence"], known["log_evidence"], atol=1e-3)
+        close(one["variant_log_evidence"][3:], known["variant_log_evidence"][3:], atol=0.02)  # searched again
+        apart = (found["variant_log_evidence"] - found["log_evidence"]).sel(variant=["priors × 0.5", "priors × 2"])
+        assert np.abs(apart.sel(model="one") - apart.sel(model="known")).min() > 0.01  # the deviation of s is stated
+        for name in ("constant_mode", "constant_mean", "constant_std", "constant_quantiles"):
+            close(one[name], known[name], rtol=2e-3, err_msg=name)
+        assert "s" in found.parameter  # of the other candidate
+        assert np.isnan(found["constant_mean"].sel(model="one", parameter="s")).all()
+        assert found["uncertain_sampled"].sel(model="one").item() == 1
+    summary = json.loads((out / "summary.json").read_text())
+    assert not any(one["code"] == "uncertain-bent" for one in summary["findings"])
+    looked_at(out)
+
+
 def test_a_candidate_with_a_wrong_jacobian_is_named(folder):
     wrong = LINES.replace("return OTHER\n", "return OTHER * np.array([1.0, 0.9])\n")
     (folder / "rival_wrong.py").write_text(wrong)
