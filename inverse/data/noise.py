@@ -256,8 +256,12 @@ class Noise:
 
         Of heavy tails, which hide it in the scales, H is zero: nothing is learnt.
         """
-        rows = np.zeros((0, len(self.sigma))) if self.uncertain is None else self.uncertain / self.scale
-        return self.whitened(rows) if self.dof is None else np.zeros_like(rows)
+        return self.pulled(self.uncertain)
+
+    def pulled(self, rows: FloatArray | None) -> FloatArray:
+        """Return such an H (k, m) of other rows (k, m) that data share; of None it has none."""
+        over = np.zeros((0, len(self.sigma))) if rows is None else rows / self.scale
+        return self.whitened(over) if self.dof is None else np.zeros_like(over)
 
     # --- independent residuals, over the scale ------------------------------------------------------------------------
 

@@ -86,6 +86,8 @@ class Problem(Generic[M]):
         What the body does not have, to be asked about; None if nothing is asked.
     truth
         What the errors of the model are learnt from; None where they are not, and always with finer meshes.
+    elsewhere
+        Displacements that are predicted, in the parts of the data, where what no parameters explain is there too.
     """
 
     data: Measurements
@@ -101,6 +103,7 @@ class Problem(Generic[M]):
     sampled: Sampled | None = None
     questions: Questions | None = None
     truth: Truth | None = None
+    elsewhere: Measurements | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +203,7 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
         treatment = method.treatment or "report"
         posterior, gaussian, mesh = corrected_few(posterior, gaussian, problem.finer, problem.data, treatment)
     if problem.errors.process:
-        posterior, gaussian, process = with_process(posterior, gaussian, problem.data)
+        posterior, gaussian, process = with_process(posterior, gaussian, problem.data, problem.elsewhere)
     found = first = AtMode(posterior, gaussian)
     moves = None if assumed is None else moved_by(posterior, gaussian, first.at, assumed)
     unknown: tuple[str, ...] = ()

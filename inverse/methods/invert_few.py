@@ -6,7 +6,7 @@ hand (`Nearby`), or all groups solve at different points of one posterior.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,7 @@ from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.methods.infer import Problem, infer
+from inverse.methods.infer import Inferred, Problem, infer
 from inverse.methods.invert import Invert
 from inverse.methods.record import (
     ENDS,
@@ -157,7 +157,7 @@ def invert_few(
         **({} if look is None else _stiffness(posterior, one, known, points, lambda values: look(values[:, own]))),
         **({} if inferred.moves is None else _of_assumed(inferred.moves, std, others)),
         **({} if problem.questions is None else _asked(*asking, problem.questions, others, method.seed, steps)),
-        **_of_uncertain(posterior, points, gaussian.mode, problem, inferred.sampled),
+        **_of_uncertain(posterior, points, gaussian.mode, problem, inferred),
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
         **diagnosed(chains, used=known.source == "chains"),
@@ -269,27 +269,39 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
 
 
 def _of_uncertain(
-    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem[Invert], names: Sequence[str]
+    posterior: Posterior, points: Points, mode: FloatArray, problem: Problem[Invert], inferred: Inferred
 ) -> Record:
     """Moments of what is uncertain beside the parameters, in its deviations, at each point and over all.
 
+    And of what no parameters explain of displacements that are predicted.
+
     With the most probable size of the errors, for which it was made; what was sampled is known at each point.
     """
-    pull, seen = posterior.noise.pull, points.weights[:, None] > 0
+    pull, seen, names = posterior.noise.pull, points.weights[:, None] > 0, inferred.sampled
     count = len(pull) + len(names)
+    residuals = posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None])
+    found: Record = {}
+    if inferred.process is not None and problem.elsewhere is not None:
+        means, covariance, beside = inferred.process.given(posterior.noise, residuals)
+        found = {"unexplained_point": means, "unexplained_covariance": covariance}
     if not count:
-        return {}
+        return found
     groups = [] if problem.assumed is None else list(problem.assumed.groups)
     new = [posterior.names.index(name) for name in names]
     sampled = np.array([groups.index(name) for name in names], dtype=int)
     others = np.delete(np.arange(count), sampled)
     there, covariance = np.zeros((len(points.values), count)), np.zeros((count, count))
-    there[:, others] = -posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None]) @ pull.T
+    there[:, others] = -residuals @ pull.T
     there[:, sampled] = np.where(seen, points.values[:, new], 0.0)
     covariance[np.ix_(others, others)] = np.eye(len(pull)) - pull @ pull.T
     mean = points.weights @ there
     squares = np.diag(covariance) + points.weights @ (there - mean) ** 2
+    if found:
+        both = np.zeros((len(beside), count))
+        both[:, others] = beside
+        found["unexplained_uncertain"] = both
     return {
+        **found,
         "uncertain_point": there,
         "uncertain_covariance": covariance,
         "uncertain_mean": mean,

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,7 @@ from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
+from uq.surrogates.expansion import Expansion
 from uq.surrogates.linearisation import linearise
 
 if TYPE_CHECKING:
@@ -72,6 +73,20 @@ class Band:
         nothing = np.full(count, np.nan)
         return cls(nothing, nothing, nothing, nothing, nothing, nothing, said=(why,))
 
+    def plus(self, values: FloatArray, more: FloatArray, weights: FloatArray) -> Band:
+        """Return the band with more (N, k) added at draws with weights (N,), by the values of the outputs there."""
+        from inverse.criticism.assessment import quantiles
+
+        def of(draws: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            mean = weights @ draws
+            ends = np.array([quantiles(column, weights, ENDS) for column in draws.T]).T
+            return mean, weights @ (draws - mean) ** 2, ends
+
+        (mean, variance, ends), (first, least, inner) = of(values + more), of(values)
+        std = np.sqrt(np.maximum(self.std**2 + variance - least, 0.0))
+        lower, upper = np.array([self.lower, self.upper]) + ends - inner
+        return replace(self, mean=self.mean + mean - first, std=std, lower=lower, upper=upper)
+
     def named(self, first: str) -> Record:
         """Return its numbers by their names in results."""
         return {f"{first}{name}": vars(self)[name] for name in BAND}
@@ -115,15 +130,20 @@ def with_beside(
     return both, np.repeat(weights / copies, copies)
 
 
-def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
-    """Return what draws of the parameters of a model, in their order, say on its outputs, with `samples` solves."""
+def of_draws(
+    draws: Draws, evaluate: Evaluate, samples: int, seed: int, more: FloatArray | None = None
+) -> tuple[Band, Band | None]:
+    """Return what draws of the parameters of a model, in their order, say on its outputs, with `samples` solves.
+
+    And the same of outputs to which more (N, k) is added at each of the draws, if it is.
+    """
     from uq.estimators.indices import moments
     from uq.estimators.input_sample_error import with_errors_of_draws
     from uq.methods.chaos import Chaos, expansion_dataset
 
     objection = draws.objection()
     if objection is not None:
-        return Band.unknown(len(evaluate.outputs), objection)
+        return Band.unknown(len(evaluate.outputs), objection), None
     inputs = Inputs({}, draws=draws)
     method = Chaos(samples=samples, seed=seed, fields=False, quantiles=ENDS)
     try:
@@ -131,14 +151,17 @@ def of_draws(draws: Draws, evaluate: Evaluate, samples: int, seed: int) -> Band:
         whole = expansion_dataset(evaluate, expanded, seed, ENDS, fields=False, of=moments)  # nobody asks for effects
         found = with_errors_of_draws(whole, inputs)
     except SolveError as error:
-        return Band.unknown(len(evaluate.outputs), error.reason)
+        return Band.unknown(len(evaluate.outputs), error.reason), None
     mean, mean_error, std, std_error = (found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error"))
     lower, upper = found["quantiles"].to_numpy()
     doubts = [one for one in findings(found) if one.severity != "note"]
     said = tuple(one.text for one in once_for_outputs(doubts, evaluate.outputs))
     failed = int((~found["ok"]).sum())
     said += (f"{failed} of {samples} solves have no answer",) if failed else ()
-    return Band(mean, mean_error, std, std_error, lower, upper, 1 + samples, said)
+    band = Band(mean, mean_error, std, std_error, lower, upper, 1 + samples, said)
+    if more is None:
+        return band, None
+    return band, band.plus(Expansion.of(whole).outputs(draws.values), more, draws.weights)
 
 
 def mesh_error_at(draws: Draws, evaluate: Evaluate) -> FloatArray:

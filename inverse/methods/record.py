@@ -67,6 +67,9 @@ _ARRAYS = {
     "uncertain": "uncertain_mean uncertain_std uncertain_sampled",
     "uncertain uncertain_partner": "uncertain_covariance",
     "point uncertain": "uncertain_point",
+    "point goal": "unexplained_point",
+    "goal goal_partner": "unexplained_covariance",
+    "goal uncertain": "unexplained_uncertain",
     "iteration column": "step",
     "datum": "mesh_error datum_axis datum_case measured sigma predicted predicted_std residual resolution model_error "
     "model_error_std",
@@ -88,7 +91,7 @@ _ARRAYS = {
         [
             "prediction_share",
             part("prediction_mean", "mesh"),
-            *(f"prediction_{one}{end}" for one in ("", "prior_") for end in BAND),
+            *(f"prediction_{one}{end}" for one in ("", "prior_", "process_") for end in BAND),
         ]
     ),
 }

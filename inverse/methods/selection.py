@@ -8,7 +8,7 @@ that were solved already (in standard normal coordinates, N(0, s²I) instead of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -34,6 +34,7 @@ from inverse.methods.record import of_learnt
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluate
 from uq.inputs.distributions import Distribution
+from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -223,7 +224,8 @@ class Select(Inference):
         for width in WIDTHS:
             label = f"priors × {width:g}"
             variants[label] = {
-                pair: one.reweighted(partial(_rescaled, found[pair], width)) for pair, one in stated.items()
+                pair: one.reweighted(partial(_rescaled, candidates[pair[0]].inputs, found[pair].asked, width))
+                for pair, one in stated.items()
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
@@ -309,10 +311,12 @@ def _only(posterior: Posterior, data: Measurements, tests: Collection[str]) -> P
     return replace(posterior, data=posterior.data[which], noise=posterior.noise.of(which), which=which)
 
 
-def _rescaled(found: Inferred, width: float, points: FloatArray) -> FloatArray:
-    """Return what priors of another width add to ln of the prior density at points (n, c); what is uncertain stays."""
-    inputs = found.first.posterior.inputs
-    x = points[:, found.asked[: len(inputs.names)]]
+def _rescaled(inputs: Inputs, asked: Sequence[int], width: float, points: FloatArray) -> FloatArray:
+    """Return what priors of another width add to ln of the prior density at points (n, c).
+
+    These hold the d parameters first among those places that are asked for; what is uncertain beside stays.
+    """
+    x = points[:, asked[: len(inputs.names)]]
     change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
     return np.asarray(change + np.log(inputs.admitted / inputs.admitted_at(width)))
 

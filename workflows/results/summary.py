@@ -22,7 +22,7 @@ NUMBERS = ("rmse", "rmse_error", "claimed", "coverage")  # of a method at a budg
 MOMENTS = (*ESTIMATED, "variance_ratio", "std_variance_ratio", "loo_error", "bias_error", "std_bias_error")
 # Of outputs that were not measured: bands by the posterior and the prior, and errors of the mesh.
 PREDICTED = {
-    **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
+    **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_", "process_") for end in BAND},
     "share": "prediction_share",
     part("", "mesh"): part("prediction_mean", "mesh"),
 }
@@ -144,7 +144,8 @@ def _nested(labels: Sequence[tuple[str, Sequence[str]]], values: Mapping[str, Fl
 def _by(dimension: str, found: xr.Dataset, names: Mapping[str, str]) -> Any:
     """Return variables of one dimension, by its labels and then by short names."""
     labels = [str(name) for name in found[dimension].values]
-    return _nested([(dimension, labels)], {short: found[name].to_numpy() for short, name in names.items()})
+    there = {short: found[name].to_numpy() for short, name in names.items() if name in found}
+    return _nested([(dimension, labels)], there)
 
 
 def _methods(dataset: xr.Dataset) -> Part:

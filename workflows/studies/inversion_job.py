@@ -252,7 +252,13 @@ def _problem(
     truth = None
     if seen.truth is not None and study.model_error is not None:
         truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
-    known: dict[str, Any] = {"finer": finer, "shared": shared, "start": start, "model": seen.model, "truth": truth}
+    elsewhere = None
+    if study.predict is not None and study.data.errors.process:
+        from workflows.studies.predicted import elsewhere_of
+
+        elsewhere = elsewhere_of(study)
+    known: dict[str, Any] = {"finer": finer, "elsewhere": elsewhere}
+    known |= {"shared": shared, "start": start, "model": seen.model, "truth": truth}
     known |= {"assumed": assumed, "sampled": sampled, "questions": seen.questions, "say": ensemble.say, "steps": steps}
     return Problem(data, study.method, study.data.errors, **known)
 

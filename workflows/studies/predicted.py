@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ValidationError
+from scipy.linalg import block_diag
 
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
 from forward.specimen import in_words, shared_paths
+from inverse.data.measurements import Measurements
 from inverse.fields.low_rank import Beside, symmetric_root
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.scalars import Mistake
+    from forward.specimen import LoadCase
     from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
@@ -137,19 +140,50 @@ def of_few(
     columns = [study.names.index(name) for name in names]
     points = found["point"].to_numpy()[used][:, columns]
     kept = weights[used] / weights[used].sum()
-    effective = float(1 / (kept**2).sum())
-    if labels:
-        means, covariance = np.zeros((used.sum(), 0)), np.zeros((0, 0))
-        if "uncertain_point" in found:
-            means, covariance = found["uncertain_point"].to_numpy()[used], found["uncertain_covariance"].to_numpy()
+    effective, c = float(1 / (kept**2).sum()), len(names) + len(labels)
+    if labels or "unexplained_point" in found:
+        means, covariance = _beside(found)
         known, others = _acting_of(study)
-        root = np.hstack([known @ symmetric_root(covariance), others])
-        points, kept = predict.with_beside(points, kept, means @ known.T, root, study.method.seed)
-    draws = Draws((*names, *labels), points, kept, effective)
-    after = predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
+        acting = block_diag(known, np.eye(means.shape[1] - known.shape[1]))
+        others = np.pad(others, ((0, len(acting) - len(known)), (0, 0)))
+        root = np.hstack([acting @ symmetric_root(covariance), others])
+        points, kept = predict.with_beside(points, kept, means[used] @ acting.T, root, study.method.seed)
+    draws, more = Draws((*names, *labels), points[:, :c], kept, effective), points[:, c:]
+    solves = study.predicted_by, study.method.seed
+    after, whole = predict.of_draws(draws, evaluate, *solves, more if more.size else None)
     looked = study.method.treatment is not None and has_mesh(study.predicted)
     mesh = predict.mesh_error_at(draws, of_mesh) if looked and not np.isnan(after.mean).all() else np.nan
-    return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
+    record = predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
+    return record if whole is None else record | whole.named("prediction_process_")
+
+
+def _beside(found: xr.Dataset) -> tuple[FloatArray, FloatArray]:
+    """Return means at all points, and the covariance, of what is uncertain and of what no parameters explain."""
+    kinds = [kind for kind in ("uncertain", "unexplained") if f"{kind}_point" in found]
+    covariance = block_diag(np.zeros((0, 0)), *(found[f"{kind}_covariance"] for kind in kinds))
+    if "unexplained_uncertain" in found:
+        both = found["unexplained_uncertain"].to_numpy()
+        g = both.shape[1]
+        covariance[g:, :g], covariance[:g, g:] = both, both.T
+    return np.hstack([np.zeros((found.sizes["point"], 0)), *(found[f"{kind}_point"] for kind in kinds)]), covariance
+
+
+def elsewhere_of(study: InversionBlocks) -> Measurements:
+    """Return the displacements that are predicted, in the load cases of the data in which the same acts."""
+    made: Any = study.predicted
+    measured = study.model.cases
+    alike = [
+        next((k for k, case in enumerate(measured) if _acts(case) == _acts(one)), len(measured) + number)
+        for number, one in enumerate(made.cases)
+    ]
+    rows = [(alike[number], axis, at) for number, _, axis, at in made.rows()]
+    cases, axes, places = (np.array(of) for of in zip(*rows, strict=True))
+    nothing = np.full(len(rows), np.nan)
+    return Measurements.of(nothing, nothing, cases, np.minimum(axes, 3), places=places)
+
+
+def _acts(case: LoadCase) -> tuple[Any, ...]:
+    return tuple(getattr(case, name) for name in ACTING)
 
 
 def _acting_of(study: InversionBlocks) -> tuple[FloatArray, FloatArray]:
@@ -169,7 +203,7 @@ def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
     values = np.hstack([points[:, [every.index(name) for name in names]], ndtri(uniforms[:, len(every) :])])
     values = values[study.inputs.allowed(points)]
     draws = Draws((*names, *labels), values, np.full(len(values), 1 / len(values)), float(len(values)))
-    return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)
+    return predict.of_draws(draws, evaluate, study.predicted_by, study.method.seed)[0]
 
 
 def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> FieldPredictions:

@@ -232,7 +232,7 @@ def test_evidence_of_priors_with_inadmissible_tails(correlated, by_nested_sampli
     assert abs(found.log_evidence - exact[1.0]) < max(4 * found.error, 5e-3)
     assert found.error < 0.05
     for width in (0.5, 2.0):
-        value, error = found.reweighted(_rescaled(whole, width, found.density.x))
+        value, error = found.reweighted(_rescaled(inputs, range(2), width, found.density.x))
         assert abs(value - exact[width]) < max(4 * error, 5e-3)
     assert not found.weights[found.density.parameters.sum(axis=1) <= 0].any()
     if by_nested_sampling and find_spec("dynesty"):

@@ -9,10 +9,12 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
+from inverse.fields.low_rank import symmetric_root
 from inverse.low_dimensional import residual_process
 from inverse.low_dimensional.laplace import deviations, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.residual_process import LENGTHS, SIZES, process, with_process
+from inverse.methods.predict import Band
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
@@ -82,6 +84,70 @@ def test_intervals_hold_where_the_model_is_wrong(size, length):
             held[with_it] += (gap <= 1.96 * deviations(one, best)).sum()
     assert held[True] > 120 * 0.95 - 3.5 * np.sqrt(120 * 0.95 * 0.05)
     assert (held[False] < 90) == (size > 0)
+
+
+NEW = np.random.default_rng(5).uniform(size=(4, 3))
+ELSEWHERE = Measurements.of_points(
+    NEW, np.full((4, 3), np.nan), np.full((4, 3), np.nan), np.array([0, 0, 1, 2]), ["q"] * 4, ("one", "two", "three")
+)
+
+
+def test_what_it_is_elsewhere_in_closed_form():
+    """Given the parameters and errors that are uncertain beside; in another load case it is as wide as it was found."""
+    shared = np.random.default_rng(3).standard_normal((2, M)) / 5
+    y = A @ [0.5, -1.0] + 0.3 * np.sin(5 * np.repeat(X[:, 2], 3)) + SIGMA * np.random.default_rng(1).standard_normal(M)
+    one = Posterior(INPUTS, SerialEvaluate(MODEL), y, Noise(np.full(M, SIGMA), uncertain=shared))
+    whole, best, found = with_process(one, laplace(one, starts=1), DATA, ELSEWHERE)
+    noise = whole.noise
+    r = whole.residuals(whole.at(best.mode[None]).outputs, best.mode[None])
+    means, covariance, beside = found.given(noise, r)
+    K = noise.process.T @ noise.process
+    cross = noise.process.T @ found.elsewhere
+    S = K + shared.T @ shared + SIGMA**2 * np.eye(M)
+    gap = y - A @ whole.physical(best.mode[None])[0]
+    wide = found.elsewhere.T @ found.elsewhere + found.left
+    np.testing.assert_allclose(means[0], cross.T @ np.linalg.solve(S, gap), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(covariance, wide - cross.T @ np.linalg.solve(S, cross), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(beside, -cross.T @ np.linalg.solve(S, shared.T), rtol=1e-8, atol=1e-10)
+    assert np.abs(means[0, :9]).max() > 0.03
+    assert (np.diag(covariance)[:9] < 0.95 * np.diag(wide)[:9]).all()
+    assert not np.round(means[0, 9:], 12).any()
+    np.testing.assert_allclose(np.diag(covariance), [*np.diag(covariance)[:9], *[wide[0, 0]] * 3], rtol=1e-8)
+    np.testing.assert_allclose(np.diag(K), wide[0, 0], rtol=0.05)
+
+
+def test_predictions_hold_with_it():
+    """95 % of intervals of displacements that were not measured; without it the model is far off."""
+    both, size = np.vstack([X[:15], NEW[:2]]), 0.3
+    apart = np.sqrt(3) * cdist(both, both) / 0.5
+    root = np.linalg.cholesky((1 + apart) * np.exp(-apart) + 1e-10 * np.eye(17))
+    data = Measurements.of_points(
+        X[:15], np.zeros((15, 3)), np.full((15, 3), SIGMA), np.zeros(15, dtype=int), ["p"] * 15, ("one",)
+    )
+    new = Measurements.of_points(NEW[:2], *2 * [np.full((2, 3), np.nan)], np.zeros(2, dtype=int), ["q"] * 2, ("one",))
+    slopes = np.array([np.outer(np.cos(2 * both[:, 0]), (1.0, 0.3, 0.0)).ravel(), np.repeat(both[:, 1], 3)]).T
+    model = FunctionModel(lambda p: slopes[:45] @ p, INPUTS.names, NAMES[:45], lambda p: slopes[:45])
+    held = np.zeros(2)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        truth, delta = rng.standard_normal(2), size * (root @ rng.standard_normal((17, 3))).ravel()
+        values = slopes @ truth + delta
+        y = values[:45] + SIGMA * rng.standard_normal(45)
+        one = Posterior(INPUTS, SerialEvaluate(model), y, Noise(np.full(45, SIGMA)))
+        whole, best, found = with_process(one, laplace(one, starts=1), data, new)
+        x = best.mode + rng.standard_normal((2000, 2)) @ best.root.T
+        draws, weights = whole.physical(x), np.full(2000, 1 / 2000)
+        means, covariance, _ = found.given(whole.noise, whole.residuals(draws @ slopes[:45].T, best.mode[None]))
+        plain, nothing = draws @ slopes[45:].T, np.zeros(6)
+        ends = np.quantile(plain, [0.025, 0.975], axis=0)
+        band = Band(plain.mean(axis=0), nothing, plain.std(axis=0), nothing, *ends)
+        more = means + rng.standard_normal((2000, 6)) @ symmetric_root(covariance)
+        wider = band.plus(plain, more, weights)
+        np.testing.assert_allclose(wider.mean, (plain + more).mean(axis=0))
+        np.testing.assert_allclose(wider.std, (plain + more).std(axis=0))
+        held += [((b.lower <= values[45:]) & (values[45:] <= b.upper)).sum() for b in (band, wider)]
+    assert held[1] > 240 * 0.95 - 3.5 * np.sqrt(240 * 0.95 * 0.05) * 2  # six of a seed go together
+    assert held[0] < 160
 
 
 @pytest.mark.unit

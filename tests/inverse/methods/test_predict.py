@@ -451,6 +451,31 @@ def specimens(tmp_path_factory):
     return place
 
 
+@pytest.mark.fem
+def test_predictions_know_what_the_model_does_not_explain(specimens, looked_at):
+    """Near points that were measured in the same load case; in another one as wide; of energies nothing."""
+    errors, out = "data.errors={kind='normal',process=true}", specimens / "process"
+    observed = "predict.observed=[{at=[[1.0,0.1,1.0]],components='x'}]"
+    mesh, load_ = "method.mesh_error=false", "uncertain={'cases.shear.loads.traction.size'={relative=0.02}}"
+    assert ran(specimens / "few.toml", out, errors, observed, mesh, load_, report=True) in (0, 3)
+    found = results(out).isel(data_set=0)
+    assert found["goal"].values.tolist() == ["pull.points.0.x", "pull.energy", "shear.points.0.x", "shear.energy"]
+    (pull, pulled, shear, sheared), size = found["prediction_process_std"].values, float(found["process_size"])
+    plain = found["prediction_std"].values
+    np.testing.assert_allclose([pulled, sheared], plain[[1, 3]], rtol=1e-9)
+    wide = np.sqrt(found["unexplained_covariance"].values[0, 0])
+    assert pull == pytest.approx(np.hypot(plain[0], wide), rel=0.05)
+    assert size < wide
+    assert plain[2] < shear < 0.7 * np.hypot(plain[2], wide)
+    before, after = (abs(float(found[f"prediction_{kind}mean"][2]) - 0.028) for kind in ("", "process_"))
+    assert after < 0.5 * before  # what was measured at a point nearby
+    moved = (found["prediction_process_mean"] - found["prediction_mean"]).values
+    np.testing.assert_allclose(moved[[0, 1, 3]], 0, atol=1e-3 * wide)
+    assert found["unexplained_uncertain"].shape == (4, 1)
+    assert "With what the model does not explain" in (out / "report.html").read_text()
+    looked_at(out)
+
+
 @pytest.mark.slow
 @pytest.mark.fem
 def test_other_loads_and_places_of_a_specimen(specimens):

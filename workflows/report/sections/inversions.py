@@ -81,11 +81,22 @@ def predictions(results: Results) -> Iterator[Block]:
             removed = percent(share) if np.isnan(share) or share >= 0 else "none"
             rows.append((str(goal), *told, removed, size(mesh, unit) if np.isfinite(mesh) else "not estimated"))
         yield Table(PREDICTED, rows)
+        if "prediction_process_mean" in one:
+            yield Text("With what the model does not explain, where it is known from displacements around there:")
+            parts = (one.sel(goal=goal) for goal in one["goal"].values[:SHOWN])
+            yield Table(PREDICTED[:3], [(str(at["goal"].item()), *_whole(at)) for at in parts])
         if np.isfinite(one["prediction_std"]).any():
             caption = "95 % intervals before and after the data, each relative to the one before."
             yield Pictures.of((plots.bands(one), caption))
     if len(done) > SETS:
         yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
+
+
+def _whole(at: xr.Dataset) -> tuple[str, str]:
+    """A prediction with what the model does not explain, and its interval."""
+    unit, names = str(at["goal_unit"].item()), ("mean", "std", "lower", "upper")
+    mean, std, lower, upper = (float(at[f"prediction_process_{name}"]) for name in names)
+    return and_error(mean, std, unit), interval(lower, upper, unit, mean)
 
 
 @section("population_draw", heading="The population")
