@@ -226,6 +226,33 @@ def test_vectors_are_written_as_such():
     np.testing.assert_allclose(study.run()["mode"][0], truth, atol=0.01)
 
 
+def test_functions_of_one_name_are_told_apart():
+    """Those that a factory makes, and those without a name; one that is defined again is the same."""
+
+    def made(k):
+        def f(p):
+            return [k * p[0]]
+
+        return f
+
+    class Scaled:
+        def __call__(self, p):
+            return [4 * p[0]]
+
+    def study(function):
+        model = {"kind": "python", "function": function, "parameters": {"x": 1.0}, "outputs": ["y"]}
+        given = {"x": {"kind": "uniform", "lower": 0, "upper": 2}}
+        return tissuq.Study(model=model, parameters=given, method={"kind": "monte-carlo", "samples": 4})
+
+    known = [(made(1.0), 1), (made(10.0), 10), (lambda p: [2 * p[0]], 2), (lambda p: [3 * p[0]], 3), (Scaled(), 4)]
+    studies = [(study(function), size) for function, size in known]
+    first = studies[0][0].run()["mean"]
+    for one, size in studies:
+        np.testing.assert_allclose(one.run()["mean"], size * first, rtol=1e-12)
+    again = [study(f).model.function for f in 2 * [lambda p: [5 * p[0]]]]
+    assert again[0] == again[1]
+
+
 def lambda_free(function, name="map_of_x"):
     """A function with a name, as a session has them."""
 

@@ -60,7 +60,7 @@ def _written(value: Any) -> Any:
             return str(value)
         case _ if hasattr(value, "tolist"):  # arrays, columns, and their numbers
             return value.tolist()
-        case _ if callable(value) and hasattr(value, "__name__"):
+        case _ if callable(value):
             return path_of(value)
         case _:
             return value

@@ -19,6 +19,7 @@ from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
+from itertools import chain, count
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -206,14 +207,27 @@ def search(folders: Iterable[Path]) -> None:
 
 
 def path_of(function: Any) -> str:
-    """Return the dotted path of a function or class; one that no module holds under its name is kept in `SESSION`."""
-    module, name = function.__module__, function.__name__
+    """Return the dotted path of what is called; what no module holds under its name is kept in `SESSION`.
+
+    There other functions of the same name, such as those that a factory makes, are numbered.
+    """
+    module, name = (getattr(function, of, "") for of in ("__module__", "__name__"))
     held = sys.modules.get(module)
     scripted = module == "__main__" or getattr(held, "__spec__", None) is None
     if scripted or getattr(held, name, None) is not function:
-        module = SESSION
-        setattr(sys.modules.setdefault(SESSION, ModuleType(SESSION)), name, function)
+        module, session = SESSION, vars(sys.modules.setdefault(SESSION, ModuleType(SESSION)))
+        name = name if name.isidentifier() else "function"
+        names = chain([name], (f"{name}_{k}" for k in count(2)))
+        name = next(one for one in names if one not in session or _alike(session[one], function))
+        session[name] = function
     return f"{module}.{name}"
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether functions are the same: defined once more in a notebook, by code that holds no values of its own."""
+    codes = [getattr(f, "__code__", None) for f in (one, other)]
+    own = any(getattr(f, of, None) for f in (one, other) for of in ("__closure__", "__defaults__", "__kwdefaults__"))
+    return one is other or (codes[0] is not None and codes[0] == codes[1] and not own)
 
 
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:
