@@ -52,6 +52,7 @@ LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
 LIVE = 400  # points of nested sampling
 NOTHING = -1e300  # ln p(y | x) there where the model has no answer
 AGREED = 0.01  # of the posterior, root mean square over all its parts: what a polynomial may miss
+SAME = 4.0  # standard errors between two estimates of ln Z
 ROUNDED = 1e-9  # relative difference from a Gaussian that counts as rounding error
 
 Route = Literal["closed form", "importance", "surrogate"]
@@ -164,15 +165,32 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     if opening is wide:
         # The others would see no more of what is far from the mode; polynomials do, and are right in few unknowns.
         if drawn.ess >= EVEN * quarter and drawn.pareto_k <= TRUSTED:
-            return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights", gaussian)
+            cloud = _cloud(posterior, pilot, gaussian, seed)
+            if cloud is None or _agree(drawn, cloud):
+                return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights", cloud)
     elif expected[best] >= EVEN:
         name = "Laplace's Gaussian" if best is normal else "Student's t about the mode"
         share += f", and all, with others from {name}, would be worth {100 * expected[best]:.0f} % of their number"
-        return _continued(posterior, pilot, best, seed, quarter, share, gaussian)
+        cloud = _cloud(posterior, pilot, gaussian, seed)
+        return _continued(posterior, pilot, best, seed, quarter, share, cloud)
     try:
         return _by_surrogate(posterior, pilot, gaussian, seed, quarter, f"{share}: uneven weights", expected[best])
     except SolveError as error:
-        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}", gaussian)
+        cloud = _cloud(posterior, pilot, gaussian, seed)
+        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}", cloud)
+
+
+def _cloud(posterior: Posterior, pilot: Sequence[_Part], gaussian: Laplace, seed: int) -> Cloud | None:
+    """Return many points that may stand for few, by a polynomial; None where there is none."""
+    with suppress(SolveError):
+        if affordable(len(posterior.inputs.names)):
+            return sample(fit(posterior, pilot[0].density), gaussian, seed + 100)
+    return None
+
+
+def _agree(drawn: Evidence, cloud: Cloud) -> bool:
+    """Whether points and a polynomial have the same Z: even weights say nothing of a mode that no point has met."""
+    return bool(abs(cloud.log_evidence - drawn.log_evidence) <= SAME * np.hypot(drawn.error, cloud.error))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,15 +266,11 @@ def _continued(
     seed: int,
     quarter: int,
     why: str,
-    gaussian: Laplace | None = None,
+    cloud: Cloud | None = None,
 ) -> Evidence:
-    """Draw all quarters that are left from a proposal; about a Gaussian, many points stand for them where they can."""
+    """Draw all quarters that are left from a proposal; many points may stand for them."""
     done = sum(len(part.density.x) for part in parts)
     rest = _drawn(posterior, proposal, seed, done, QUARTERS * quarter, derivatives=False)
-    cloud = None
-    if gaussian is not None and affordable(len(posterior.inputs.names)):
-        with suppress(SolveError):
-            cloud = sample(fit(posterior, parts[0].density), gaussian, seed + 100)
     return _weighted(posterior, [*parts, rest], "importance", why, cloud)
 
 

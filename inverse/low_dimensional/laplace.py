@@ -14,7 +14,8 @@ which is exact for models that are linear in normal parameters (D. J. C. MacKay,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,8 @@ FARTHEST = 3.0  # length of a step, in standard deviations of the prior
 STIFFER, SOFTER = 8.0, 3.0
 HALVED = 20  # times that a step of Newton is halved
 ROUNDED = 1e-12  # gain over the log posterior that is rounding
+MOST_STARTS = 32
+APART, NEGLIGIBLE = 3.0, 9.0  # deviations between modes, and ln of the weight of one beside the other
 DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
 
 
@@ -65,6 +68,8 @@ class Laplace:
         The iterations of all starts.
     modes
         End points (k, c) of the searches, and `ends` (k,), the log posterior there.
+    curvatures
+        Gauss–Newton's second derivatives (k, c, c) there; None where nothing is said of other modes.
     """
 
     mode: FloatArray
@@ -75,6 +80,7 @@ class Laplace:
     modes: FloatArray
     ends: FloatArray
     left: float
+    curvatures: FloatArray | None = None
 
     @property
     def log_evidence(self) -> float:
@@ -92,12 +98,37 @@ class Laplace:
         root = self.root
         return np.asarray(root @ root.T)
 
+    @property
+    def others(self) -> tuple[FloatArray, FloatArray]:
+        """Other modes (k, c) where searches have ended, and second derivatives (k, c, c) there, by what they weigh.
+
+        They are apart from each other and from the mode, and not negligible beside it, by Laplace's formula.
+        """
+        if self.curvatures is None:
+            return self.modes[:0], self.hessian[None][:0]
+        modes, hessians = np.vstack([self.mode, self.modes]), np.concatenate([self.hessian[None], self.curvatures])
+        which = _distinct(modes, hessians, np.append(np.inf, self.ends), self.log_evidence)
+        return modes[which[1:]], hessians[which[1:]]
+
+    def knowing(self, searched: Laplace, places: Sequence[int]) -> Laplace:
+        """Return the same with where searches have ended in some of the coordinates, before the posterior changed."""
+        if searched.curvatures is None:
+            return self
+        c, n = len(self.mode), len(searched.modes)
+        modes, curvatures = np.zeros((n, c)), np.tile(np.eye(c), (n, 1, 1))
+        modes[:, places], curvatures[np.ix_(range(n), places, places)] = searched.modes, searched.curvatures
+        ends = searched.ends + self.log_posterior - searched.log_posterior
+        return replace(self, modes=modes, ends=ends, curvatures=curvatures)
+
 
 @phase("searching for the mode")
 def laplace(
     posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool = True, first: FloatArray | None = None
 ) -> Laplace:
     """Find the mode, and the second derivatives there.
+
+    Where searches end in w different modes there may be more: of n starts, w (n − 1)/(n − w − 2) are expected in all
+    (C. G. E. Boender, A. H. G. Rinnooy Kan, Math. Program. 37 (1987) 59–80). Until that is w + ½, starts are doubled.
 
     Parameters
     ----------
@@ -117,17 +148,27 @@ def laplace(
     from scipy.special import ndtri
 
     c = len(posterior.names)
-    # Every coordinate of a start is within a standard deviation or two: in the far tails models have no answer.
-    others = ndtri(0.05 + 0.9 * sobol_points(seed, 0, 0, starts - 1, c)) if starts > 1 else np.zeros((0, c))
+
+    def begin(start: int, stop: int) -> FloatArray:
+        # Every coordinate of a start is within a standard deviation or two: in the far tails models have no answer.
+        return np.asarray(ndtri(0.05 + 0.9 * sobol_points(seed, 0, start - 1, stop - 1, c)))
+
     ends: list[Density] = []
     steps: list[Step] = []
-    for number, x in enumerate(np.vstack([np.zeros(c) if first is None else first, others])):
-        found = _climb(posterior, x, number, steps)
-        if found is not None:
-            ends.append(found)
-    if not ends:
-        raise SolveError(f"the model has no answer at any of the {starts} starts of the search for the mode")
-    values = np.array([float(end.log_posterior[0]) for end in ends])
+    number, begun = 0, list(np.vstack([np.zeros(c) if first is None else first, begin(1, starts)]))
+    while begun:
+        for x in begun:
+            found = _climb(posterior, x, number, steps)
+            number += 1
+            if found is not None:
+                ends.append(found)
+        if not ends:
+            raise SolveError(f"the model has no answer at any of the {starts} starts of the search for the mode")
+        curvatures = np.array([_positive(end.curvature[0]) for end in ends])
+        values = np.array([float(end.log_posterior[0]) for end in ends])
+        seen = len(_distinct(np.vstack([end.x for end in ends]), curvatures, values))
+        enough = seen < 2 or number >= MOST_STARTS or seen * (number - 1) <= (seen + 0.5) * (number - seen - 2)
+        begun = [] if enough else list(begin(number, 2 * number))
     best = int(values.argmax())
     here = ends[best]
     hessian = _positive(here.curvature[0])
@@ -145,7 +186,22 @@ def laplace(
         np.array([(here if k == best else end).x[0] for k, end in enumerate(ends)]),
         values,
         left,
+        curvatures,
     )
+
+
+def _distinct(modes: FloatArray, hessians: FloatArray, ends: FloatArray, log_evidence: float = -np.inf) -> list[int]:
+    """Return which of modes (k, c) are apart, by their weights, and not negligible beside the heaviest one.
+
+    Or beside what has some evidence; an infinite log posterior is of a mode that comes first.
+    """
+    weights = ends - np.linalg.slogdet(hessians)[1] / 2
+    heaviest, found = max(weights[np.isfinite(weights)].max(), log_evidence), list[int]()
+    for k in np.argsort(-weights, kind="stable"):
+        gaps = ((modes[k] - modes[j], hessians[k] + hessians[j]) for j in found)
+        if weights[k] > heaviest - NEGLIGIBLE and all(gap @ both @ gap > 2 * APART**2 for gap, both in gaps):
+            found.append(int(k))
+    return found
 
 
 def _newton(posterior: Posterior, here: Density, number: int, steps: list[Step]) -> tuple[Density, FloatArray]:

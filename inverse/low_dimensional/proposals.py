@@ -44,8 +44,10 @@ class Mixture:
 
     @classmethod
     def of(cls, gaussian: Laplace) -> Mixture:
-        """Return the mixture of Laplace's Gaussian, widened, and the prior."""
-        return cls(gaussian.mode[None, :], WIDER * gaussian.root[None, :, :])
+        """Return the mixture of the prior and widened Gaussians: Laplace's, and others about other modes."""
+        modes, hessians = gaussian.others
+        roots = [gaussian.root, *(np.linalg.inv(np.linalg.cholesky(one)).T for one in hessians)]
+        return cls(np.vstack([gaussian.mode, modes]), WIDER * np.array(roots))
 
     def draw(self, cubes: FloatArray) -> FloatArray:
         """Map points (n, c + 1) of the unit cube to points (n, c): the first number chooses the component."""
@@ -127,7 +129,12 @@ def about(gaussian: Laplace) -> tuple[Mixture, Elliptical, Elliptical]:
 
 
 def first(wide: Mixture, student: Elliptical, normal: Elliptical) -> Proposal:
-    """Return the widest of proposals about a mode whose points would count if the posterior were Laplace's Gaussian."""
+    """Return the widest of proposals about a mode whose points would count if the posterior were Laplace's Gaussian.
+
+    Of several modes it is the one that knows them.
+    """
+    if len(wide.centres) > 1:
+        return wide
     x = normal.draw(sobol_points(0, 0, 0, TRIED, len(normal.centre) + 1))
     over = np.exp(normal.log_over_prior(x) - wide.log_over_prior(x))
     return wide if 1 / over.mean() >= WORTHWHILE else student

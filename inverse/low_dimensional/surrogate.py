@@ -254,6 +254,13 @@ class Cloud:
         return effective_sample_size(self.weights)
 
     @property
+    def log_evidence(self) -> float:
+        """Ln of the mean weight: ln Z by the polynomial."""
+        from scipy.special import logsumexp
+
+        return float(logsumexp(self.log_weights) - np.log(len(self.x)))
+
+    @property
     def error(self) -> float:
         """Standard error of the logarithm of the mean weight, from the scatter of the scrambles."""
         means = self.weights.reshape(SCRAMBLES, -1).mean(axis=1)

@@ -219,7 +219,7 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
                 model, steps = sampled.make() if method.chains == "hmc" else None, parts
     one = assess(
         found.posterior,
-        gaussian,
+        gaussian.knowing(searched, [k for k, name in enumerate(found.posterior.names) if name not in unknown]),
         samples,
         chains=method.chains,
         when=method.chains_when,

@@ -208,15 +208,16 @@ def missed(moved: FloatArray) -> FloatArray:
 
     With z the normal quantity of the same rank, the outermost ones are assumed to follow A exp(b (z − a)), a log-normal
     tail, of which A exp(b²/2 − ba) Φ(b − a) is beyond the quantile a at 1 − 1/n. If ln v bends downwards among them (an
-    end of the range, a kink), b is what its slope falls to. Of the squares of normal samples, `_covered` times their
-    standard error is beyond a, which is subtracted.
+    end of the range, a kink), b is what its slope falls to. The slope is told from thirds of them, of two or more each,
+    and not at all from fewer: of 12 samples, three single ones saw tails in one of seven sines. Of the squares of
+    normal samples, `_covered` times their standard error is beyond a, which is subtracted.
     """
     from scipy.special import ndtr, ndtri
 
     n = len(moved)
     k = int(OUTERMOST * n**0.75)
     third = k // 3
-    if third == 0:
+    if third < 2:
         return np.zeros(moved.shape[1])
     z, a = -ndtri((np.arange(1, k + 1) - 0.375) / (n + 0.25)), -ndtri(1 / n)
     ordered, size = np.sort(moved, axis=0), moved.std(axis=0)

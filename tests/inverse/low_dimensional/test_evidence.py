@@ -164,6 +164,35 @@ def test_models_that_end_somewhere_are_weighted_by_nothing_there():
     assert found.error < 0.15
 
 
+SYMMETRIC = {  # outputs, their slopes, means of the parameters, data, mean and standard deviation of each, ln Z
+    "squares": (lambda p: p**2, lambda p: np.diag(2 * p), 0.0, (1.0, 1.0), (0.0, 0.99493), -2.82263),
+    "sum and product": (
+        lambda p: np.array([p.sum(), p.prod()]), lambda p: np.array([[1.0, 1.0], p[::-1]]), 1.0, (3.0, 1.5),
+        (1.48431, 0.83085), -2.62137),
+    "cubic": (lambda p: p**3 - 3 * p, lambda p: np.diag(3 * p**2 - 3), 0.0, (0.3,), (-0.12801, 0.73639), -1.80655),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+def test_all_modes_count(name):
+    """Of two to four modes, by quadrature on a grid; where few searches have found two, more find the others."""
+    function, slopes, centre, data, (mean, std), log_evidence = SYMMETRIC[name]
+    names = tuple("ab"[: len(data)])
+    inputs = Inputs({one: Normal(mean=centre, std=1.0) for one in names})
+    model = FunctionModel(function, names, tuple("uv"[: len(data)]), slopes)
+    for seed in range(2):
+        whole = Posterior(inputs, SerialEvaluate(model), np.array(data), Noise(np.full(len(data), 0.1)))
+        mode = laplace(whole, starts=4, seed=seed)
+        found = evidence(whole, mode, 256, seed=seed)
+        assert found.trusted
+        assert len(mode.others[0]) + 1 >= {"squares": 4, "sum and product": 2, "cubic": 3}[name]
+        assert abs(found.log_evidence - log_evidence) < 4 * found.error < 0.4
+        x, weights = found.points
+        values = whole.physical(x)
+        np.testing.assert_allclose(weights @ values, mean, atol=0.06)
+        np.testing.assert_allclose(np.sqrt(weights @ (values - weights @ values) ** 2), std, rtol=0.05)
+
+
 def test_nested_sampling_agrees():
     pytest.importorskip("dynesty")
     model = FunctionModel(lambda p: [p[0], p[0] + p[1]], ("a", "b"), ("u", "v"), lambda p: [[1.0, 0.0], [1.0, 1.0]])
