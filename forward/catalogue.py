@@ -34,7 +34,8 @@ TABLE: dict[str, str | Words] = {
     "displacement-far": "{path} reaches {far}, more than the length of the body, {long}: is it given in another unit "
     "than metres?",
     "tool-small": "loads.{label} touches '{boundary}' over a radius of about {radius}, which is below the edges of "
-    "the cells there ({cell}): its force and pressure are rough. Refine the mesh there.",
+    "the cells there ({cell}): its force may be a third too large, its pressure is rough. Refine the mesh "
+    "there.",
     "tool-edge": "The edge of loads.{label} is rounded over {over}, less than the distance of the points at which "
     "contact is looked for on '{boundary}' ({apart}): where these pass it there are several equilibria, whose forces "
     "differ by up to 15 % on coarse meshes, and one of them is found. Refine the mesh there, or give it a rounder "

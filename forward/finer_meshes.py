@@ -5,9 +5,11 @@ mesh that is refined equally shares most of the error there. Finer meshes are qu
 body is linear, and never coarser than a few cells: the differences of linear or very coarse meshes tell neither how
 fast the error falls nor what is left of it (docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are
 halved, and graded as those of the body: the edge of the contact may be anywhere. Errors change their sign there as that
-edge passes lines of nodes, so that two meshes show no order: nothing is extrapolated. A mesh that does not contain the
-vertices of a random field has another field: cells of boxes and blocks with fields are divided, and again at the rims
-of what is held (`forward.bodies.tetrahedra`).
+edge passes lines of nodes, so that two meshes show no order: nothing is extrapolated. The coarser of them has 1.5 times
+the body's cells along edges: what two fine meshes differ by is of the size of their errors, where the body itself may
+have one cell in contact, or agree with one of them by chance. A mesh that does not contain the vertices of a random
+field has another field: cells of boxes and blocks with fields are divided, and again at the rims of what is held
+(`forward.bodies.tetrahedra`).
 """
 
 from __future__ import annotations
@@ -117,7 +119,7 @@ def on_mesh(spec: AnyBody, times: float, *, thin: bool = True) -> Any:
         body = within(quadratic, here, held(spec), layers)
     else:
         if _touched(spec):  # the edge of the contact decides, wherever that is
-            body = body.with_cells((2.0 if times > 1 else 1.0) / (2 if linear else 1))
+            body = body.with_cells((2.0 if times > 1 else TIMES) / (2 if linear else 1))
         elif not thin:
             body = body.with_cells(times / 2 if linear else times)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -205,6 +206,14 @@ class Measurements:
     def kinds(self) -> Ints:
         """A number (m,) for each pair of a part and a component or output."""
         return kinds(self.cases, self.axes)
+
+    @property
+    def curves(self) -> Ints:
+        """A number (m,) for each output, which is the same in all load cases and steps of a path; -1 of the others."""
+        found, rows = np.full(len(self), -1), ~self.placed
+        outputs = [re.sub(r"\.\d+$", "", name) for name in self.names[rows]]
+        found[rows] = np.unique(outputs, return_inverse=True)[1]
+        return found
 
     def neighbours(self) -> Neighbours:
         """Return pairs of neighbouring data that are the same, and of repeated measurements."""

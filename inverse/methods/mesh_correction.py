@@ -77,8 +77,8 @@ def error_of(
     if tangents is not None and look.tangents is not None:
         slopes = look.tangents - tangents
     error = look.outputs - outputs
-    root, apart = uncertain(error, look.between, data), OF_DATUM * beside(look.between, data)
-    return ModelError(point, error, slopes, root, apart)
+    root = np.concatenate([uncertain(error, look.between, data), along_curves(look, data)])
+    return ModelError(point, error, slopes, root, OF_DATUM * beside(look.between, data))
 
 
 def beside(between: FloatArray, data: Measurements) -> FloatArray:
@@ -88,9 +88,8 @@ def beside(between: FloatArray, data: Measurements) -> FloatArray:
     errors need not be.
     """
     squares = (between / data.sigma) ** 2
-    curves = ~data.placed
-    for axis in np.unique(data.axes[curves]):
-        rows = np.flatnonzero(curves & (data.axes == axis))
+    for curve in np.unique(data.curves[~data.placed]):
+        rows = np.flatnonzero(data.curves == curve)
         rows = rows[np.argsort(data.cases[rows], kind="stable")]
         pairs = np.pad(squares[rows], 1, constant_values=np.nan)
         squares[rows] = np.nanmean([pairs[:-2], pairs[1:-1], pairs[2:]], axis=0)
@@ -115,6 +114,20 @@ def uncertain(error: FloatArray, between: FloatArray, data: Measurements) -> Flo
     ]
     found = np.array(rows).reshape(-1, len(between))
     return np.asarray(found[np.abs(found).max(axis=1, initial=0.0) > 0])
+
+
+def along_curves(look: Look, data: Measurements) -> FloatArray:
+    """Return rows (k, m) of what is uncertain of outputs besides: a factor of each curve, as a stiffness would be.
+
+    Its size is the root mean square of the difference over that of the outputs, both over the noise. Where differences
+    change their sign along a curve, errors need not, and independent ones would vanish in a mean over many data.
+    """
+    mine = data.curves == np.unique(data.curves[~data.placed])[:, None]
+    mine = mine[[len(np.unique(data.kinds[row])) > 1 for row in mine]]
+    weights = mine / data.sigma
+    apart, sizes = (np.linalg.norm(weights * one, axis=1, keepdims=True) for one in (look.between, look.outputs))
+    share = np.divide(apart, sizes, out=np.zeros_like(sizes), where=sizes > 0)
+    return np.asarray(OF_DIFFERENCE * share * mine * look.outputs)
 
 
 def along(images: FloatArray, between: FloatArray, noise: Noise) -> FloatArray:
