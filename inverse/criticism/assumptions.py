@@ -12,7 +12,6 @@ Problems 30 (2014) 114007).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,7 +24,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, Guess, SolveError
 from forward.readable import number, told
 from inverse.criticism.finer import parameters_moved
-from inverse.data.measurements import AXES, Measurements
+from inverse.data.measurements import AXES, STEP_OF, Measurements
 from inverse.data.shared_motion import Shared
 from uq.evaluation.request import Evaluate, Request, Start
 
@@ -41,7 +40,6 @@ BENT = 0.2  # deviations by which second order may move an answer
 OFF = 3.0  # deviations from which on what the data say of it contradicts what is stated
 BESIDE = 0.05  # of a posterior deviation, by which points are beside the mode
 STEP = 1e-4  # of the extent of a body, by which points are moved for derivatives
-STEP_OF = re.compile(r"\.\d+$")  # which step of a path an output is of
 
 
 class Assumption(NamedTuple):

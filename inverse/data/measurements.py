@@ -22,6 +22,7 @@ FAR = 0.02  # of the extent of a body: median distance of points from which on t
 SAME = 1e-9  # of the extent of all points: distance within which points coincide
 LISTED = 5  # points that do not belong to a body
 COLUMNS = ("values", "sigma", "cases", "axes", "names", "labels", "places", "along", "points", "moved", "at")
+STEP_OF = re.compile(r"\.\d+$")  # which step of a path an output is of
 Ints = NDArray[np.int64]
 
 
@@ -211,7 +212,7 @@ class Measurements:
     def curves(self) -> Ints:
         """A number (m,) for each output, which is the same in all load cases and steps of a path; -1 of the others."""
         found, rows = np.full(len(self), -1), ~self.placed
-        outputs = [re.sub(r"\.\d+$", "", name) for name in self.names[rows]]
+        outputs = [STEP_OF.sub("", name) for name in self.names[rows]]
         found[rows] = np.unique(outputs, return_inverse=True)[1]
         return found
 

@@ -17,7 +17,6 @@ from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from inverse.criticism.assumptions import (
     PART,
-    STEP_OF,
     Ask,
     Assumption,
     Assumptions,
@@ -27,7 +26,7 @@ from inverse.criticism.assumptions import (
     of_data,
     of_outputs,
 )
-from inverse.data.measurements import Measurements
+from inverse.data.measurements import STEP_OF, Measurements
 from uq.findings import add
 from workflows.data.measured import observing, onto
 
