@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from forward.model import FloatArray, ModelError, SolveError
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from forward.specimen import Observed
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.data.measurements import Measurements
 from inverse.designs.fields import of_field
@@ -283,31 +282,21 @@ def of_outputs(spec: ModelSpec) -> Measurements:
 
 def known(spec: Any) -> Measurements | None:
     """Say what the values of a specimen are; None where nodes of a mesh from a file are observed."""
-    names, places, cases, parts = list[str](), list[FloatArray](), list[str](), list[str]()
-    for case in spec.cases:
-        for item in spec.seen(case):
-            points = _points(spec, item)
-            if points is None:
-                return None
-            names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(points)) for axis in item.components]
-            places += [point for point in points for _ in item.components]
-            parts += [axis for _ in points for axis in AXES if axis in item.components]
-        names += [f"{case.name}.{output.name}" for output in case.outputs]
-        places += [np.full(3, np.nan) for _ in case.outputs]
-        parts += [output.name for output in case.outputs]
-        cases += [case.name] * (len(names) - len(cases))
-    return Measurements.possible(names, np.array(places).reshape(-1, 3), cases, parts)
-
-
-def _points(spec: Any, item: Observed) -> FloatArray | None:
-    """Points (n, 3) at which displacements are measured: nodes of a side as they lie on a cube of cells of one size."""
-    if item.on is None:
-        return np.array(item.at)
-    cells = getattr(spec.body, "cells", None)
-    if cells is None or len(cells) != len(AXES) or item.on not in SIDES:
+    nodes: dict[str, Any] = {item.on: _nodes(spec.body, item.on) for item in spec.observed if item.on is not None}
+    if any(points is None for points in nodes.values()):
         return None
-    lines = [np.linspace(0.0, 1.0, spec.body.degree * n + 1) for n in cells]
-    axis, end = SIDES[item.on]
+    rows = list(spec.rows(nodes.__getitem__))
+    cases, names, axes, places = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return _possible(spec, names, np.array(places).reshape(-1, 3), cases, axes)
+
+
+def _nodes(body: Any, on: str) -> FloatArray | None:
+    """Places (n, 3) of the nodes of a side as they lie on a cube of cells of one size; None of other boundaries."""
+    cells = getattr(body, "cells", None)
+    if cells is None or len(cells) != len(AXES) or on not in SIDES:
+        return None
+    lines = [np.linspace(0.0, 1.0, body.degree * n + 1) for n in cells]
+    axis, end = SIDES[on]
     lines[axis] = lines[axis][[end]]
     return np.asarray(np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3))
 
@@ -316,12 +305,17 @@ def values_of(spec: Any, model: Any) -> Measurements:
     """Say of each output of a model what it is and where it is measured."""
     if not spec.placed:
         return of_outputs(spec)
-    cases = [spec.cases[number] for number in model.cases]
-    parts = [
-        AXES[axis] if axis < len(AXES) else case.outputs[axis - len(AXES)].name
-        for axis, case in zip(model.axes, cases, strict=True)
-    ]
-    return Measurements.possible(model.outputs, model.places, [case.name for case in cases], parts)
+    return _possible(spec, model.outputs, model.places, model.cases, model.axes)
+
+
+def _possible(
+    spec: Any, names: Sequence[str], places: FloatArray, cases: Iterable[int], axes: Iterable[int]
+) -> Measurements:
+    """Return what could be measured of a specimen: displacements along axes, or other outputs of load cases."""
+    of = [spec.cases[number] for number in cases]
+    each = zip(axes, of, strict=True)
+    parts = [AXES[k] if k < len(AXES) else case.outputs[k - len(AXES)].name for k, case in each]
+    return Measurements.possible(names, places, [case.name for case in of], parts)
 
 
 # --- a field of nodal values -----------------------------------------------------------------------------------------
