@@ -114,29 +114,22 @@ def _of_specimen(
     """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
     places, cells, kind = vertices
     found = list(study.measurements)
-    moves = [np.zeros(0) if m is None else m.moves for m in found]
+    moves, size = [np.zeros(0) if m is None else m.moves for m in found], record["place"].shape[1]
+    each = (np.zeros(0) if m is None else m.moved for m in found)  # how far (m) the point of each datum was moved
+    moved = [np.pad(one, (0, size - len(one)), constant_values=np.nan) for one in each]
     before = study.stiffness(places, prior_draws(study)).std(axis=0) if prior is None else np.sqrt(prior.variance)
     return {
         "points_moved": ("data_set", [int((one > 0).sum()) for one in moves]),
         "largest_move": ("data_set", [float(one.max(initial=0.0)) for one in moves]),
         "rms_move": ("data_set", [float(np.linalg.norm(one) / np.sqrt(max(len(one), 1))) for one in moves]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
-        "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
+        "datum_move": (("data_set", "datum"), np.array(moved)),
         "stiffness_prior_std": ("node", before),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
-
-
-def _moves(found: Sequence[Measurements | None], count: int) -> FloatArray:
-    """Return how far (n, count) the point of each datum was moved (m)."""
-    whole = np.full((len(found), count), np.nan)
-    for row, one in zip(whole, found, strict=True):
-        if one is not None:
-            row[: len(one)] = one.moved
-    return whole
 
 
 def _volumes(study: InversionBlocks, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
@@ -399,12 +392,9 @@ def arviz_groups(study: InversionBlocks, found: xr.Dataset) -> dict[str, xr.Data
     chains = max(counts.pop() if len(counts) == 1 and not study.field else 1, 1)
     each = found.sizes["sample"] // chains
 
-    def draws(name: str) -> Any:
-        values = of_set[name].isel(sample=slice(chains * each)).transpose("sample", ...)
-        shape = (chains, each, *values.shape[1:])
-        dims = ("chain", "draw", *values.dims[1:])
-        here = {key: value for key, value in values.coords.items() if "sample" not in value.dims}
-        return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
+    def draws(name: str) -> xr.DataArray:
+        whole = of_set[name].isel(sample=slice(chains * each)).coarsen(sample=each)
+        return whole.construct(sample=("chain", "draw"), keep_attrs=False).transpose("chain", "draw", ...)
 
     left: dict[str, xr.Dataset] = {}
     observed = {study.data.quantity: of_set["measured"]}
