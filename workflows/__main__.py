@@ -219,8 +219,7 @@ def _reduce(options: argparse.Namespace) -> int:
 
 def _run_study(options: argparse.Namespace, study: StudyKind, name: str) -> int:
     from forward.machine import SHARED_BY_RANKS, require_files
-    from workflows.run.run import run
-    from workflows.run.signals import heed
+    from workflows.run.run import heed, run
 
     if "mpi4py.MPI" not in sys.modules:  # or else it has its file
         require_files(SHARED_BY_RANKS, "MPI")

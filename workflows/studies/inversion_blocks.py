@@ -24,7 +24,7 @@ from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.assumptions import TakenForGranted, Uncertain
-from workflows.studies.model_errors import UNSEEN, truth_of
+from workflows.studies.candidates import UNSEEN, truth_of
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:

@@ -32,6 +32,7 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
 from workflows.studies.assumptions import ASSUMED, SAMPLED
+from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import (
     BATCH,
@@ -42,7 +43,6 @@ from workflows.studies.inversion_results import (
     table_of_finished,
 )
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
-from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 

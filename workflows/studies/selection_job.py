@@ -24,8 +24,8 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
 from workflows.studies.assumptions import ASSUMED, SAMPLED
+from workflows.studies.candidates import TRUTH
 from workflows.studies.job import MOVED, MethodJob, kept_starts
-from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
