@@ -27,11 +27,11 @@ from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
 from workflows.results.directory import completed, digest, read_dataset, read_summary, write_dataset, write_fields
+from workflows.results.summary import summarised
 from workflows.run import own_code
 from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress, in_notebook
-from workflows.run.summary import summarised
 from workflows.run.version import version
 from workflows.studies.job import Job
 from workflows.studies.solves import findings_of_solves
