@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 
 Priors = Annotated[
-    dict[str, Distribution],
-    BeforeValidator(written_out, json_schema_input_type=dict[str, Distribution | Sized]),
+    dict[str, Distribution], BeforeValidator(written_out, json_schema_input_type=dict[str, Distribution | Sized])
 ]
 """Distributions by path; x = { size = 64, kind = "normal", ... } are those of x.0 to x.63."""
 

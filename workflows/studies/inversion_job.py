@@ -34,14 +34,7 @@ from workflows.data.measured import motion_of, observing
 from workflows.studies.assumptions import ASSUMED, SAMPLED
 from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.inversion_results import (
-    BATCH,
-    Vertices,
-    batch_table,
-    dataset,
-    judged,
-    table_of_finished,
-)
+from workflows.studies.inversion_results import BATCH, Vertices, batch_table, dataset, judged, table_of_finished
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
@@ -238,11 +231,7 @@ def _problem(
 
 
 def _inverted(
-    study: InversionBlocks,
-    made: _Made,
-    problem: Problem[Invert],
-    evaluate: Recorder,
-    cheap: ForwardModel | None,
+    study: InversionBlocks, made: _Made, problem: Problem[Invert], evaluate: Recorder, cheap: ForwardModel | None
 ) -> xr.Dataset:
     """Invert a data set for few parameters, with a reduced model if there is one, which is `cheap`."""
     if cheap is None:

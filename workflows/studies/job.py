@@ -178,13 +178,7 @@ class TasksJob(Job):
                 self.solving.pop().forget()
 
         found = run_tasks(
-            ensemble,
-            self.names,
-            self.work,
-            checkpoint=checkpoint,
-            progress=progress,
-            arrived=self.arrived,
-            kept=kept,
+            ensemble, self.names, self.work, checkpoint=checkpoint, progress=progress, arrived=self.arrived, kept=kept
         )
         if found is None:
             return None

@@ -15,14 +15,7 @@ from uq.evaluation.request import OWN, company_of
 from workflows.accuracy import tolerance_words
 from workflows.accuracy.levers import COUNTS
 from workflows.config.priors import ranges
-from workflows.studies.predictions import (
-    NOT_ASKED,
-    PRODUCT,
-    duration,
-    mesh_check,
-    never_estimable,
-    times_of,
-)
+from workflows.studies.predictions import NOT_ASKED, PRODUCT, duration, mesh_check, never_estimable, times_of
 
 if TYPE_CHECKING:
     from inverse.data.measurements import Measurements
