@@ -169,7 +169,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         taken = {one: self.takes(one, values) for one in specs if self.uncertain}
         taken = {one: found for one, found in taken.items() if found.groups}
         if self.field:
-            return _of_field(method, self.spec, ensemble, checkpoint, model, values, taken.get(first))
+            return self._of_field(ensemble, checkpoint, model, values, taken.get(first))
         recorders: dict[str, Recorder] = {}
 
         def made(name: str) -> ForwardModel:
@@ -195,6 +195,49 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         makers: dict[str, Callable[[], ForwardModel]] = {one: partial(made, one) for one in others}
         makers |= {held[name]: partial(one.model, ensemble.group) for name, one in taken.items()}
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
+
+    def _of_field(
+        self, ensemble: Ensemble, checkpoint: Checkpoint, model: Any, values: Measurements, held: TakenForGranted | None
+    ) -> TasksJob:
+        """Each draw of the field is a task of one group."""
+        from forward.combine import Recorded
+        from uq.evaluation.kept import Kept, KeptSolves
+
+        method = self.method
+        spec: Any = self.spec
+        prior = spec.fields[0].prior(spec.body)
+        names = [f"draw {number}" for number in range(method.draws)]
+        solving: list[Kept] = []  # of the draw at hand
+        goals, assumed = method.candidates(values)[1], None
+        if held is not None:
+            assumed = held.of(held.data, by_model(held.model(ensemble.group)))
+
+        def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
+            solving.append(Kept(checkpoint, ensemble.group, names[number]))
+            kept = Recorded(model, KeptSolves(solving[-1], solved))
+            whitened = method.whitened(number, len(model.parameters))
+            try:
+                solution = kept.solve(prior.root(whitened))
+            except SolveError:
+                ensemble.count(1, 1)
+                raise
+            ensemble.count(1, 0)
+            sigma = method.sigma(values, solution.outputs[None])
+            mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
+            errors = np.zeros((0, len(values)))
+            if assumed is not None:
+                errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
+            parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
+            found = of_field(kept, solution, whitened, *parts)
+            return found if mesh is None else found.assign(mesh_error=("value", mesh))
+
+        def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
+            found = [one.dataset for one in outcomes if one.dataset is not None]
+            if not found:
+                raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
+            return method.of_fields(found, values, 0 if assumed is None else len(assumed.weights))
+
+        return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         return self.inputs.names if self.candidates is None else super().parameters_of(label)
@@ -316,57 +359,6 @@ def _possible(
     each = zip(axes, of, strict=True)
     parts = [AXES[k] if k < len(AXES) else case.outputs[k - len(AXES)].name for k, case in each]
     return Measurements.possible(names, places, [case.name for case in of], parts)
-
-
-# --- a field of nodal values -----------------------------------------------------------------------------------------
-
-
-def _of_field(
-    method: Design,
-    spec: Any,
-    ensemble: Ensemble,
-    checkpoint: Checkpoint,
-    model: ForwardModel,
-    values: Measurements,
-    taken: TakenForGranted | None,
-) -> TasksJob:
-    """Each draw of the field is a task of one group."""
-    from forward.combine import Recorded
-    from uq.evaluation.kept import Kept, KeptSolves
-
-    prior = spec.fields[0].prior(spec.body)
-    names = [f"draw {number}" for number in range(method.draws)]
-    solving: list[Kept] = []  # of the draw at hand
-    goals, assumed = method.candidates(values)[1], None
-    if taken is not None:
-        assumed = taken.of(taken.data, by_model(taken.model(ensemble.group)))
-
-    def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
-        solving.append(Kept(checkpoint, ensemble.group, names[number]))
-        kept = Recorded(model, KeptSolves(solving[-1], solved))
-        whitened = method.whitened(number, len(model.parameters))
-        try:
-            solution = kept.solve(prior.root(whitened))
-        except SolveError:
-            ensemble.count(1, 1)
-            raise
-        ensemble.count(1, 0)
-        sigma = method.sigma(values, solution.outputs[None])
-        mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
-        errors = np.zeros((0, len(values)))
-        if assumed is not None:
-            errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
-        parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
-        found = of_field(kept, solution, whitened, *parts)
-        return found if mesh is None else found.assign(mesh_error=("value", mesh))
-
-    def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
-        found = [one.dataset for one in outcomes if one.dataset is not None]
-        if not found:
-            raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
-        return method.of_fields(found, values, 0 if assumed is None else len(assumed.weights))
-
-    return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
 
 
 def uncalibrated(solution: Solution) -> FloatArray | None:
