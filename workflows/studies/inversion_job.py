@@ -212,22 +212,10 @@ def _problem(
         from workflows.studies.predicted import elsewhere_of
 
         elsewhere = elsewhere_of(study)
-    return Problem(
-        data,
-        study.method,
-        study.data.errors,
-        finer,
-        shared,
-        start,
-        model=seen.model,
-        say=ensemble.say,
-        steps=Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN,
-        assumed=assumed,
-        sampled=sampled,
-        questions=seen.questions,
-        truth=truth,
-        elsewhere=elsewhere,
-    )
+    steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
+    besides: dict[str, Any] = {"assumed": assumed, "sampled": sampled, "truth": truth, "elsewhere": elsewhere}
+    besides |= {"model": seen.model, "questions": seen.questions, "say": ensemble.say, "steps": steps}
+    return Problem(data, study.method, study.data.errors, finer, shared, start, **besides)
 
 
 def _inverted(
