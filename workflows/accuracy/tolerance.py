@@ -218,7 +218,6 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
 def within(
     study: SamplingBlocks,
     method: Method,
-    inputs: Inputs,
     evaluate: Evaluate,
     recorders: dict[str, Recorder],
     estimates: list[Evaluations],
@@ -226,17 +225,11 @@ def within(
 ) -> xr.Dataset:
     """Sample until mean and standard deviation of every output are within the tolerance, with their mesh errors.
 
-    It finds its solves where they are stored.
-
-    Parameters
-    ----------
-    recorders, estimates
-        Of the job, where evaluations are kept.
-    directory
-        Of the results: how the mesh was found stands there.
+    It finds its solves where they are stored, and keeps evaluations in the recorders and estimates of the job; how the
+    mesh was found stands in the directory of the results.
     """
+    inputs, unknown = study.inputs, tuple[Finding, ...]()
     asked, mesh, before = goal(study), None, history(directory)
-    unknown: tuple[Finding, ...] = ()
     if study.estimates and before is not None:
         try:
             centre = linearise(inputs, evaluate)

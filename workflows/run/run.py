@@ -39,7 +39,6 @@ from workflows.studies.solves import findings_of_solves
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.request import Evaluations
     from workflows.studies.study import StudyKind
 
 CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
@@ -147,7 +146,7 @@ def _run(
         own_code.keep(directory, study, loaded)
         took = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, took)
-        _leave(study, directory, dataset, evaluations, summary, checkpoint, job)
+        _leave(study, directory, dataset, summary, checkpoint, job)
         # What was found need not wait for pictures.
         sys.stdout.write("" if quiet else closing_words(dataset, summary, study))
         sys.stdout.flush()
@@ -190,13 +189,7 @@ def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
 
 
 def _leave(
-    study: StudyKind,
-    directory: Path,
-    dataset: xr.Dataset,
-    evaluations: dict[str, Evaluations],
-    summary: dict[str, Any],
-    checkpoint: Checkpoint,
-    job: Job,
+    study: StudyKind, directory: Path, dataset: xr.Dataset, summary: dict[str, Any], checkpoint: Checkpoint, job: Job
 ) -> None:
     """Write all results, in an order that is safe against a kill."""
     write_dataset(directory / "results.nc", dataset, study.arviz_groups(dataset))
@@ -204,7 +197,7 @@ def _leave(
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         write_text(directory / name, text)
-    checkpoint.consolidate(evaluations)
+    checkpoint.consolidate(job.evaluations)
     # The summary marks the study as finished: only then may the blocks be removed.
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")

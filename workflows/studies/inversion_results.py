@@ -45,15 +45,7 @@ SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
     """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
-    Parameters
-    ----------
-    study
-        The study.
-    outcomes
-        Of the inversions.
-    vertices
-        Places (N, 3) of the vertices of a specimen, cells (n_cells, k), and VTK's number of their kind; None of other
-        models.
+    Vertices of a specimen are places (N, 3), cells (n_cells, k), and VTK's number of their kind; None of other models.
     """
     import xarray as xr
 

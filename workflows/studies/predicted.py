@@ -125,14 +125,8 @@ def of_few(
 ) -> Record:
     """Return what the posterior of few parameters, in the dataset of its inversion, says on what is predicted.
 
-    Parameters
-    ----------
-    study, found
-        The study, and the results of the inversion.
-    evaluate, of_mesh
-        The model of what is predicted, for solves, and for estimates of the error of its mesh.
-    before
-        What the prior says.
+    The model of that has evaluations for solves, and for estimates of the error of its mesh; what the prior says of it
+    was found before.
     """
     names, labels = study.acting, tuple(study.predicts.groups)
     weights = found["point_weight"].to_numpy()
@@ -207,15 +201,7 @@ def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
 
 
 def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> FieldPredictions:
-    """Return what predicts from the posterior of a field of a data set.
-
-    Parameters
-    ----------
-    study
-        The study.
-    model
-        The model of what is predicted, whose solves are kept under a name.
-    """
+    """Return what predicts from the posterior of a field of a data set, by a model whose solves are kept by name."""
     prior, looked = study.model.fields[0].prior(study.model.body), study.method.treatment is not None
     pairs, seed, size = study.predicted_by // 2, study.method.seed, len(study.acting)
     known, others = _acting_of(study)
