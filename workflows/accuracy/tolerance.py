@@ -189,21 +189,12 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
             means = [row for row in rows if np.isfinite(row[2])]
             relative = float((np.nan_to_num(np.abs(estimate_of(data, "nominal").mesh)) / sizes[0]).max())
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
-        return Assessed(
-            study.spec.unknowns,
-            cells(study),
-            count,
-            float(shares.max()),
-            len(inputs.names),
-            recorder.outputs[column],
-            IN_WORDS[ESTIMATED[row]],
-            [] if close is None else close.tolist(),
-            [] if close is None else np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist(),
-            relative,
-            means,
-            recorder.solves,
-            recorder.seconds,
-        )
+        of = recorder.outputs[column], IN_WORDS[ESTIMATED[row]]
+        left: list[list[list[float]]] = [[], []]
+        if close is not None:
+            left = [close.tolist(), np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist()]
+        mesh = study.spec.unknowns, cells(study), count, float(shares.max()), len(inputs.names)
+        return Assessed(*mesh, *of, left[0], left[1], relative, means, recorder.solves, recorder.seconds)
 
     found = ensemble.run(model, task, checkpoint=checkpoint, blocks=study.parallel.blocks)
     result: Assessed | Exception = ensemble.world.bcast(found)

@@ -125,20 +125,12 @@ class DataFile(Settings):
         tests = self._tests(table, path)
         if not tests:
             raise DataError(f"data: {path}: no row is left; data.where and data.between say which ones are kept")
-        return {
-            "source": list(table.remarks),
-            "tests": [
-                {
-                    "mode": self.modes.get(word, word),
-                    "name": named(word, component),
-                    "group": group,
-                    "stress": self.stress,
-                    "component": component,
-                    **columns,
-                }
-                for (group, word, component), columns in tests.items()
-            ],
-        }
+        found = [
+            {"mode": self.modes.get(word, word), "name": named(word, component), "stress": self.stress}
+            | {"group": group, "component": component, **columns}
+            for (group, word, component), columns in tests.items()
+        ]
+        return {"source": list(table.remarks), "tests": found}
 
     def _table(self, path: Path) -> Table:
         """Read the table, which must have all columns that are named."""

@@ -174,16 +174,10 @@ def _methods(dataset: xr.Dataset) -> Part:
                 | {key: _number(of[f"{estimated}_{key}"]) for key in ("gain_solves", "gain_cpu", "gain_textbook")}
                 for estimated in ESTIMATED
             }
-        methods.setdefault(name, []).append(
-            {
-                "cost": int(row["solves"]),
-                "cpu_seconds": float(row["cpu_seconds"]),
-                "error": next(iter(outputs.values()))["mean"]["rmse"],
-                "budget": int(row["budget"]),
-                "derived": bool(row["derived"]),
-                "outputs": outputs,
-            }
-        )
+        error = next(iter(outputs.values()))["mean"]["rmse"]
+        told: Part = {"cost": int(row["solves"]), "cpu_seconds": float(row["cpu_seconds"]), "error": error}
+        told |= {"budget": int(row["budget"]), "derived": bool(row["derived"]), "outputs": outputs}
+        methods.setdefault(name, []).append(told)
     return {"methods": methods}
 
 

@@ -72,14 +72,9 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices, prior)
         if prior is not None:  # the first unknown is the mean over the body
             true[:, 0] = held["stiffness_true"][1] @ prior.matern.mass / prior.matern.mass.sum()
-    coordinates = {
-        "data_set": [item.name for item in study.data.sets],
-        "parameter": list(study.names),
-        "partner": list(study.names),
-        "case": list(study.parts),
-        "axis": ["x", "y", "z"],
-        "column": list(COLUMNS["field" if study.field else "parameters"]),
-    }
+    sets, names, columns = study.data.sets, list(study.names), COLUMNS["field" if study.field else "parameters"]
+    coordinates = {"data_set": [item.name for item in sets], "parameter": names, "partner": names}
+    coordinates |= {"case": list(study.parts), "axis": ["x", "y", "z"], "column": list(columns)}
     if study.taken is not None and "assumption_shift" in held:
         assumed = study.taken.shown
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}

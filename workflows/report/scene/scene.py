@@ -356,14 +356,8 @@ def packed(scene: Scene) -> tuple[str, str]:
         if not len(inside.triangles):
             continue
         mine = split(scene.points if inside.points is None else inside.points, inside.triangles)
-        entry = {
-            "name": inside.name,
-            "colour": COLOURS[inside.kind],
-            "opacity": inside.opacity,
-            "shown": inside.shown,
-            "outside": inside.kind == "tool",
-            "triangles": pack.add(mine.triangles),
-        }
+        entry = {"name": inside.name, "colour": COLOURS[inside.kind], "opacity": inside.opacity, "shown": inside.shown}
+        entry |= {"outside": inside.kind == "tool", "triangles": pack.add(mine.triangles)}
         if inside.points is None:
             entry["nodes"] = pack.add(number[mine.nodes])
         else:
