@@ -110,7 +110,14 @@ class DataFiles(Reading):
         StudyError
             If no file can be used.
         """
-        return read_files(self.files, folder, lambda path: read_measurement(path, model, self))
+
+        def known(path: Path) -> Measurements:
+            """Return data whose errors are known, with what is true."""
+            found = read_on(path, model, self).checked()
+            truth = {name: _known(name, value, path) for name, value in found.truth.items()}
+            return replace(found, truth=truth | self.truth)
+
+        return read_files(self.files, folder, known)
 
 
 class DisplacementFile(Reading):
@@ -273,18 +280,6 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     forces.check_signs(forces.names.tolist(), negative)
     truth = found.truth | {name: repr(value) for name, value in scan.truth.items()}
     return replace(found, between=scan.moved_between(found.unit), truth=truth)
-
-
-def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurements:
-    """Read a file of displacements of a specimen, whose errors are known, with what is true.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
-    """
-    found = read_on(path, model, data).checked()
-    return replace(found, truth={name: _known(name, value, path) for name, value in found.truth.items()} | data.truth)
 
 
 def _known(name: str, said: str, path: Path) -> Any:

@@ -180,8 +180,13 @@ def of_inversion(study: InversionBlocks) -> list[str]:
         unlooked = NOT_ASKED if study.model_error is None else study.unlooked
         once, checked = mesh_check(spec) if study.looked else (0.0, unlooked)
         lines.append(f"mesh check  {checked}")
-        seconds = (_seconds_of_outputs(study, len(counts)) if of_outputs else _seconds_of_specimen(study)) + own + once
-        time = f"about {duration(seconds + _seconds_of_predictions(study))} for each on 1 core (rough)"
+        seconds = own + once + _seconds_of_predictions(study)
+        if of_outputs:
+            cost = times_of(spec)
+            seconds += study.solves / len(counts) * (cost.sample + cost.tangents(len(study.inputs.names)) / 4)
+        else:
+            seconds += _seconds_of_specimen(study)
+        time = f"about {duration(seconds)} for each on 1 core (rough)"
     lines += [*_predicted(study), f"time        {time}"]
     lines += only_needed(method.chains, method.chains_when, method.chain_solves(size, field=study.field))
     lines += _learnt(study)
@@ -201,12 +206,6 @@ def _seconds_of_specimen(study: InversionBlocks) -> float:
     modes = SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD if field else 15 * method.starts
     draws = 2 * method.solves(0, field=True) if field else method.solves(size, field=False)
     return textbook * modes + each * (draws + method.chain_solves(size, field=field))
-
-
-def _seconds_of_outputs(study: InversionBlocks, count: int) -> float:
-    """Predict the processor time (s) of the solves for one of so many data sets of outputs."""
-    cost = times_of(study.spec)
-    return study.solves / count * (cost.sample + cost.tangents(len(study.inputs.names)) / 4)
 
 
 def _learnt(study: InversionBlocks) -> list[str]:
