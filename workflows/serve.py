@@ -23,14 +23,13 @@ import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from forward.external.models import PROTOCOL
-from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, displacements
+from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError, displacements
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
 from workflows.http import RefusalError, Server, listen
 
 if TYPE_CHECKING:
-    from forward.model import ForwardModel
     from forward.spec import ModelSpec
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.study import Sampled

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
-from forward.bodies.geometry import AXES, tolerance
+from forward.bodies.geometry import AXES, Body, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.files import meshes
@@ -28,7 +28,6 @@ from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
 
 if TYPE_CHECKING:
-    from forward.bodies.geometry import Body
     from forward.model import FloatArray, ForwardModel
     from forward.scalars import Mistake
     from forward.spec import ModelSpec

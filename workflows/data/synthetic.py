@@ -17,7 +17,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from forward.bodies.geometry import AXES
+from forward.bodies.geometry import AXES, Body
 from forward.bodies.inclusions import log_factor
 from forward.bodies.surface import Surface
 from inverse.data.curves import steps_of
@@ -26,7 +26,6 @@ from inverse.data.measurements import Measurements, kinds
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.bodies.geometry import Body
     from forward.fem.joined import SpecimenModel
     from forward.model import FloatArray
     from forward.spec import ModelSpec

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from forward.bodies.geometry import AXES
 from forward.findings import Finding
-from forward.model import FloatArray, ModelError, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
@@ -31,21 +31,17 @@ from workflows.data.designs import files
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import ASSUMED, TakenForGranted, Uncertain, of_none
 from workflows.studies.candidates import CandidateModel, OfCandidates
-from workflows.studies.job import MethodJob, TasksJob
+from workflows.studies.job import Job, MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import xarray as xr
 
-    from forward.model import ForwardModel, Solution
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate, Evaluations
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.job import Job
 
 
 ANY_MODEL = OfKind(MODELS, "specimen")

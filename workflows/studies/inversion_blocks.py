@@ -9,9 +9,9 @@ from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
-from forward.model import ModelError
+from forward.model import FloatArray, ModelError
 from forward.settings import Settings
-from forward.spec import MEASURED, SPECIMEN, usual_kind
+from forward.spec import MEASURED, SPECIMEN, ModelSpec, usual_kind
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
 from inverse.methods.model_error import LearntError
@@ -28,9 +28,7 @@ from workflows.studies.candidates import UNSEEN, truth_of
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
-    from forward.model import FloatArray
     from forward.reduced.spec import Reduced
-    from forward.spec import ModelSpec
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted

@@ -12,14 +12,14 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.combine import Recorded
-from forward.fem.finer import Keep, extrapolated
+from forward.fem.finer import FinerMeshes, Keep, extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.criticism.finer import Finer
-from inverse.data.shared_motion import together
-from inverse.methods.infer import Problem, Sampled
+from inverse.data.shared_motion import SharedMotion, together
+from inverse.methods.infer import Problem, Sampled, Starts
 from inverse.methods.invert import Invert, derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.model_error import Truth
@@ -42,11 +42,8 @@ from workflows.studies.solves import of_answers
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.finer import FinerMeshes
     from forward.joined_models import JoinedMeshes
     from inverse.criticism.questions import Questions
-    from inverse.data.shared_motion import SharedMotion
-    from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble

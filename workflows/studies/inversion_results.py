@@ -22,7 +22,7 @@ from inverse.data.shared_motion import said as said_of_motion
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, WORDS, stacked, usual_sizes
 from uq.findings import add
-from uq.inputs.distributions import Normal
+from uq.inputs.distributions import Distribution, Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
 from workflows.studies.assumptions import KEPT
 from workflows.studies.predictions import of_file
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from forward.bodies.random_fields import NodalPrior
     from inverse.data.measurements import Measurements
     from uq.evaluation.tasks import Outcome
-    from uq.inputs.distributions import Distribution
     from workflows.studies.inversion_blocks import InversionBlocks
 
 BATCH = "batch.csv"

@@ -13,27 +13,24 @@ from scipy.linalg import block_diag
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import in_words, shared_paths
+from forward.specimen import LoadCase, in_words, shared_paths
 from inverse.data.measurements import Measurements
-from inverse.fields.low_rank import Beside, symmetric_root
+from inverse.fields.low_rank import Beside, LowRankPosterior, symmetric_root
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
-from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED
+from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED, InversionBlocks, Predict
 from workflows.studies.predictions import has_mesh, never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.scalars import Mistake
-    from forward.specimen import LoadCase
-    from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
     from uq.evaluation.request import Evaluate
-    from workflows.studies.inversion_blocks import InversionBlocks, Predict
 
 # From the name of a data set, the posterior of its field, what corrects that, and what is uncertain beside.
 FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None", Beside], "Record"]

@@ -6,12 +6,11 @@ import math
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from forward.fem.cost import REPORT, START
+from forward.fem.cost import REPORT, START, Times
 from forward.finer_meshes import finer, graded
 from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
-    from forward.fem.cost import Times
     from forward.spec import ModelSpec
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps

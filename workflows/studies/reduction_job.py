@@ -14,7 +14,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.findings import Finding
-from forward.model import SolveError
+from forward.model import FloatArray, Solution, SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
@@ -33,7 +33,6 @@ from workflows.studies.reduction_blocks import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-    from forward.model import FloatArray, Solution
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import SolveError, Stability
+from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
 from uq.estimators import failure_domain
 from uq.estimators.estimate import holds, part
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.model import HyperelasticModel
-    from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs

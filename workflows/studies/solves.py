@@ -18,7 +18,7 @@ from forward.bodies.crossing import CREASED, deepest, least_stretch
 from forward.bodies.mesh import surface_of
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
-from forward.model import FloatArray, ReferenceSolution, SolveError
+from forward.model import FloatArray, ForwardModel, ReferenceSolution, Solution, SolveError
 from forward.readable import number, place, told, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.model import HyperelasticModel
-    from forward.model import ForwardModel, Solution
 
 Cell = Literal["tetrahedron", "hexahedron"]
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.bodies.geometry import AXES
+from forward.bodies.geometry import AXES, Vector
 from forward.model import FloatArray
 from forward.readable import number, scale
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, ON_DEEP, PLAIN, axes, finished, grid, text_of
@@ -16,8 +16,6 @@ from workflows.results.points import MeasuredPoints, displacements, measured_poi
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
-
-    from forward.bodies.geometry import Vector
 
 
 EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]  # of a box whose corners count in bits

@@ -10,7 +10,7 @@ import numpy as np
 
 from forward.bodies.geometry import AXES
 from forward.hyperelastic import Path as PathOfLoads
-from forward.model import SolveError
+from forward.model import FloatArray, SolveError
 from forward.readable import and_error, named, number, size, spoken
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
 from workflows.report.plots import outputs
@@ -20,7 +20,6 @@ from workflows.report.section import Results, section
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import FloatArray
     from forward.specimen import Specimen
     from workflows.report.scene.scene import Scene
 
