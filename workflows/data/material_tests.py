@@ -21,6 +21,8 @@ from workflows.config.tables import at
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 WHOLE = "all"  # name of the group if there is only one
+SHORTENED = 0.9  # stretch below which no error of measurement makes a compression a tension
+LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
 class MeasuredTest(MaterialTest):
@@ -63,10 +65,6 @@ class MeasuredTest(MaterialTest):
             )
             raise ValueError(message)
         return self
-
-
-SHORTENED = 0.9  # stretch below which no error of measurement makes a compression a tension
-LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
 class DataFile(Settings):

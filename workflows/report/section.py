@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 Content = Callable[["Results"], Iterator[Block]]
 DRAWN = 24  # outputs with pictures
 ROWS = 40  # parameters from which on a table is in the order of their effects
+_HERE = "workflows.report.sections"
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,6 @@ def section(
     return made
 
 
-_HERE = "workflows.report.sections"
 SECTIONS = Kinds(
     "section",
     {

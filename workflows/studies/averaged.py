@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from uq.inputs.draws import Draws
 
 LEAST = 1e-3  # probability of candidates that are left out
+AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
 
 
 class AveragedStudy(Study):
@@ -163,9 +164,6 @@ class AveragedStudy(Study):
                 yield place, f"of a candidate, {line}", said
         except ValueError as error:
             yield place, str(error), said
-
-
-AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
 
 
 def _told(dataset: xr.Dataset) -> xr.Dataset:

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from workflows.studies.predicted import FieldPredictions
 
 BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
+On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
 def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
@@ -182,9 +183,6 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
         return {BATCH: batch_table(found)}
 
     return {"labelled": labelled, "texts": texts}
-
-
-On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
 def _problem(

@@ -39,6 +39,9 @@ BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
+STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
+EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
+NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
 
 
 def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
@@ -296,11 +299,6 @@ def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Findi
 
 
 # --- batch.csv, and ArviZ's groups -----------------------------------------------------------------------------------
-
-
-STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
-EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
-NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
 
 
 def batch_table(found: xr.Dataset) -> str:

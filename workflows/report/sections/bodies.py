@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 DRAWN = 8  # data sets that have more than a row in the table
 STILLS = 2  # pictures for paper
+LEAST = 3  # places that make a map
+MISSES = ("measured", "predicted", "residual over its error")
 
 
 def _body_applies(results: Results) -> bool:
@@ -150,9 +152,6 @@ def curve(results: Results) -> Iterator[Block]:
     yield Pictures.of(*drawn)
 
 
-LEAST = 3  # places that make a map
-
-
 # If outputs of load cases of a specimen were inverted.
 @section("datum_axis", heading="Forces", when=lambda results: bool((results.dataset["datum_axis"] >= len(AXES)).any()))
 def places(results: Results) -> Iterator[Block]:
@@ -194,9 +193,6 @@ def places_of(model: Specimen) -> dict[str, FloatArray]:
         if len(tools) == 1:
             found[case.name] = np.array(tools[0].at, dtype=float)
     return found
-
-
-MISSES = ("measured", "predicted", "residual over its error")
 
 
 def misses(datum: xr.Dataset, unit: str, like: float | None = None) -> Iterator[str]:

@@ -23,6 +23,16 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
 
 TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
+SHOWN = 24  # rows of the table of a data set
+SETS = 12  # data sets that have a table
+PREDICTED = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
+WORTH = {
+    "information": "What they tell (nat)",
+    "parameters": "Share of the parameters' variances that they take away",
+    "predictions": "Share of the predictions' variances that they take away",
+    "models": "Expected ln Bayes factor of the true model (nat)",
+}
+FIRST = 5  # observations on the card
 
 
 @section("alone_eigenvalue", heading="All data sets", when=lambda results: results.dataset.sizes["data_set"] > 1)
@@ -51,11 +61,6 @@ def batch(results: Results) -> Iterator[Block]:
     units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     yield Table(head, rows, text={0, 2})
-
-
-SHOWN = 24  # rows of the table of a data set
-SETS = 12  # data sets that have a table
-PREDICTED = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
 
 
 @section("prediction_share", heading="Predictions")
@@ -190,15 +195,6 @@ def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray
     found = np.interp(np.log(sizes), at, curve) / sizes
     order = np.argsort(sign * sizes)
     return (sign * sizes)[order], found[order]
-
-
-WORTH = {
-    "information": "What they tell (nat)",
-    "parameters": "Share of the parameters' variances that they take away",
-    "predictions": "Share of the predictions' variances that they take away",
-    "models": "Expected ln Bayes factor of the true model (nat)",
-}
-FIRST = 5  # observations on the card
 
 
 @section("chosen", heading="Which observations tell most")
