@@ -186,13 +186,7 @@ class Server(Listening):
 
 
 def listen(host: str, port: int, option: str) -> socket.socket:
-    """Return a socket at a port; 0 is any free one.
-
-    Raises
-    ------
-    StudyError
-        If it is taken.
-    """
+    """Return a socket at a port, where 0 is any free one; a StudyError if it is taken."""
     try:
         return socket.create_server((host, port))
     except OverflowError as error:

@@ -62,10 +62,7 @@ class Service:
     def answer(self, what: str, question: dict[str, Any]) -> dict[str, Any]:
         """Answer a request, such as "Evaluate" with its fields.
 
-        Raises
-        ------
-        RefusalError
-            If it is not of the protocol, or the model has no answer.
+        A RefusalError says that it is not of the protocol, or that the model has no answer.
         """
         if what == "Info":
             return {"protocolVersion": PROTOCOL, "models": [NAME]}

@@ -182,10 +182,7 @@ class Source(Settings):
     def draws_of(self, scalars: Mapping[str, Scalar]) -> Draws | None:
         """Return the draws by paths of numbers of the model; None if there are none.
 
-        Raises
-        ------
-        ValueError
-            If they are no distribution: too few, constant, or linearly dependent.
+        A ValueError says that they are no distribution: too few, constant, or linearly dependent.
         """
         from uq.inputs.draws import Draws
 

@@ -113,10 +113,7 @@ class DataFile(Settings):
     def read(self, folder: Path) -> dict[str, Any]:
         """Return the block `data` with the tests themselves.
 
-        Raises
-        ------
-        DataError
-            If the table cannot be read, lacks a column, or holds something that is not a number.
+        A DataError says that the table cannot be read, lacks a column, or holds something that is not a number.
         """
         path = folder / self.file
         table = self._table(path)

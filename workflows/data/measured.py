@@ -102,13 +102,7 @@ class DataFiles(Reading):
         yield from ()
 
     def read(self, folder: Path, model: Any) -> Found:
-        """Read the files, in a folder or in the working directory, of displacements of a specimen.
-
-        Raises
-        ------
-        StudyError
-            If no file can be used.
-        """
+        """Read the files, in a folder or the working directory, of a specimen; a StudyError if none can be used."""
 
         def known(path: Path) -> Measurements:
             """Return data whose errors are known, with what is true."""
@@ -178,13 +172,7 @@ def read_files(names: Sequence[str], folder: Path, read: Callable[[Path], Any]) 
 
 
 def scan_of(path: Path, usual: Reading) -> Scan:
-    """Return the scan that a file is, or describes; what it does not say is as usual.
-
-    Raises
-    ------
-    DataError
-        If a description is none.
-    """
+    """Return the scan that a file is, or describes, else as usual; a DataError if a description is none."""
     known = {name: getattr(usual, name) for name in Reading.model_fields if name in usual.model_fields_set}
     if path.suffix not in SCANS:
         return Scan(**known, file=path.name)
@@ -253,12 +241,7 @@ def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
 def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     """Read a scan, and put it on the body of a specimen; standard deviations may still be unknown.
 
-    What its description does not say is as usual.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the files.
+    What its description does not say is as usual; a DataError says every kind of mistake in the files.
     """
     scan, body = scan_of(path, usual), specimen.body
     found = read(path.parent, scan, specimen.measurable)

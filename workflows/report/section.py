@@ -289,13 +289,7 @@ def of_study(report: Report | None) -> dict[str, Section]:
 
 
 def sections(report: Report | None = None) -> list[tuple[str, Section]]:
-    """Return all sections by name, in the order of the page; those that a study asks for too.
-
-    Raises
-    ------
-    StudyError
-        As in `of_study`.
-    """
+    """Return all sections by name, in the order of the page, with those of a study; errors as of `of_study`."""
     others = {name: SECTIONS[name]() for name in SECTIONS.names if name not in SECTIONS.own} | of_study(report)
     placed: list[tuple[str, Section]] = []
     for name in SECTIONS.own:

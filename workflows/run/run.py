@@ -255,12 +255,9 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> 
 
 
 def _hold(directory: Path, held: ExitStack) -> None:
-    """Lock a directory until `held` is closed or the process ends; file systems without locks are left alone.
+    """Lock a directory until `held` is closed or the process ends; a StudyError if another run has it.
 
-    Raises
-    ------
-    StudyError
-        If another run has it.
+    File systems without locks are left alone.
     """
     handle = os.open(directory, os.O_RDONLY)
     held.callback(os.close, handle)

@@ -156,13 +156,7 @@ def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def truth_of(model: Mapping[str, Any] | ModelSpec, learnt: LearntError, parameters: Mapping[str, Any]) -> ModelSpec:
-    """Return the other model, given that of the study, in the form that suits all values of its parameters.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        If it is none.
-    """
+    """Return the other model, in the form that suits all values of its parameters; a ValidationError if it is none."""
     own = model.model_dump(mode="json", exclude_none=True) if isinstance(model, ModelSpec) else model
     made = SPEC.validate_python(changed({"model": own}, {"model": learnt.against})["model"])
     return made.over(ranges({name: one for name, one in parameters.items() if name in made.scalars}))

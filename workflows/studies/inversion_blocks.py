@@ -156,12 +156,7 @@ class InversionBlocks(OneModel):
     def reduced(self) -> dict[str, Reduced]:
         """The reduced models that stand for the load cases of a specimen, by name, or for the model, as "".
 
-        None where the model is asked itself.
-
-        Raises
-        ------
-        ValueError
-            If a file cannot be used.
+        There are none where the model is asked itself; a ValueError says that a file cannot be used.
         """
         asked = self.method.reduced
         if asked is None:

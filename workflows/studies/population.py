@@ -160,13 +160,7 @@ class PopulationStudy(FromPython, StudyKind):
 
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
-    """Return the study of a specimen of a population, with another prior.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or its data are not there any more.
-    """
+    """Return the study of a specimen, with another prior; a ValueError if there is none, or its data are not there."""
     from workflows.config.study import parse
 
     method = study.method
