@@ -301,14 +301,8 @@ def _of_gradients(names: list[str], gradients: FloatArray, places: FloatArray) -
     Where two places of a body have nearly the same largest value, that has a kink: a model may take the other place,
     with another gradient. So they are told for all samples, and for those at which the place is the same.
 
-    Parameters
-    ----------
-    names
-        The outputs.
-    gradients
-        Those of the body, and what is off before and after correction (3, n, m, d).
-    places
-        Numbers (3, n, m) of the places of largest values, in the same order.
+    Gradients (3, n, m, d) are those of the body, and what is off before and after correction; numbers (3, n, m) of the
+    places of largest values are in the same order.
     """
     sizes = (gradients**2).sum(axis=3)
     told: dict[str, Any] = {}
