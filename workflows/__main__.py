@@ -125,13 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument("--quiet", action="store_true", help="print nothing but errors")
     for command in (check, run, solve, reduce, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
-        command.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="KEY=VALUE",
-            help="change one value, such as method.samples=512",
-        )
+        said = "change one value, such as method.samples=512"
+        command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=said)
     for command, name in ((run, "STUDY"), (reduce, "STUDY-reduced")):
         command.add_argument("--out", type=Path, metavar="DIR", help=f"results directory (default: results/{name})")
         command.add_argument(
@@ -219,8 +214,7 @@ def _reduce(options: argparse.Namespace) -> int:
 
 def _run_study(options: argparse.Namespace, study: StudyKind, name: str) -> int:
     from forward.machine import SHARED_BY_RANKS, require_files
-    from workflows.run.run import run
-    from workflows.run.signals import heed
+    from workflows.run.run import heed, run
 
     if "mpi4py.MPI" not in sys.modules:  # or else it has its file
         require_files(SHARED_BY_RANKS, "MPI")

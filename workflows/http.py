@@ -27,6 +27,7 @@ SECONDS_TO_SEND = 30.0  # within which a client must send its whole request and 
 LARGEST = 16 * 2**20  # bytes of a request
 DEEPEST = 32  # levels of lists and tables in a request
 MOST_WAITING = 1024  # requests that wait to be answered
+Ask = Callable[[str, dict[str, Any]], dict[str, Any]]  # what, with which fields
 
 
 class RefusalError(Exception):
@@ -35,9 +36,6 @@ class RefusalError(Exception):
     def __init__(self, message: str, kind: str = "InvalidInput", status: int = 400) -> None:
         super().__init__(message)
         self.kind, self.status = kind, status
-
-
-Ask = Callable[[str, dict[str, Any]], dict[str, Any]]  # what, with which fields
 
 
 class _Deadline(io.RawIOBase):
@@ -188,13 +186,7 @@ class Server(Listening):
 
 
 def listen(host: str, port: int, option: str) -> socket.socket:
-    """Return a socket at a port; 0 is any free one.
-
-    Raises
-    ------
-    StudyError
-        If it is taken.
-    """
+    """Return a socket at a port, where 0 is any free one; a StudyError if it is taken."""
     try:
         return socket.create_server((host, port))
     except OverflowError as error:

@@ -23,14 +23,13 @@ import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from forward.external.models import PROTOCOL
-from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, displacements
+from forward.model import FloatArray, ForwardModel, Guess, ModelError, Solution, SolveError, displacements
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
 from workflows.http import RefusalError, Server, listen
 
 if TYPE_CHECKING:
-    from forward.model import ForwardModel
     from forward.spec import ModelSpec
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.study import Sampled
@@ -63,10 +62,7 @@ class Service:
     def answer(self, what: str, question: dict[str, Any]) -> dict[str, Any]:
         """Answer a request, such as "Evaluate" with its fields.
 
-        Raises
-        ------
-        RefusalError
-            If it is not of the protocol, or the model has no answer.
+        A RefusalError says that it is not of the protocol, or that the model has no answer.
         """
         if what == "Info":
             return {"protocolVersion": PROTOCOL, "models": [NAME]}

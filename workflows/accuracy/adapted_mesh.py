@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,21 +51,12 @@ def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
 
     assert found.mesh is not None
     assert found.indicators is not None
-    history = {
-        "outputs": [output.name for output in study.model.outputs],
-        "cycles": [
-            {
-                "cells": cycle.cells,
-                "unknowns": cycle.unknowns,
-                "values": cycle.values,
-                "errors": [None if np.isnan(error) else error for error in cycle.errors],
-                "factors": cycle.factors,
-                "cpu_seconds": cycle.seconds,
-            }
-            for cycle in found.cycles
-        ],
-        "stopped": found.stopped,
-    }
+    cycles = [asdict(cycle) for cycle in found.cycles]
+    for one in cycles:
+        one["errors"] = [None if np.isnan(error) else error for error in one["errors"]]
+        one["cpu_seconds"] = one.pop("seconds")
+    names = [output.name for output in study.model.outputs]
+    history = {"outputs": names, "cycles": cycles, "stopped": found.stopped}
     write_text(path.with_name(HISTORY), json.dumps(history, indent=2, ensure_ascii=False) + "\n")
     write_whole(path, packed(found.mesh, found.indicators))
 

@@ -312,7 +312,9 @@ class MeshLever:
         now, degree = seen[-1], int(self.first.solid.body.degree)
         if not math.isfinite(now.share):
             return None
-        shown = rate_seen(seen, degree, self.dimension)
+        known = {one.unknowns: one.size for one in seen if one.size > 0}
+        # Coarse meshes may show too little: no rate is believed to be less than what is assumed elsewhere.
+        shown = _rate(sorted(known.items()), RATE, 2 * degree, self.dimension)
         rate = 2.0 * degree if shown is None else shown
         least = self._least_share(now, rate)
         if least <= HOPELESS:
@@ -354,15 +356,6 @@ def rate_of(meshes: Sequence[Assessed]) -> float:
     """The rate at which errors fall with the size of cells, by the last two meshes."""
     known = {factor(meshes[0].cells, one.cells): one.size for one in meshes if one.size > 0}
     return _rate(list(known.items()), *RATES) or RATE
-
-
-def rate_seen(meshes: Sequence[Assessed], degree: int, d: int) -> float | None:
-    """Return the rate at which errors fall with the size of cells in d directions, by two meshes; None of one.
-
-    Coarse meshes may show too little: none is believed to be less than what is assumed elsewhere.
-    """
-    known = {one.unknowns: one.size for one in meshes if one.size > 0}
-    return _rate(sorted(known.items()), RATE, 2 * degree, d)
 
 
 def _rate(known: Sequence[tuple[float, float]], least: float, most: float, d: int = 1) -> float | None:

@@ -189,21 +189,12 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
             means = [row for row in rows if np.isfinite(row[2])]
             relative = float((np.nan_to_num(np.abs(estimate_of(data, "nominal").mesh)) / sizes[0]).max())
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
-        return Assessed(
-            study.spec.unknowns,
-            cells(study),
-            count,
-            float(shares.max()),
-            len(inputs.names),
-            recorder.outputs[column],
-            IN_WORDS[ESTIMATED[row]],
-            [] if close is None else close.tolist(),
-            [] if close is None else np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist(),
-            relative,
-            means,
-            recorder.solves,
-            recorder.seconds,
-        )
+        of = recorder.outputs[column], IN_WORDS[ESTIMATED[row]]
+        left: list[list[list[float]]] = [[], []]
+        if close is not None:
+            left = [close.tolist(), np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist()]
+        mesh = study.spec.unknowns, cells(study), count, float(shares.max()), len(inputs.names)
+        return Assessed(*mesh, *of, left[0], left[1], relative, means, recorder.solves, recorder.seconds)
 
     found = ensemble.run(model, task, checkpoint=checkpoint, blocks=study.parallel.blocks)
     result: Assessed | Exception = ensemble.world.bcast(found)
@@ -218,7 +209,6 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
 def within(
     study: SamplingBlocks,
     method: Method,
-    inputs: Inputs,
     evaluate: Evaluate,
     recorders: dict[str, Recorder],
     estimates: list[Evaluations],
@@ -226,17 +216,11 @@ def within(
 ) -> xr.Dataset:
     """Sample until mean and standard deviation of every output are within the tolerance, with their mesh errors.
 
-    It finds its solves where they are stored.
-
-    Parameters
-    ----------
-    recorders, estimates
-        Of the job, where evaluations are kept.
-    directory
-        Of the results: how the mesh was found stands there.
+    It finds its solves where they are stored, and keeps evaluations in the recorders and estimates of the job; how the
+    mesh was found stands in the directory of the results.
     """
+    inputs, unknown = study.inputs, tuple[Finding, ...]()
     asked, mesh, before = goal(study), None, history(directory)
-    unknown: tuple[Finding, ...] = ()
     if study.estimates and before is not None:
         try:
             centre = linearise(inputs, evaluate)

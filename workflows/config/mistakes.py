@@ -18,6 +18,23 @@ from uq.inputs.distributions import Distribution
 
 LISTED = 50  # mistakes that are shown
 MANY = 3  # alike, of elements of a vector
+# What pydantic adds to the locations of mistakes besides keys: the members of a union, in TOML's words.
+_MEMBERS = {
+    "str": "a text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "tuple": "a list",
+    "list": "a list",
+    "dict": "a table",
+}
+_ELEMENT = re.compile(r"\.\d+\b(?=[.:])")  # of a vector
+_MEMBER = re.compile(rf"({'|'.join(_MEMBERS)})(\[.*\])?$")
+_INNER = re.compile(
+    r"\[key\]$|(function-|tagged-union|literal|constrained|lax-or|nullable|is-instance|model|chain|json)\S*\["
+)
+_ELSEWHERE = {"mesh_error": "accuracy.mesh_error"}  # keys that are looked for in several blocks, and where they stand
+_WORD = 60  # letters of a key in a message
 
 
 class StudyError(Error):
@@ -49,23 +66,6 @@ def not_installed(key: str, given: str, packages: Sequence[str]) -> Iterator[Mis
     for package in packages:
         if find_spec(package) is None:
             yield ("method", key), f"needs {package}, which is not installed: pip install {package}", given
-
-
-# What pydantic adds to the locations of mistakes besides keys: the members of a union, in TOML's words.
-_MEMBERS = {
-    "str": "a text",
-    "float": "a number",
-    "int": "a whole number",
-    "bool": "true or false",
-    "tuple": "a list",
-    "list": "a list",
-    "dict": "a table",
-}
-_ELEMENT = re.compile(r"\.\d+\b(?=[.:])")  # of a vector
-_MEMBER = re.compile(rf"({'|'.join(_MEMBERS)})(\[.*\])?$")
-_INNER = re.compile(
-    r"\[key\]$|(function-|tagged-union|literal|constrained|lax-or|nullable|is-instance|model|chain|json)\S*\["
-)
 
 
 def lines(error: ValidationError, place: str = "", apart: Sequence[str] = ()) -> list[str]:
@@ -133,10 +133,6 @@ def _line(item: Any, place: str, apart: Sequence[str]) -> str:
     ):  # a whole block, of which the message names the part
         return message
     return f"{message}; given {shown(given)}"
-
-
-_ELSEWHERE = {"mesh_error": "accuracy.mesh_error"}  # keys that are looked for in several blocks, and where they stand
-_WORD = 60  # letters of a key in a message
 
 
 def _kinds() -> set[str]:

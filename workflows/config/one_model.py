@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 
 Priors = Annotated[
-    dict[str, Distribution],
-    BeforeValidator(written_out, json_schema_input_type=dict[str, Distribution | Sized]),
+    dict[str, Distribution], BeforeValidator(written_out, json_schema_input_type=dict[str, Distribution | Sized])
 ]
 """Distributions by path; x = { size = 64, kind = "normal", ... } are those of x.0 to x.63."""
 
@@ -183,10 +182,7 @@ class Source(Settings):
     def draws_of(self, scalars: Mapping[str, Scalar]) -> Draws | None:
         """Return the draws by paths of numbers of the model; None if there are none.
 
-        Raises
-        ------
-        ValueError
-            If they are no distribution: too few, constant, or linearly dependent.
+        A ValueError says that they are no distribution: too few, constant, or linearly dependent.
         """
         from uq.inputs.draws import Draws
 

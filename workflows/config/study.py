@@ -26,6 +26,15 @@ LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smalle
 MOST_LINES = 50
 REDUCED = "reduced"  # the kind of a model that is a file
 _OPTIONS = "model.config"  # of another program's model, of which nothing is known
+# A part of a dotted key: in quotes, or without dots.
+QUOTED = re.compile(r"""(?:^|\.)(?:"([^"]*)"|'([^']*)'|([^."']+))""")
+# Files that count by their contents, not their path.
+_FILES = {
+    "model.body.contents.digest": "model.body.file",
+    "model.digest": "model.file",
+    "method.reduced.digest": "method.reduced.file",
+    "parameters.from.digest": "parameters.from.file",
+}
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> StudyKind:
@@ -227,18 +236,6 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         for place in places
         if before.get(place) != after.get(place)
     ]
-
-
-# A part of a dotted key: in quotes, or without dots.
-QUOTED = re.compile(r"""(?:^|\.)(?:"([^"]*)"|'([^']*)'|([^."']+))""")
-
-# Files that count by their contents, not their path.
-_FILES = {
-    "model.body.contents.digest": "model.body.file",
-    "model.digest": "model.file",
-    "method.reduced.digest": "method.reduced.file",
-    "parameters.from.digest": "parameters.from.file",
-}
 
 
 def _override(blocks: dict[str, Any], assignment: str) -> None:

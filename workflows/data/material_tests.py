@@ -21,6 +21,8 @@ from workflows.config.tables import at
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 WHOLE = "all"  # name of the group if there is only one
+SHORTENED = 0.9  # stretch below which no error of measurement makes a compression a tension
+LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
 class MeasuredTest(MaterialTest):
@@ -63,10 +65,6 @@ class MeasuredTest(MaterialTest):
             )
             raise ValueError(message)
         return self
-
-
-SHORTENED = 0.9  # stretch below which no error of measurement makes a compression a tension
-LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
 class DataFile(Settings):
@@ -115,30 +113,19 @@ class DataFile(Settings):
     def read(self, folder: Path) -> dict[str, Any]:
         """Return the block `data` with the tests themselves.
 
-        Raises
-        ------
-        DataError
-            If the table cannot be read, lacks a column, or holds something that is not a number.
+        A DataError says that the table cannot be read, lacks a column, or holds something that is not a number.
         """
         path = folder / self.file
         table = self._table(path)
         tests = self._tests(table, path)
         if not tests:
             raise DataError(f"data: {path}: no row is left; data.where and data.between say which ones are kept")
-        return {
-            "source": list(table.remarks),
-            "tests": [
-                {
-                    "mode": self.modes.get(word, word),
-                    "name": named(word, component),
-                    "group": group,
-                    "stress": self.stress,
-                    "component": component,
-                    **columns,
-                }
-                for (group, word, component), columns in tests.items()
-            ],
-        }
+        found = [
+            {"mode": self.modes.get(word, word), "name": named(word, component), "stress": self.stress}
+            | {"group": group, "component": component, **columns}
+            for (group, word, component), columns in tests.items()
+        ]
+        return {"source": list(table.remarks), "tests": found}
 
     def _table(self, path: Path) -> Table:
         """Read the table, which must have all columns that are named."""

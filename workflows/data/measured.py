@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
-from forward.bodies.geometry import AXES, tolerance
+from forward.bodies.geometry import AXES, Body, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.surface import Surface
 from forward.files import meshes
@@ -28,7 +28,6 @@ from inverse.data.table import DataError, needed
 from workflows.config.mistakes import StudyError, lines
 
 if TYPE_CHECKING:
-    from forward.bodies.geometry import Body
     from forward.model import FloatArray, ForwardModel
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
@@ -103,14 +102,15 @@ class DataFiles(Reading):
         yield from ()
 
     def read(self, folder: Path, model: Any) -> Found:
-        """Read the files, in a folder or in the working directory, of displacements of a specimen.
+        """Read the files, in a folder or the working directory, of a specimen; a StudyError if none can be used."""
 
-        Raises
-        ------
-        StudyError
-            If no file can be used.
-        """
-        return read_files(self.files, folder, lambda path: read_measurement(path, model, self))
+        def known(path: Path) -> Measurements:
+            """Return data whose errors are known, with what is true."""
+            found = read_on(path, model, self).checked()
+            truth = {name: _known(name, value, path) for name, value in found.truth.items()}
+            return replace(found, truth=truth | self.truth)
+
+        return read_files(self.files, folder, known)
 
 
 class DisplacementFile(Reading):
@@ -172,13 +172,7 @@ def read_files(names: Sequence[str], folder: Path, read: Callable[[Path], Any]) 
 
 
 def scan_of(path: Path, usual: Reading) -> Scan:
-    """Return the scan that a file is, or describes; what it does not say is as usual.
-
-    Raises
-    ------
-    DataError
-        If a description is none.
-    """
+    """Return the scan that a file is, or describes, else as usual; a DataError if a description is none."""
     known = {name: getattr(usual, name) for name in Reading.model_fields if name in usual.model_fields_set}
     if path.suffix not in SCANS:
         return Scan(**known, file=path.name)
@@ -247,12 +241,7 @@ def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
 def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     """Read a scan, and put it on the body of a specimen; standard deviations may still be unknown.
 
-    What its description does not say is as usual.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the files.
+    What its description does not say is as usual; a DataError says every kind of mistake in the files.
     """
     scan, body = scan_of(path, usual), specimen.body
     found = read(path.parent, scan, specimen.measurable)
@@ -273,18 +262,6 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
     forces.check_signs(forces.names.tolist(), negative)
     truth = found.truth | {name: repr(value) for name, value in scan.truth.items()}
     return replace(found, between=scan.moved_between(found.unit), truth=truth)
-
-
-def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurements:
-    """Read a file of displacements of a specimen, whose errors are known, with what is true.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
-    """
-    found = read_on(path, model, data).checked()
-    return replace(found, truth={name: _known(name, value, path) for name, value in found.truth.items()} | data.truth)
 
 
 def _known(name: str, said: str, path: Path) -> Any:

@@ -45,13 +45,7 @@ class Mail:
         return True
 
     def receive(self) -> Any:
-        """Wait for a message.
-
-        Raises
-        ------
-        EOFError
-            If the other end is closed.
-        """
+        """Wait for a message; an EOFError if the other end is closed."""
         packet = self._end.recv(LARGEST)
         if not packet:
             raise EOFError

@@ -21,13 +21,7 @@ def place() -> Path:
 
 
 def kept() -> str:
-    """Return this user's token; it is made where there is none.
-
-    Raises
-    ------
-    StudyError
-        If others may read it, or it cannot be kept.
-    """
+    """Return this user's token, made where there is none; a StudyError if others may read it, or it cannot be kept."""
     path = place()
     try:
         if not path.exists():

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 Content = Callable[["Results"], Iterator[Block]]
 DRAWN = 24  # outputs with pictures
 ROWS = 40  # parameters from which on a table is in the order of their effects
+_HERE = "workflows.report.sections"
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,6 @@ def section(
     return made
 
 
-_HERE = "workflows.report.sections"
 SECTIONS = Kinds(
     "section",
     {
@@ -289,13 +289,7 @@ def of_study(report: Report | None) -> dict[str, Section]:
 
 
 def sections(report: Report | None = None) -> list[tuple[str, Section]]:
-    """Return all sections by name, in the order of the page; those that a study asks for too.
-
-    Raises
-    ------
-    StudyError
-        As in `of_study`.
-    """
+    """Return all sections by name, in the order of the page, with those of a study; errors as of `of_study`."""
     others = {name: SECTIONS[name]() for name in SECTIONS.names if name not in SECTIONS.own} | of_study(report)
     placed: list[tuple[str, Section]] = []
     for name in SECTIONS.own:

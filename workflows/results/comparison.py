@@ -256,11 +256,6 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     return said + criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
 
 
-def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Dataset:
-    """Trust no evidence of models whose derivatives are wrong: their modes were not found."""
-    return dataset.assign(trusted=dataset["trusted"] & ~dataset["model"].isin(list(wrong)))
-
-
 def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
     """Say what the errors of candidates are that were learnt."""
     from inverse.criticism.doubts import learnt as learnt_errors

@@ -119,13 +119,9 @@ def body_grid(dataset: xr.Dataset) -> Grid:
         for name, values in node_fields(dataset).items()
         if (known := np.isfinite(values)).any()
     }
-    return Grid(
-        points=dataset["node_position"].to_numpy(),
-        cells=dataset["cell_nodes"].to_numpy(),
-        kind=int(dataset["cell_nodes"].attrs["vtk_cell_type"]),
-        point_data=fields,
-        cell_data={"region": dataset["cell_region"].to_numpy()} if "cell_region" in dataset else {},
-    )
+    points, cells = dataset["node_position"].to_numpy(), dataset["cell_nodes"]
+    regions = {"region": dataset["cell_region"].to_numpy()} if "cell_region" in dataset else {}
+    return Grid(points, cells.to_numpy(), int(cells.attrs["vtk_cell_type"]), fields, regions)
 
 
 def mesh_grid(dataset: xr.Dataset) -> Grid:

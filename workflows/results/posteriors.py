@@ -36,10 +36,7 @@ BEST = "best"
 def read(file: str, group: str | None, model: str | None) -> Draws:
     """Read draws by their names in a source.
 
-    Raises
-    ------
-    ValueError
-        If it is not there, unfinished, of another kind, without draws, or ambiguous: one line.
+    A ValueError says in one line that it is not there, unfinished, of another kind, without draws, or ambiguous.
     """
     path = Path(file)
     if path.name == KEPT:
@@ -255,10 +252,7 @@ class NamedCandidate(NamedTuple):
 def candidates(file: str, by: str) -> list[NamedCandidate]:
     """Return the candidates of a comparison, the most probable first, or that of the largest weight ("stacking").
 
-    Raises
-    ------
-    ValueError
-        If it is none of materials: one line.
+    A ValueError says in one line that it is none of materials.
     """
     left = Left(file)
     if left.kind != "select":

@@ -29,6 +29,8 @@ SHARP = np.cos(np.radians(40))  # of the angle between faces from which an edge 
 # The corners of each face, seen from outside against the clock.
 QUADRILATERALS = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (3, 7, 6, 2), (0, 4, 7, 3), (1, 2, 6, 5))
 TRIANGLES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+HEXAHEDRA = (12, 29, 72)  # kinds of cells of VTK
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # of VTK
 
 
 def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
@@ -81,10 +83,6 @@ def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
     """Return the surface of a tool, in triangles."""
     places, triangles = surface(tool, points)
     return Grid(places, triangles, TRIANGLE)
-
-
-HEXAHEDRA = (12, 29, 72)  # kinds of cells of VTK
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # of VTK
 
 
 def lattice(places: FloatArray, *, hexahedral: bool) -> IntArray:

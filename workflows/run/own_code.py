@@ -46,13 +46,7 @@ def identity(study: StudyKind) -> str:
 
 
 def refuse_other(directory: Path, study: StudyKind) -> None:
-    """Compare the user's modules with those from which the results in a directory were computed.
-
-    Raises
-    ------
-    StudyError
-        If one has changed; the message names it.
-    """
+    """Compare the user's modules with those of the results in a directory; a StudyError names one that has changed."""
     before = _kept(directory)
     if before is None or not modules(study):
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -12,10 +13,11 @@ import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Thread, Timer
 from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import SESSION, Loaded
-from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
+from forward.machine import INTERRUPTED, StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
 from forward.model import SolveError
 from forward.phases import phase
 from uq.evaluation.checkpoint import Checkpoint
@@ -25,11 +27,11 @@ from workflows.config.blocks import KEPT
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
 from workflows.results.directory import completed, digest, read_dataset, read_summary, write_dataset, write_fields
+from workflows.results.summary import summarised
 from workflows.run import own_code
 from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress, in_notebook
-from workflows.run.summary import summarised
 from workflows.run.version import version
 from workflows.studies.job import Job
 from workflows.studies.solves import findings_of_solves
@@ -37,11 +39,13 @@ from workflows.studies.solves import findings_of_solves
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.evaluation.request import Evaluations
     from workflows.studies.study import StudyKind
 
 CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
 SECONDS_TO_END = 5.0  # in which ranks of a run that was killed end
+ENDING = (signal.SIGINT, signal.SIGTERM)
+SECONDS_FOR_OTHERS = 1.5  # within which `mpirun`, if it was signalled too, ends all ranks silently
+SECONDS_TO_ABORT = 2.0
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
@@ -142,7 +146,7 @@ def _run(
         own_code.keep(directory, study, loaded)
         took = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, took)
-        _leave(study, directory, dataset, evaluations, summary, checkpoint, job)
+        _leave(study, directory, dataset, summary, checkpoint, job)
         # What was found need not wait for pictures.
         sys.stdout.write("" if quiet else closing_words(dataset, summary, study))
         sys.stdout.flush()
@@ -185,13 +189,7 @@ def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
 
 
 def _leave(
-    study: StudyKind,
-    directory: Path,
-    dataset: xr.Dataset,
-    evaluations: dict[str, Evaluations],
-    summary: dict[str, Any],
-    checkpoint: Checkpoint,
-    job: Job,
+    study: StudyKind, directory: Path, dataset: xr.Dataset, summary: dict[str, Any], checkpoint: Checkpoint, job: Job
 ) -> None:
     """Write all results, in an order that is safe against a kill."""
     write_dataset(directory / "results.nc", dataset, study.arviz_groups(dataset))
@@ -199,7 +197,7 @@ def _leave(
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         write_text(directory / name, text)
-    checkpoint.consolidate(evaluations)
+    checkpoint.consolidate(job.evaluations)
     # The summary marks the study as finished: only then may the blocks be removed.
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
@@ -257,12 +255,9 @@ def _prepare(study: StudyKind, directory: Path, ranks: int, held: ExitStack) -> 
 
 
 def _hold(directory: Path, held: ExitStack) -> None:
-    """Lock a directory until `held` is closed or the process ends; file systems without locks are left alone.
+    """Lock a directory until `held` is closed or the process ends; a StudyError if another run has it.
 
-    Raises
-    ------
-    StudyError
-        If another run has it.
+    File systems without locks are left alone.
     """
     handle = os.open(directory, os.O_RDONLY)
     held.callback(os.close, handle)
@@ -336,6 +331,48 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
         for name in made:
             (directory / name).unlink(missing_ok=True)
         directory.rmdir()
+
+
+# --- signals ---------------------------------------------------------------------------------------------------------
+
+
+def heed() -> None:
+    """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
+
+    A single process raises KeyboardInterrupt. Of several ranks the first prints the line; each ends the job from a
+    separate thread, since MPI waits without ever returning to Python. No rank dies at once: `mpirun`, which signals
+    all of them, would then kill the others at once too, before the line is printed, in place of a second later. It
+    sends the signal too once a rank ends the job for a reason of its own: then that is said, and they die.
+    """
+    from mpi4py import MPI
+
+    from uq.evaluation.work_queue import is_ending
+
+    world = MPI.COMM_WORLD
+    if world.size == 1:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        return
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    for number in ENDING:
+        signal.signal(number, lambda *_: None)
+    Thread(target=_wait, args=(read, world, is_ending), daemon=True).start()
+
+
+def _wait(pipe: int, world: Any, is_ending: Callable[[], bool]) -> None:
+    while os.read(pipe, 1)[0] not in ENDING:
+        pass
+    if is_ending():
+        os.kill(os.getpid(), signal.SIGKILL)
+    if world.rank == 0:
+        sys.stderr.write(f"{INTERRUPTED}\n")
+        sys.stderr.flush()
+    time.sleep(SECONDS_FOR_OTHERS)
+    fallback = Timer(SECONDS_TO_ABORT, os._exit, [1])
+    fallback.daemon = True
+    fallback.start()
+    world.Abort(1)
 
 
 # --- from Python ----------------------------------------------------------------------------------------------------

@@ -271,10 +271,7 @@ class TakenForGranted:
     def with_changes(self, found: xr.Dataset, mean: FloatArray, evaluate: Evaluate) -> xr.Dataset:
         """Add how far outputs are larger at the mean (d,) if each number that is not random is; NaN without an answer.
 
-        Raises
-        ------
-        ModelError
-            If the model has no derivatives.
+        A ModelError says that the model has no derivatives.
         """
         if not evaluate.differentiable:
             raise ModelError("sensitivity.all: the model has no derivatives, expected one that has")

@@ -16,7 +16,7 @@ from forward.scalars import Mistake
 from uq.estimators import failure_domain
 from uq.estimators.averaged import averaged
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate
+from uq.evaluation.request import Evaluate, Evaluations
 from uq.findings import add
 from workflows.config.blocks import STACKED
 from workflows.config.mistakes import lines
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.request import Evaluations
     from uq.inputs.draws import Draws
 
 LEAST = 1e-3  # probability of candidates that are left out
+AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
 
 
 class AveragedStudy(Study):
@@ -164,9 +164,6 @@ class AveragedStudy(Study):
                 yield place, f"of a candidate, {line}", said
         except ValueError as error:
             yield place, str(error), said
-
-
-AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
 
 
 def _told(dataset: xr.Dataset) -> xr.Dataset:

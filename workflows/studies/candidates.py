@@ -1,8 +1,11 @@
-"""Candidates of comparisons and designs: what each changes of one model, or materials, with their priors."""
+"""Models by what they change of another: candidates of comparisons and designs, with their priors, or materials.
+
+And models against which the errors of cheaper ones are learnt, as studies that infer have them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +16,7 @@ from forward.material_tests import Constants
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MEASURED, ModelSpec
+from inverse.methods.model_error import LearntError
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation
 from workflows.config.one_model import Priors
@@ -21,6 +25,8 @@ from workflows.config.priors import inputs_of, mistakes_of_materials, mistakes_o
 if TYPE_CHECKING:
     from forward.findings import Finding
 
+TRUTH = "other model"  # against which errors are learnt, in names of models
+UNSEEN = "the errors of the model are learnt against another one, whose mesh is taken as it is"
 SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, MEASURED])
 
 
@@ -144,3 +150,44 @@ def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         inside = isinstance(value, Mapping) and isinstance(here, Mapping) and "kind" not in value
         found[key] = changed(here, value) if inside else value  # type: ignore[arg-type]
     return found
+
+
+# --- models against which the errors of cheaper ones are learnt -------------------------------------------------------
+
+
+def truth_of(model: Mapping[str, Any] | ModelSpec, learnt: LearntError, parameters: Mapping[str, Any]) -> ModelSpec:
+    """Return the other model, in the form that suits all values of its parameters; a ValidationError if it is none."""
+    own = model.model_dump(mode="json", exclude_none=True) if isinstance(model, ModelSpec) else model
+    made = SPEC.validate_python(changed({"model": own}, {"model": learnt.against})["model"])
+    return made.over(ranges({name: one for name, one in parameters.items() if name in made.scalars}))
+
+
+def mistakes_of_truth(make: Callable[[], ModelSpec], own: Any, unknown: Collection[str]) -> Iterator[Mistake]:
+    """Find what the other model lacks, or that it is the model itself; places begin with "against"."""
+    place = ("against",)
+    try:
+        truth: Any = make()
+    except ValidationError as error:
+        for one in error.errors(include_url=False):
+            yield (*place, *one["loc"]), one["msg"], one["input"]
+        return
+    if truth.placed != own.placed:
+        yield place, f"expected a model of kind '{own.kind}', which is observed as this one is", truth.kind
+        return
+    if truth.identity() == own.identity():
+        yield place, "is the model itself, expected another one", truth.kind
+    has = {*truth.scalars, *truth.coefficients}
+    lost = [name for name in unknown if name not in has]
+    if lost:
+        yield (*place, "parameters"), f"has no {', '.join(lost[:3])}, expected all unknown numbers", list(has)[:8]
+    seen, needed = (_observable(one) for one in (truth, own))
+    missing = [name for name in needed if name not in seen]
+    if missing:
+        yield (*place, "outputs"), f"has no {', '.join(missing[:3])}, expected all that the model has", list(seen)[:8]
+
+
+def _observable(spec: Any) -> list[str]:
+    """Return the names of what can be observed of a model, of a specimen by load case."""
+    if spec.placed:
+        return [f"{case}.{name}" for case, names in spec.observable.items() for name in names]
+    return [output.name for output in spec.returned]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,11 +13,10 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from forward.bodies.geometry import AXES
 from forward.findings import Finding
-from forward.model import FloatArray, ModelError, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from forward.specimen import Observed
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.data.measurements import Measurements
 from inverse.designs.fields import of_field
@@ -32,21 +31,17 @@ from workflows.data.designs import files
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import ASSUMED, TakenForGranted, Uncertain, of_none
 from workflows.studies.candidates import CandidateModel, OfCandidates
-from workflows.studies.job import MethodJob, TasksJob
+from workflows.studies.job import Job, MethodJob, TasksJob
 from workflows.studies.predictions import PRODUCT, duration, has_mesh
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import xarray as xr
 
-    from forward.model import ForwardModel, Solution
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate, Evaluations
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.job import Job
 
 
 ANY_MODEL = OfKind(MODELS, "specimen")
@@ -170,7 +165,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         taken = {one: self.takes(one, values) for one in specs if self.uncertain}
         taken = {one: found for one, found in taken.items() if found.groups}
         if self.field:
-            return _of_field(method, self.spec, ensemble, checkpoint, model, values, taken.get(first))
+            return self._of_field(ensemble, checkpoint, model, values, taken.get(first))
         recorders: dict[str, Recorder] = {}
 
         def made(name: str) -> ForwardModel:
@@ -196,6 +191,49 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
         makers: dict[str, Callable[[], ForwardModel]] = {one: partial(made, one) for one in others}
         makers |= {held[name]: partial(one.model, ensemble.group) for name, one in taken.items()}
         return MethodJob(model, makers, task, recorders, texts=lambda found: files(specs[first], found))
+
+    def _of_field(
+        self, ensemble: Ensemble, checkpoint: Checkpoint, model: Any, values: Measurements, held: TakenForGranted | None
+    ) -> TasksJob:
+        """Each draw of the field is a task of one group."""
+        from forward.combine import Recorded
+        from uq.evaluation.kept import Kept, KeptSolves
+
+        method = self.method
+        spec: Any = self.spec
+        prior = spec.fields[0].prior(spec.body)
+        names = [f"draw {number}" for number in range(method.draws)]
+        solving: list[Kept] = []  # of the draw at hand
+        goals, assumed = method.candidates(values)[1], None
+        if held is not None:
+            assumed = held.of(held.data, by_model(held.model(ensemble.group)))
+
+        def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
+            solving.append(Kept(checkpoint, ensemble.group, names[number]))
+            kept = Recorded(model, KeptSolves(solving[-1], solved))
+            whitened = method.whitened(number, len(model.parameters))
+            try:
+                solution = kept.solve(prior.root(whitened))
+            except SolveError:
+                ensemble.count(1, 1)
+                raise
+            ensemble.count(1, 0)
+            sigma = method.sigma(values, solution.outputs[None])
+            mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
+            errors = np.zeros((0, len(values)))
+            if assumed is not None:
+                errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
+            parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
+            found = of_field(kept, solution, whitened, *parts)
+            return found if mesh is None else found.assign(mesh_error=("value", mesh))
+
+        def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
+            found = [one.dataset for one in outcomes if one.dataset is not None]
+            if not found:
+                raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
+            return method.of_fields(found, values, 0 if assumed is None else len(assumed.weights))
+
+        return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         return self.inputs.names if self.candidates is None else super().parameters_of(label)
@@ -283,31 +321,21 @@ def of_outputs(spec: ModelSpec) -> Measurements:
 
 def known(spec: Any) -> Measurements | None:
     """Say what the values of a specimen are; None where nodes of a mesh from a file are observed."""
-    names, places, cases, parts = list[str](), list[FloatArray](), list[str](), list[str]()
-    for case in spec.cases:
-        for item in spec.seen(case):
-            points = _points(spec, item)
-            if points is None:
-                return None
-            names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(points)) for axis in item.components]
-            places += [point for point in points for _ in item.components]
-            parts += [axis for _ in points for axis in AXES if axis in item.components]
-        names += [f"{case.name}.{output.name}" for output in case.outputs]
-        places += [np.full(3, np.nan) for _ in case.outputs]
-        parts += [output.name for output in case.outputs]
-        cases += [case.name] * (len(names) - len(cases))
-    return Measurements.possible(names, np.array(places).reshape(-1, 3), cases, parts)
-
-
-def _points(spec: Any, item: Observed) -> FloatArray | None:
-    """Points (n, 3) at which displacements are measured: nodes of a side as they lie on a cube of cells of one size."""
-    if item.on is None:
-        return np.array(item.at)
-    cells = getattr(spec.body, "cells", None)
-    if cells is None or len(cells) != len(AXES) or item.on not in SIDES:
+    nodes: dict[str, Any] = {item.on: _nodes(spec.body, item.on) for item in spec.observed if item.on is not None}
+    if any(points is None for points in nodes.values()):
         return None
-    lines = [np.linspace(0.0, 1.0, spec.body.degree * n + 1) for n in cells]
-    axis, end = SIDES[item.on]
+    rows = list(spec.rows(nodes.__getitem__))
+    cases, names, axes, places = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return _possible(spec, names, np.array(places).reshape(-1, 3), cases, axes)
+
+
+def _nodes(body: Any, on: str) -> FloatArray | None:
+    """Places (n, 3) of the nodes of a side as they lie on a cube of cells of one size; None of other boundaries."""
+    cells = getattr(body, "cells", None)
+    if cells is None or len(cells) != len(AXES) or on not in SIDES:
+        return None
+    lines = [np.linspace(0.0, 1.0, body.degree * n + 1) for n in cells]
+    axis, end = SIDES[on]
     lines[axis] = lines[axis][[end]]
     return np.asarray(np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3))
 
@@ -316,63 +344,17 @@ def values_of(spec: Any, model: Any) -> Measurements:
     """Say of each output of a model what it is and where it is measured."""
     if not spec.placed:
         return of_outputs(spec)
-    cases = [spec.cases[number] for number in model.cases]
-    parts = [
-        AXES[axis] if axis < len(AXES) else case.outputs[axis - len(AXES)].name
-        for axis, case in zip(model.axes, cases, strict=True)
-    ]
-    return Measurements.possible(model.outputs, model.places, [case.name for case in cases], parts)
+    return _possible(spec, model.outputs, model.places, model.cases, model.axes)
 
 
-# --- a field of nodal values -----------------------------------------------------------------------------------------
-
-
-def _of_field(
-    method: Design,
-    spec: Any,
-    ensemble: Ensemble,
-    checkpoint: Checkpoint,
-    model: ForwardModel,
-    values: Measurements,
-    taken: TakenForGranted | None,
-) -> TasksJob:
-    """Each draw of the field is a task of one group."""
-    from forward.combine import Recorded
-    from uq.evaluation.kept import Kept, KeptSolves
-
-    prior = spec.fields[0].prior(spec.body)
-    names = [f"draw {number}" for number in range(method.draws)]
-    solving: list[Kept] = []  # of the draw at hand
-    goals, assumed = method.candidates(values)[1], None
-    if taken is not None:
-        assumed = taken.of(taken.data, by_model(taken.model(ensemble.group)))
-
-    def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
-        solving.append(Kept(checkpoint, ensemble.group, names[number]))
-        kept = Recorded(model, KeptSolves(solving[-1], solved))
-        whitened = method.whitened(number, len(model.parameters))
-        try:
-            solution = kept.solve(prior.root(whitened))
-        except SolveError:
-            ensemble.count(1, 1)
-            raise
-        ensemble.count(1, 0)
-        sigma = method.sigma(values, solution.outputs[None])
-        mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
-        errors = np.zeros((0, len(values)))
-        if assumed is not None:
-            errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
-        parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
-        found = of_field(kept, solution, whitened, *parts)
-        return found if mesh is None else found.assign(mesh_error=("value", mesh))
-
-    def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
-        found = [one.dataset for one in outcomes if one.dataset is not None]
-        if not found:
-            raise SolveError(f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}")
-        return method.of_fields(found, values, 0 if assumed is None else len(assumed.weights))
-
-    return TasksJob(names, linearise, results, solving, texts=lambda found: files(spec, found))
+def _possible(
+    spec: Any, names: Sequence[str], places: FloatArray, cases: Iterable[int], axes: Iterable[int]
+) -> Measurements:
+    """Return what could be measured of a specimen: displacements along axes, or other outputs of load cases."""
+    of = [spec.cases[number] for number in cases]
+    each = zip(axes, of, strict=True)
+    parts = [AXES[k] if k < len(AXES) else case.outputs[k - len(AXES)].name for k, case in each]
+    return Measurements.possible(names, places, [case.name for case in of], parts)
 
 
 def uncalibrated(solution: Solution) -> FloatArray | None:

@@ -20,8 +20,8 @@ from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
+from workflows.studies.candidates import mistakes_of_truth
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.model_errors import mistakes_of_truth
 from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import Sampled, StudyKind
 

@@ -9,9 +9,9 @@ from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
-from forward.model import ModelError
+from forward.model import FloatArray, ModelError
 from forward.settings import Settings
-from forward.spec import MEASURED, SPECIMEN, usual_kind
+from forward.spec import MEASURED, SPECIMEN, ModelSpec, usual_kind
 from forward.specimen import SHARED, LoadCase, Observed, Specimen
 from inverse.methods.invert import Invert, names_of
 from inverse.methods.model_error import LearntError
@@ -24,13 +24,11 @@ from workflows.config.tables import at
 from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.assumptions import TakenForGranted, Uncertain
-from workflows.studies.model_errors import UNSEEN, truth_of
+from workflows.studies.candidates import UNSEEN, truth_of
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
-    from forward.model import FloatArray
     from forward.reduced.spec import Reduced
-    from forward.spec import ModelSpec
 
 SOLVES_OF_FIELD = 12  # for a mode
 PREDICTED = "predicted"  # name of the solves for what is predicted
@@ -158,12 +156,7 @@ class InversionBlocks(OneModel):
     def reduced(self) -> dict[str, Reduced]:
         """The reduced models that stand for the load cases of a specimen, by name, or for the model, as "".
 
-        None where the model is asked itself.
-
-        Raises
-        ------
-        ValueError
-            If a file cannot be used.
+        There are none where the model is asked itself; a ValueError says that a file cannot be used.
         """
         asked = self.method.reduced
         if asked is None:

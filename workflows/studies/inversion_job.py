@@ -12,14 +12,14 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.combine import Recorded
-from forward.fem.finer import Keep, extrapolated
+from forward.fem.finer import FinerMeshes, Keep, extrapolated
 from forward.machine import write_text
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.criticism.finer import Finer
-from inverse.data.shared_motion import together
-from inverse.methods.infer import Problem, Sampled
+from inverse.data.shared_motion import SharedMotion, together
+from inverse.methods.infer import Problem, Sampled, Starts
 from inverse.methods.invert import Invert, derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.model_error import Truth
@@ -32,51 +32,33 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
 from workflows.studies.assumptions import ASSUMED, SAMPLED
+from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.inversion_results import (
-    BATCH,
-    Vertices,
-    batch_table,
-    dataset,
-    judged,
-    table_of_finished,
-)
+from workflows.studies.inversion_results import BATCH, Vertices, batch_table, dataset, judged, table_of_finished
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
-from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, has_mesh
 from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.finer import FinerMeshes
     from forward.joined_models import JoinedMeshes
     from inverse.criticism.questions import Questions
-    from inverse.data.shared_motion import SharedMotion
-    from inverse.methods.infer import Starts
     from inverse.methods.predict import Band
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.predicted import FieldPredictions
 
 BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
-Held = tuple[ForwardModel | None, ForwardModel | None]
-There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
+On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
 
 
 def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
     """Make the model; collective over the group."""
-    keep = kept_starts(checkpoint, ensemble.group)
-    specimen = study.specimen
-    made = _outputs(study, ensemble, keep) if specimen is None else _specimen(study, specimen, ensemble, keep)
-    derivable(made.model, study.model.kind)
-    if study.predict is not None:
-        made = replace(made, predicted=study.predicts.by_deviations(ensemble.group))
-    return (
-        _one(study, made, ensemble, checkpoint)
-        if study.together
-        else _many(study, made, ensemble, directory, checkpoint)
-    )
+    made = _made(study, ensemble, kept_starts(checkpoint, ensemble.group))
+    if study.together:
+        return _one(study, made, ensemble, checkpoint)
+    return _many(study, made, ensemble, directory, checkpoint)
 
 
 @dataclass(frozen=True)
@@ -87,25 +69,23 @@ class _Observed:
     ----------
     model
         The model of what was measured.
-    there
-        The same on finer meshes (`forward.fem.finer`).
-    shared
-        What errors the data share, and the model that tells what they are; None if they are independent.
-    held
-        The model with the numbers that are taken for granted, and with those that can be sampled; None where it is not
-        asked, or nothing can be.
+    beside
+        What is asked besides, by name: the same on finer meshes (`forward.fem.finer`), what tells which errors the data
+        share, the model with the numbers that are taken for granted, and with those that can be sampled, and the one
+        against which its errors are learnt; those that there are.
+    unseen
+        Why there is none on finer meshes, empty if there is one; None without a mesh.
+    motion
+        What is uncertain of rigid motions; None if nothing is.
     questions
         Questions to its shape; None where there are none.
-    truth
-        The model against which its errors are learnt; None where they are not.
     """
 
     model: ForwardModel
-    there: There
-    shared: tuple[SharedMotion, ForwardModel] | None = None
-    held: Held = (None, None)
-    questions: Questions | None = None
-    truth: ForwardModel | None = None
+    beside: dict[str, ForwardModel]
+    unseen: str | None
+    motion: SharedMotion | None
+    questions: Questions | None
 
 
 @dataclass(frozen=True)
@@ -118,95 +98,72 @@ class _Made:
         The model.
     observed
         What a data set, by its number, is compared with; a SolveError if there is nothing.
+    predicted
+        The model of what is predicted, if anything is.
     vertices
         Places (N, 3) of the vertices of a specimen, cells, and VTK's number of their kind; None of other models.
     look
         Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices, of a specimen.
-    predicted
-        The model of what is predicted, if anything is.
     """
 
     model: ForwardModel
     observed: Callable[[int], _Observed]
+    predicted: ForwardModel | None
     vertices: Vertices | None = None
     look: Look | None = None
-    predicted: ForwardModel | None = None
 
 
-def _outputs(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
-    """Make a model with outputs, of which the data tell which were measured; collective."""
-    model, there = study.spec.build(ensemble.group, study.inputs.names), None
-    if has_mesh(study.spec):
-        meshes, why = _meshes(study, model, study.inputs.mean, keep)
-        there = (None if meshes is None else meshes.of(model), why)
-    elif study.spec.hidden:
-        there = (None, f"{study.spec.hidden}; {BY_REDUCED}")
-    held, asked, truth = _holding(study, ensemble), _asking(study, ensemble), _truth(study, ensemble)
-    return _Made(model, lambda number: _Observed(model, there, None, held(number), asked(number), truth))
+def _made(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
+    """Make a specimen, or a model with outputs of which the data tell which were measured; collective."""
+    spec, comm, taken = study.spec, ensemble.group, study.taken
+    model: Any = spec.build(comm, study.unknown)
+    derivable(model, spec.kind)
+    meshes, unseen = None, f"{spec.hidden}; {BY_REDUCED}" if spec.hidden else None
+    if has_mesh(spec):
+        meshes, unseen = _meshes(study, model, keep)
+    held = None if taken is None else taken.build(comm)
+    truth = None if study.model_error is None else study.truth.build(comm, study.unknown)
+    asked = None
+    if study.method.question:
+        from workflows.studies.questions import asking
 
+        asked = asking(spec, study.unknown, comm)
 
-def _holding(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Held]:
-    """Return what makes the models of a data set, by its number, with what is taken for granted; collective."""
-    taken = study.taken
-    if taken is None:
-        return lambda number: (None, None)
-    model = taken.build(ensemble.group)
-    can = bool(taken.sampled) and not study.field
+    def observed(number: int) -> _Observed:
+        data, own, motion = study.measurements[number], model, None
+        beside: dict[str, ForwardModel | None] = {TRUTH: truth}
+        if spec.placed:
+            try:
+                own = observing(model, data)
+            except ValueError as error:  # a place that is far from the mesh: the other data sets go on
+                raise SolveError(str(error)) from None
+            motion = motion_of(data, study.model.body)
+            beside[MOVED] = None if motion is None else model.observing(*motion.observed)
+            beside[TRUTH] = None if truth is None else observing(truth, data)
+        beside[FINER] = None if meshes is None else meshes.of(own)
+        if taken is not None:
+            beside[ASSUMED] = taken.observed(held, data)
+            can = taken.sampled and not study.field
+            beside[SAMPLED] = taken.sampling(observing(held, data), study.inputs) if can else None
+        there = {name: one for name, one in beside.items() if one is not None}
+        return _Observed(own, there, unseen, motion, None if asked is None else asked(data))
 
-    def held(number: int) -> Held:
-        data = study.measurements[number]
-        return taken.observed(model, data), taken.sampling(observing(model, data), study.inputs) if can else None
-
-    return held
-
-
-def _asking(study: InversionBlocks, ensemble: Ensemble) -> Callable[[int], Questions | None]:
-    """Return what makes the questions to the shape for a data set, by its number; collective."""
-    if not study.method.question:
-        return lambda number: None
-    from workflows.studies.questions import asking
-
-    of = asking(study.spec, study.inputs.names, ensemble.group)
-    return lambda number: of(study.measurements[number])
-
-
-def _truth(study: InversionBlocks, ensemble: Ensemble) -> ForwardModel | None:
-    """Make the model against which errors are learnt; collective."""
-    return None if study.model_error is None else study.truth.build(ensemble.group, study.inputs.names)
-
-
-def _specimen(study: InversionBlocks, spec: Any, ensemble: Ensemble, keep: Keep) -> _Made:
-    """Make a specimen; collective."""
-    names = study.model.coefficients if study.field else study.inputs.names
-    model = spec.build(ensemble.group, names)
+    predicted = None if study.predict is None else study.predicts.by_deviations(comm)
+    if not spec.placed:
+        return _Made(model, observed, predicted)
     vertices = (model.vertices.coordinates, *model.vertices.cells())
-    meshes, why = _meshes(study, model, np.zeros(len(names)) if study.field else study.inputs.mean, keep)
-    held, asked, truth = _holding(study, ensemble), _asking(study, ensemble), _truth(study, ensemble)
 
     def look(points: FloatArray) -> FloatArray:
         return np.asarray(study.stiffness(vertices[0], points) + model.log_fields(points))
 
-    def observed(number: int) -> _Observed:
-        data = study.measurements[number]
-        try:
-            own = observing(model, data)
-        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
-            raise SolveError(str(error)) from None
-        there = None if meshes is None else meshes.of(own)
-        motion = motion_of(data, study.model.body)
-        shared = None if motion is None else (motion, model.observing(*motion.observed))
-        beside = None if truth is None else observing(truth, data)
-        return _Observed(own, (there, why), shared, held(number), asked(number), beside)
-
-    return _Made(model, observed, vertices, look)
+    return _Made(model, observed, predicted, vertices, look)
 
 
-def _meshes(
-    study: InversionBlocks, model: ForwardModel, start: FloatArray, keep: Keep
-) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
-    """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+def _meshes(study: InversionBlocks, model: ForwardModel, keep: Keep) -> tuple[FinerMeshes | JoinedMeshes | None, str]:
+    """Return a body on finer meshes, which are first solved on at the mean, or why there are none."""
     if not study.looked:
         return None, study.unlooked
+    start = np.zeros(len(study.unknown)) if study.field else study.inputs.mean
     try:
         return extrapolated(model, start, keep), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
@@ -228,47 +185,36 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
     return {"labelled": labelled, "texts": texts}
 
 
-On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
-
-
 def _problem(
     study: InversionBlocks, number: int, seen: _Observed, on: On, ensemble: Ensemble, kept: Kept, start: Starts | None
 ) -> Problem[Invert]:
     """Return what is inverted of a data set, by its number; with a reduced model, steps are done more than once."""
-    finer = None
-    if seen.there is not None:
-        model, why = seen.there
-        finer = Finer(None, why) if model is None else Finer.by(on(FINER, model))
-    shared = None if seen.shared is None else seen.shared[0].errors_by(on(MOVED, seen.shared[1]))
-    steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
-    data, taken, assumed, sampled = study.measurements[number], study.taken, None, None
+    data, taken, learnt, beside = study.measurements[number], study.taken, study.model_error, seen.beside
+    finer = None if seen.unseen is None else Finer(None, seen.unseen)
+    if FINER in beside:
+        finer = Finer.by(on(FINER, beside[FINER]))
+    shared = None if seen.motion is None else seen.motion.errors_by(on(MOVED, beside[MOVED]))
+    assumed = sampled = elsewhere = None
     if taken is not None:
-        (held, wider), ask = seen.held, None
-        if held is not None:
-            ask = by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
+        held = beside.get(ASSUMED)
+        ask = None if held is None else by_model(held) if study.field else by_evaluation(on(ASSUMED, held))
         assumed = taken.of(data, ask)
         shared = together(shared, assumed.shared)
-        sampled = None if wider is None else Sampled(taken.sampled, lambda: wider, on(SAMPLED, wider))
-    truth = None
-    if seen.truth is not None and study.model_error is not None:
-        truth = Truth(on(TRUTH, seen.truth), study.model_error.solves, study.method.seed)
-    elsewhere = None
+        if SAMPLED in beside:
+            sampled = Sampled(taken.sampled, lambda: beside[SAMPLED], on(SAMPLED, beside[SAMPLED]))
+    truth = None if learnt is None else Truth(on(TRUTH, beside[TRUTH]), learnt.solves, study.method.seed)
     if study.predict is not None and study.data.errors.process:
         from workflows.studies.predicted import elsewhere_of
 
         elsewhere = elsewhere_of(study)
-    known: dict[str, Any] = {"finer": finer, "elsewhere": elsewhere}
-    known |= {"shared": shared, "start": start, "model": seen.model, "truth": truth}
-    known |= {"assumed": assumed, "sampled": sampled, "questions": seen.questions, "say": ensemble.say, "steps": steps}
-    return Problem(data, study.method, study.data.errors, **known)
+    steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
+    besides: dict[str, Any] = {"assumed": assumed, "sampled": sampled, "truth": truth, "elsewhere": elsewhere}
+    besides |= {"model": seen.model, "questions": seen.questions, "say": ensemble.say, "steps": steps}
+    return Problem(data, study.method, study.data.errors, finer, shared, start, **besides)
 
 
 def _inverted(
-    study: InversionBlocks,
-    made: _Made,
-    problem: Problem[Invert],
-    evaluate: Recorder,
-    cheap: ForwardModel | None,
+    study: InversionBlocks, made: _Made, problem: Problem[Invert], evaluate: Recorder, cheap: ForwardModel | None
 ) -> xr.Dataset:
     """Invert a data set for few parameters, with a reduced model if there is one, which is `cheap`."""
     if cheap is None:
@@ -354,12 +300,11 @@ def _expanded(
     def kept(model: ForwardModel, label: str) -> Recorder:
         return Recorder(SerialEvaluate(model, ensemble.count, kept=Kept(checkpoint, ensemble.group, label)))
 
-    there, samples = made.observed(0).there, study.method.expansion
-    model, why = (None, "") if there is None else there
-    fine = None if model is None else kept(model, f"expansion, {FINER}")
+    first, samples = made.observed(0), study.method.expansion
+    fine = kept(first.beside[FINER], f"expansion, {FINER}") if FINER in first.beside else None
     assert samples is not None
     own = kept(made.model, "expansion")
-    return shared_expansion(study.inputs, own, fine, samples, why), own.log
+    return shared_expansion(study.inputs, own, fine, samples, first.unseen or ""), own.log
 
 
 def _by_expansion(
@@ -426,11 +371,8 @@ def _one(study: InversionBlocks, made: _Made, ensemble: Ensemble, checkpoint: Ch
     seen, predicted = made.observed(0), made.predicted
     recorders: dict[str, Recorder] = {}
     cheap = _reduced(study)(seen.model)
-    moved = None if seen.shared is None else seen.shared[1]
-    fine = None if seen.there is None else seen.there[0]
-    held, wider = seen.held
-    models = {FINER: fine, MOVED: moved, PREDICTED: predicted, ASSUMED: held, SAMPLED: wider, TRUTH: seen.truth}
-    others = {name: partial(lambda one: one, model) for name, model in models.items() if model is not None}
+    models = seen.beside | ({} if predicted is None else {PREDICTED: predicted})
+    others = {name: partial(lambda one: one, model) for name, model in models.items()}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         full = recorders["/"] = Recorder(evaluate)

@@ -22,7 +22,7 @@ from inverse.data.shared_motion import said as said_of_motion
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, WORDS, stacked, usual_sizes
 from uq.findings import add
-from uq.inputs.distributions import Normal
+from uq.inputs.distributions import Distribution, Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
 from workflows.studies.assumptions import KEPT
 from workflows.studies.predictions import of_file
@@ -33,27 +33,21 @@ if TYPE_CHECKING:
     from forward.bodies.random_fields import NodalPrior
     from inverse.data.measurements import Measurements
     from uq.evaluation.tasks import Outcome
-    from uq.inputs.distributions import Distribution
     from workflows.studies.inversion_blocks import InversionBlocks
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
 Vertices = tuple[FloatArray, NDArray[np.int64], int]
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
+STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
+EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
+NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
 
 
 def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
     """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
-    Parameters
-    ----------
-    study
-        The study.
-    outcomes
-        Of the inversions.
-    vertices
-        Places (N, 3) of the vertices of a specimen, cells (n_cells, k), and VTK's number of their kind; None of other
-        models.
+    Vertices of a specimen are places (N, 3), cells (n_cells, k), and VTK's number of their kind; None of other models.
     """
     import xarray as xr
 
@@ -80,14 +74,9 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
         held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices, prior)
         if prior is not None:  # the first unknown is the mean over the body
             true[:, 0] = held["stiffness_true"][1] @ prior.matern.mass / prior.matern.mass.sum()
-    coordinates = {
-        "data_set": [item.name for item in study.data.sets],
-        "parameter": list(study.names),
-        "partner": list(study.names),
-        "case": list(study.parts),
-        "axis": ["x", "y", "z"],
-        "column": list(COLUMNS["field" if study.field else "parameters"]),
-    }
+    sets, names, columns = study.data.sets, list(study.names), COLUMNS["field" if study.field else "parameters"]
+    coordinates = {"data_set": [item.name for item in sets], "parameter": names, "partner": names}
+    coordinates |= {"case": list(study.parts), "axis": ["x", "y", "z"], "column": list(columns)}
     if study.taken is not None and "assumption_shift" in held:
         assumed = study.taken.shown
         coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
@@ -114,29 +103,22 @@ def _of_specimen(
     """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
     places, cells, kind = vertices
     found = list(study.measurements)
-    moves = [np.zeros(0) if m is None else m.moves for m in found]
+    moves, size = [np.zeros(0) if m is None else m.moves for m in found], record["place"].shape[1]
+    each = (np.zeros(0) if m is None else m.moved for m in found)  # how far (m) the point of each datum was moved
+    moved = [np.pad(one, (0, size - len(one)), constant_values=np.nan) for one in each]
     before = study.stiffness(places, prior_draws(study)).std(axis=0) if prior is None else np.sqrt(prior.variance)
     return {
         "points_moved": ("data_set", [int((one > 0).sum()) for one in moves]),
         "largest_move": ("data_set", [float(one.max(initial=0.0)) for one in moves]),
         "rms_move": ("data_set", [float(np.linalg.norm(one) / np.sqrt(max(len(one), 1))) for one in moves]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
-        "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
+        "datum_move": (("data_set", "datum"), np.array(moved)),
         "stiffness_prior_std": ("node", before),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
-
-
-def _moves(found: Sequence[Measurements | None], count: int) -> FloatArray:
-    """Return how far (n, count) the point of each datum was moved (m)."""
-    whole = np.full((len(found), count), np.nan)
-    for row, one in zip(whole, found, strict=True):
-        if one is not None:
-            row[: len(one)] = one.moved
-    return whole
 
 
 def _volumes(study: InversionBlocks, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
@@ -319,11 +301,6 @@ def _of_mesh(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Findi
 # --- batch.csv, and ArviZ's groups -----------------------------------------------------------------------------------
 
 
-STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
-EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
-NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
-
-
 def batch_table(found: xr.Dataset) -> str:
     """Return a table of comma-separated values with a row for each data set."""
     names, cases = ([str(name) for name in found[key].values] for key in ("parameter", "case"))
@@ -399,12 +376,9 @@ def arviz_groups(study: InversionBlocks, found: xr.Dataset) -> dict[str, xr.Data
     chains = max(counts.pop() if len(counts) == 1 and not study.field else 1, 1)
     each = found.sizes["sample"] // chains
 
-    def draws(name: str) -> Any:
-        values = of_set[name].isel(sample=slice(chains * each)).transpose("sample", ...)
-        shape = (chains, each, *values.shape[1:])
-        dims = ("chain", "draw", *values.dims[1:])
-        here = {key: value for key, value in values.coords.items() if "sample" not in value.dims}
-        return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
+    def draws(name: str) -> xr.DataArray:
+        whole = of_set[name].isel(sample=slice(chains * each)).coarsen(sample=each)
+        return whole.construct(sample=("chain", "draw"), keep_attrs=False).transpose("chain", "draw", ...)
 
     left: dict[str, xr.Dataset] = {}
     observed = {study.data.quantity: of_set["measured"]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,8 +14,6 @@ from uq.evaluation.kept import Kept
 from uq.evaluation.request import Evaluate, Evaluations
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import xarray as xr
 
     from forward.model import FloatArray, ForwardModel
@@ -178,13 +176,7 @@ class TasksJob(Job):
                 self.solving.pop().forget()
 
         found = run_tasks(
-            ensemble,
-            self.names,
-            self.work,
-            checkpoint=checkpoint,
-            progress=progress,
-            arrived=self.arrived,
-            kept=kept,
+            ensemble, self.names, self.work, checkpoint=checkpoint, progress=progress, arrived=self.arrived, kept=kept
         )
         if found is None:
             return None

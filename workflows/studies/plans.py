@@ -15,18 +15,9 @@ from uq.evaluation.request import OWN, company_of
 from workflows.accuracy import tolerance_words
 from workflows.accuracy.levers import COUNTS
 from workflows.config.priors import ranges
-from workflows.studies.predictions import (
-    NOT_ASKED,
-    PRODUCT,
-    duration,
-    mesh_check,
-    never_estimable,
-    times_of,
-)
+from workflows.studies.predictions import NOT_ASKED, PRODUCT, duration, mesh_check, never_estimable, times_of
 
 if TYPE_CHECKING:
-    from forward.spec import ModelSpec
-    from forward.specimen import Specimen
     from inverse.data.measurements import Measurements
     from workflows.studies.inversion_blocks import InversionBlocks
     from workflows.studies.sampling_blocks import SamplingBlocks
@@ -159,60 +150,62 @@ def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compil
 
 def of_inversion(study: InversionBlocks) -> list[str]:
     """Say what is inverted, and how long that will take."""
-    from inverse.criticism.assessment import only_needed
+    from inverse.criticism.assessment import only_needed, own_seconds
+    from inverse.methods.invert import derivable
 
-    method = study.method
-    lines = _of_outputs(study) if study.specimen is None else _of_specimen(study, study.specimen)
-    lines += only_needed(method.chains, method.chains_when, method.chain_solves(len(study.names), field=study.field))
-    lines += _learnt(study)
-    lines += [] if study.taken is None else [f"assumed     {study.taken.described(field=study.field)}"]
-    lines += (
-        [f"asked       {', '.join(study.asked)}: whether the data call for them, by 1 solve"] if study.asked else []
-    )
-    refused = (f"warning     {one.refused}" for one in study.data.sets if one.refused)
-    return [f"method      {method.kind}", *lines, *refused]
-
-
-def _of_specimen(study: InversionBlocks, spec: Specimen) -> list[str]:
-    from workflows.studies.inversion_blocks import SOLVES_OF_FIELD
-
-    usable = [m for m in study.measurements if m is not None]
-    decision = study.model.decision(ranges(study.parameters))
-    counts = [len(m) for m in usable]
-    moved = [int((m.moves > 0).sum()) for m in usable]
-    cases = [times_of(spec.loaded(case)) for case in spec.cases]
-    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
+    method, spec, of_outputs, size = study.method, study.spec, study.specimen is None, len(study.names)
+    usable = [one for one in study.measurements if one is not None]
+    counts = [len(one) for one in usable]
+    kind, unknown = "values" if of_outputs else "components", f"{size}: {', '.join(study.names)}"
     if study.field:
-        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
-        seconds = (
-            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(0, field=True) * each
-        )
-    else:
-        unknown = f"{len(study.names)}: {', '.join(study.names)}"
-        seconds = textbook * 15 * study.method.starts + each * study.method.solves(len(study.names), field=False)
-    seconds += each * study.method.chain_solves(len(study.names), field=study.field)
-    once, checked = _mesh_check(study, spec)
-    seconds += once + _seconds_of_predictions(study) + _own_seconds(study, max(counts))
-    return [
+        unknown = f"{study.specimen.body.vertex_count:,} values of ln stiffness"
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        *(f"by          {one.description}" for one in study.reduced.values() if of_outputs),
         f"unknown     {unknown}",
-        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
-        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
-        f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}",
-        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
-        *([f"            {_moved(sum(moved), usable)}"] if sum(moved) else []),
+        *([f"outputs     {', '.join(study.parts)}"] if of_outputs else []),
+        f"data sets   {len(usable)}, of {', '.join(f'{n:,}' for n in counts)} {kind}",
+        *_moved(usable),
         *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
         *(f"warning     {found.clause}" for one in usable for found in one.findings),
-        f"mesh check  {checked}",
-        *_predicted(study),
-        f"time        about {duration(seconds)} for each on 1 core (rough)",
+        *([f"solves      about {study.solves // len(counts):,} for each"] if of_outputs else []),
     ]
+    own = 0.0 if study.field else own_seconds(size, max(counts), method.solves(size, field=False), method.chains)
+    if spec.cost() is None:
+        derivable(spec.build(None, study.inputs.names), spec.kind)
+        each = f"up to about {duration(own)} for each, " if own else ""
+        time = f"{each}{duration(START + REPORT)} for start and report, and what the solves take"
+    else:
+        unlooked = NOT_ASKED if study.model_error is None else study.unlooked
+        once, checked = mesh_check(spec) if study.looked else (0.0, unlooked)
+        lines.append(f"mesh check  {checked}")
+        seconds = own + once + _seconds_of_predictions(study)
+        if of_outputs:
+            cost = times_of(spec)
+            seconds += study.solves / len(counts) * (cost.sample + cost.tangents(len(study.inputs.names)) / 4)
+        else:
+            seconds += _seconds_of_specimen(study)
+        time = f"about {duration(seconds)} for each on 1 core (rough)"
+    lines += [*_predicted(study), f"time        {time}"]
+    lines += only_needed(method.chains, method.chains_when, method.chain_solves(size, field=study.field))
+    lines += _learnt(study)
+    lines += [] if study.taken is None else [f"assumed     {study.taken.described(field=study.field)}"]
+    if study.asked:
+        lines.append(f"asked       {', '.join(study.asked)}: whether the data call for them, by 1 solve")
+    return [*lines, *(f"warning     {one.refused}" for one in study.data.sets if one.refused)]
 
 
-def _mesh_check(study: InversionBlocks, spec: ModelSpec) -> tuple[float, str]:
-    """Predict the processor time (s) of looks on finer meshes, and say what is solved, or why nothing is."""
-    if study.looked:
-        return mesh_check(spec)
-    return 0.0, NOT_ASKED if study.model_error is None else study.unlooked
+def _seconds_of_specimen(study: InversionBlocks) -> float:
+    """Predict the processor time (s) of the solves for a data set of a specimen."""
+    from workflows.studies.inversion_blocks import SOLVES_OF_FIELD
+
+    method, size, field = study.method, len(study.names), study.field
+    cases = [times_of(study.specimen.loaded(case)) for case in study.specimen.cases]
+    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
+    modes = SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD if field else 15 * method.starts
+    draws = 2 * method.solves(0, field=True) if field else method.solves(size, field=False)
+    return textbook * modes + each * (draws + method.chain_solves(size, field=field))
 
 
 def _learnt(study: InversionBlocks) -> list[str]:
@@ -244,46 +237,13 @@ def _seconds_of_predictions(study: InversionBlocks) -> float:
     return 2 * (cost.textbook + study.predicted_by * (cost.sample + own))
 
 
-def _own_seconds(study: InversionBlocks, data: int) -> float:
-    """Predict the most processor time (s) that an inversion of so many data takes besides solves."""
-    from inverse.criticism.assessment import own_seconds
-
-    if study.field:
-        return 0.0
-    method, size = study.method, len(study.names)
-    return own_seconds(size, data, method.solves(size, field=False), method.chains)
-
-
-def _moved(count: int, usable: list[Measurements]) -> str:
-    where = "" if all(m.on_surface for m in usable) else " outside the body"
+def _moved(usable: list[Measurements]) -> list[str]:
+    """Say how many points are moved onto the body, and how far."""
+    moves = np.concatenate([one.moves for one in usable])
+    count = int((moves > 0).sum())
+    if not count:
+        return []
+    where = "" if all(one.on_surface for one in usable) else " outside the body"
     are = f"point{where} is" if count == 1 else f"points{where} are"
-    farthest = max(m.moves.max(initial=0.0) for m in usable)
-    square = float(np.mean(np.concatenate([m.moves for m in usable]) ** 2))
-    rms = told(np.sqrt(square), "m")
-    return f"{count} {are} moved to its surface, by up to {told(farthest, 'm')} (root mean square {rms})"
-
-
-def _of_outputs(study: InversionBlocks) -> list[str]:
-    from inverse.methods.invert import derivable
-
-    spec = study.spec
-    counts = [len(found) for found in study.measurements if found is not None]
-    lines = [
-        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
-        *(f"by          {one.description}" for one in study.reduced.values()),
-        f"unknown     {len(study.names)}: {', '.join(study.names)}",
-        f"outputs     {', '.join(study.parts)}",
-        f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
-        f"solves      about {study.solves // len(counts):,} for each",
-        *_predicted(study),
-    ]
-    cost, own = spec.cost(), _own_seconds(study, max(counts))
-    if cost is None:
-        derivable(study.spec.build(None, study.inputs.names), spec.kind)
-        each = f"up to about {duration(own)} for each, " if own else ""
-        return [*lines, f"time        {each}{duration(START + REPORT)} for start and report, and what the solves take"]
-    once, checked = _mesh_check(study, spec)
-    d = len(study.inputs.names)
-    seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
-    each = duration(seconds + own + once)
-    return [*lines, f"mesh check  {checked}", f"time        about {each} for each on 1 core (rough)"]
+    farthest, rms = (told(float(x), "m") for x in (moves.max(), np.sqrt(np.mean(moves**2))))
+    return [f"            {count} {are} moved to its surface, by up to {farthest} (root mean square {rms})"]

@@ -31,7 +31,7 @@ from workflows.studies.job import Job
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     import xarray as xr
 
@@ -160,13 +160,7 @@ class PopulationStudy(FromPython, StudyKind):
 
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
-    """Return the study of a specimen of a population, with another prior.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or its data are not there any more.
-    """
+    """Return the study of a specimen, with another prior; a ValueError if there is none, or its data are not there."""
     from workflows.config.study import parse
 
     method = study.method
@@ -260,7 +254,9 @@ class PopulationJob(Job):
 
         def task(asked: Callable[[tuple[str, Inputs]], tuple[Draws | None, str]]) -> xr.Dataset:
             posteriors = self.study.posteriors
-            prior = _prior(self.study, prior_names(posteriors))
+            names, before, left = prior_names(posteriors), self.study.of_specimens, self.study.source
+            whose = before.models[left.candidate(method.model)] if "candidates" in left.blocks else before
+            prior = Inputs({name: whose.inputs.marginals[name] for name in names}, whose.inputs.correlations)
             asking = 0.0
 
             def timed(*one: Any) -> tuple[Draws | None, str]:
@@ -276,11 +272,3 @@ class PopulationJob(Job):
             return fitted
 
         return ensemble.led(task, lambda asked: again(*asked))
-
-
-def _prior(study: PopulationStudy, names: Sequence[str]) -> Inputs:
-    """Return the prior of these parameters, which the posteriors were found with."""
-    before, left = study.of_specimens, study.source
-    by_candidate = "candidates" in left.blocks
-    inputs: Inputs = before.models[left.candidate(study.method.model)].inputs if by_candidate else before.inputs
-    return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)

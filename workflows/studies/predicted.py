@@ -13,27 +13,24 @@ from scipy.linalg import block_diag
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import in_words, shared_paths
+from forward.specimen import LoadCase, in_words, shared_paths
 from inverse.data.measurements import Measurements
-from inverse.fields.low_rank import Beside, symmetric_root
+from inverse.fields.low_rank import Beside, LowRankPosterior, symmetric_root
 from inverse.methods import predict
 from uq.estimators.estimate import estimate_of
 from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
-from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED
+from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED, InversionBlocks, Predict
 from workflows.studies.predictions import has_mesh, never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.scalars import Mistake
-    from forward.specimen import LoadCase
-    from inverse.fields.low_rank import LowRankPosterior
     from inverse.methods.predict import Band
     from inverse.methods.record import Record
     from uq.evaluation.request import Evaluate
-    from workflows.studies.inversion_blocks import InversionBlocks, Predict
 
 # From the name of a data set, the posterior of its field, what corrects that, and what is uncertain beside.
 FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None", Beside], "Record"]
@@ -125,14 +122,8 @@ def of_few(
 ) -> Record:
     """Return what the posterior of few parameters, in the dataset of its inversion, says on what is predicted.
 
-    Parameters
-    ----------
-    study, found
-        The study, and the results of the inversion.
-    evaluate, of_mesh
-        The model of what is predicted, for solves, and for estimates of the error of its mesh.
-    before
-        What the prior says.
+    The model of that has evaluations for solves, and for estimates of the error of its mesh; what the prior says of it
+    was found before.
     """
     names, labels = study.acting, tuple(study.predicts.groups)
     weights = found["point_weight"].to_numpy()
@@ -207,15 +198,7 @@ def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
 
 
 def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> FieldPredictions:
-    """Return what predicts from the posterior of a field of a data set.
-
-    Parameters
-    ----------
-    study
-        The study.
-    model
-        The model of what is predicted, whose solves are kept under a name.
-    """
+    """Return what predicts from the posterior of a field of a data set, by a model whose solves are kept by name."""
     prior, looked = study.model.fields[0].prior(study.model.body), study.method.treatment is not None
     pairs, seed, size = study.predicted_by // 2, study.method.seed, len(study.acting)
     known, others = _acting_of(study)

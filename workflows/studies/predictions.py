@@ -6,12 +6,11 @@ import math
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from forward.fem.cost import REPORT, START
+from forward.fem.cost import REPORT, START, Times
 from forward.finer_meshes import finer, graded
 from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
-    from forward.fem.cost import Times
     from forward.spec import ModelSpec
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
@@ -58,10 +57,7 @@ def never_estimable(spec: ModelSpec, names: Collection[str] | None = None) -> tu
 def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
     """Return the bodies of a model on the finer meshes that they are looked at on, where these are known before a run.
 
-    Raises
-    ------
-    ValueError
-        If there are none, or they would be too large.
+    A ValueError says that there are none, or that they would be too large.
     """
     both = ((finer(one), graded(one)) for one in spec.bodies if one.body.structured)
     return tuple(mesh for pair in both for mesh in pair if mesh is not None)

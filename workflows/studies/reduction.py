@@ -72,13 +72,7 @@ class ReductionStudy(Study):
 
 
 def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
-    """Return the study of one load case of a specimen, if that is what is to be reduced.
-
-    Raises
-    ------
-    StudyError
-        If the case is not one of the specimen's.
-    """
+    """Return the study of one load case of a specimen, if that is reduced; a StudyError if it has no such case."""
     if at(blocks, "model", "kind") != "specimen" or at(blocks, "method", "kind") is None:
         return blocks
     model, method = blocks["model"], blocks["method"]

@@ -14,7 +14,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.findings import Finding
-from forward.model import SolveError
+from forward.model import FloatArray, Solution, SolveError
 from forward.reduced.data import ReducedData, save
 from forward.reduced.model import ReducedModel
 from forward.reduced.reduction import Reduction, Sizes
@@ -33,7 +33,6 @@ from workflows.studies.reduction_blocks import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-    from forward.model import FloatArray, Solution
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
@@ -302,14 +301,8 @@ def _of_gradients(names: list[str], gradients: FloatArray, places: FloatArray) -
     Where two places of a body have nearly the same largest value, that has a kink: a model may take the other place,
     with another gradient. So they are told for all samples, and for those at which the place is the same.
 
-    Parameters
-    ----------
-    names
-        The outputs.
-    gradients
-        Those of the body, and what is off before and after correction (3, n, m, d).
-    places
-        Numbers (3, n, m) of the places of largest values, in the same order.
+    Gradients (3, n, m, d) are those of the body, and what is off before and after correction; numbers (3, n, m) of the
+    places of largest values are in the same order.
     """
     sizes = (gradients**2).sum(axis=3)
     told: dict[str, Any] = {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import SolveError, Stability
+from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
 from uq.estimators import failure_domain
 from uq.estimators.estimate import holds, part
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.model import HyperelasticModel
-    from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
@@ -55,19 +54,16 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         told.update(_told(study, recorders["/"], estimates, directory))
         if not (study.spec.meshed and study.spec.touched):
             return found
-        tools = tuple(load.label for load in model.spec.loads if load.contact)
-        return with_contact(found, tools, model.space.coordinates, inputs, evaluate, recorders["/"].first)
+        return with_contact(found, model, inputs, evaluate, recorders["/"].first)
 
     def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
             from workflows.accuracy.tolerance import within
 
-            return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
+            return with_errors_of_draws(study, within(study, method, evaluate, recorders, estimates, directory))
         found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
-        return (
-            _with_mesh_errors(study, found, inputs, evaluate, recorders["/"], estimates) if study.estimates else found
-        )
+        return _with_mesh_errors(study, found, evaluate, recorders["/"], estimates) if study.estimates else found
 
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
@@ -118,19 +114,14 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
 
 
 def _with_mesh_errors(
-    study: SamplingBlocks,
-    found: xr.Dataset,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    recorder: Recorder,
-    estimates: list[Evaluations],
+    study: SamplingBlocks, found: xr.Dataset, evaluate: Evaluate, recorder: Recorder, estimates: list[Evaluations]
 ) -> xr.Dataset:
     """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
     from uq.accuracy.doubts import failed
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
-    first = recorder.first
+    inputs, first = study.inputs, recorder.first
     if "output" not in found.coords or first is None:  # a method from outside
         return found
     at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()

@@ -25,7 +25,7 @@ from workflows.data.material_tests import DataFile, expanded
 from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
-from workflows.studies.model_errors import mistakes_of_truth
+from workflows.studies.candidates import mistakes_of_truth
 from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
 from workflows.studies.study import StudyKind, bytes_of

@@ -28,8 +28,7 @@ from workflows.data.material_tests import WHOLE, MeasuredTests
 from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
 from workflows.studies.assumptions import TakenForGranted, Uncertain
-from workflows.studies.candidates import CandidateModel, OfCandidates
-from workflows.studies.model_errors import UNSEEN, truth_of
+from workflows.studies.candidates import UNSEEN, CandidateModel, OfCandidates, truth_of
 from workflows.studies.predictions import has_mesh, meshes_of
 
 if TYPE_CHECKING:

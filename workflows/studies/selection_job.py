@@ -24,8 +24,8 @@ from uq.evaluation.request import Evaluate
 from uq.findings import add
 from workflows.results import comparison
 from workflows.studies.assumptions import ASSUMED, SAMPLED
+from workflows.studies.candidates import TRUTH
 from workflows.studies.job import MOVED, MethodJob, kept_starts
-from workflows.studies.model_errors import TRUTH
 from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
 
@@ -101,7 +101,8 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
         doubts = comparison.doubts_of_selection(found, study.priors, method.noise.factor, units)
         wrong = {name: _contradictions(study, name, make) for (name, _), make in makers.items()}
         of_wrong = [name for name, several in wrong.items() if several]
-        judged = comparison.trusted_on_meshes(comparison.with_right_derivatives(found, of_wrong))
+        right = found["trusted"] & ~found["model"].isin(of_wrong)  # of the others, modes were not found
+        judged = comparison.trusted_on_meshes(found.assign(trusted=right))
         add(judged, *comparison.findings(found), *comparison.untrusted(found, judged, of_wrong), *doubts)
         add(judged, *(one for several in wrong.values() for one in several), *comparison.learnt(judged))
         return judged

@@ -18,7 +18,7 @@ from forward.bodies.crossing import CREASED, deepest, least_stretch
 from forward.bodies.mesh import surface_of
 from forward.external.derivatives import mistrusted
 from forward.findings import Entry, Finding
-from forward.model import FloatArray, ReferenceSolution, SolveError
+from forward.model import FloatArray, ForwardModel, ReferenceSolution, Solution, SolveError
 from forward.readable import number, place, told, with_unit
 from uq.estimators.failure_domain import of_jumps
 from uq.evaluation.block import merge
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.model import HyperelasticModel
-    from forward.model import ForwardModel, Solution
 
 Cell = Literal["tetrahedron", "hexahedron"]
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
@@ -70,30 +69,13 @@ class Touched(FieldSum):
 
 
 def with_contact(
-    dataset: xr.Dataset,
-    tools: tuple[str, ...],
-    places: FloatArray,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    first: Evaluations | None,
+    dataset: xr.Dataset, model: Any, inputs: Inputs, evaluate: Evaluate, first: Evaluations | None
 ) -> xr.Dataset:
-    """Add the vertices under tools, with the pressures there, at the mean of the inputs.
+    """Add the vertices under the tools of a body, with the pressures there, at the mean of the inputs.
 
-    Parameters
-    ----------
-    dataset
-        Results of a method.
-    tools
-        Their labels.
-    places
-        Coordinates (N, 3) of the nodes.
-    inputs
-        The inputs.
-    evaluate
-        The model.
-    first
-        What the method evaluated first: where that is the mean with its state, the map begins there.
+    Where what the method has evaluated `first` is the mean with its state, the map begins there.
     """
+    tools, places = tuple(load.label for load in model.spec.loads if load.contact), model.space.coordinates
     found = evaluate(Request(inputs.mean[None], fields=Touched(tools), start=at_mean(inputs, first)))
     if found.failures:
         return dataset

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from forward.registry import named
 from forward.scalars import Mistake
 from forward.spec import MEASURED, ModelSpec
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
-from workflows.data.synthetic import Synthetic, files_of, outputs
+from workflows.data.synthetic import displacements, files_of, outputs
 from workflows.run.from_python import FromPython
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration
@@ -70,12 +69,9 @@ class Synthesis(OneModel, FromPython, StudyKind):
         ]
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
-        model = self.spec.build(ensemble.group, self.inputs.names)
-        if self.model.placed:
-            of_specimen = named("workflows.data.synthetic_displacements:displacements")
-            made: Synthetic = of_specimen(self.model, self.method, self.inputs, model, ensemble)
-        else:
-            made = outputs(self.model, model)
+        model: Any = self.spec.build(ensemble.group, self.inputs.names)
+        spec: Any = self.model
+        made = displacements(spec, self.method, self.inputs, model, ensemble) if spec.placed else outputs(spec, model)
         recorders: dict[str, Recorder] = {}
 
         def task(evaluate: Evaluate) -> xr.Dataset:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 PART_COLOURS = {"sampling": CONTROLLED, "mesh": HIGH, "solver": PLAIN, "total": DARK}
 SHOWN = 12  # outputs that have bars
 SPAN = 1e-5  # of the largest error: smaller ones have a number, but no bar, so that the others can be distinguished
+Cost = Literal["solves", "cpu_seconds"]
+METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6b", "#b08900", "#1d9aa8", "#5b4636")
 
 
 def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax: Axes | None = None) -> Axes:
@@ -150,10 +152,6 @@ def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax
         ax.plot(unknowns, relative, "o-", color=colour, markersize=4, label=text_of(output))
     ax.axhline(tolerance, color=PLAIN, linestyle=":", label="tolerance")
     return finished(ax, "unknowns", "estimated relative error of the mesh", log="xy")
-
-
-Cost = Literal["solves", "cpu_seconds"]
-METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6b", "#b08900", "#1d9aa8", "#5b4636")
 
 
 def errors(

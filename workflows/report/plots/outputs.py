@@ -28,6 +28,10 @@ WORDS: dict[Estimated, str] = {"mean": "mean", "std": "standard deviation"}
 FIRST_SHOWN = 8  # estimates from fewer samples are meaningless
 MOST_BINS = 200
 WIDEST = 40  # characters of a name beside a plot
+NAMED = 8  # parameters that have a colour of their own
+BARS = 15  # parameters that a tornado chart shows
+PALE = "#c4cbd2"  # of what no parameter has alone
+SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 
 def quantity(dataset: xr.Dataset, output: str) -> str:
@@ -151,9 +155,6 @@ def comparison(
     return finished(ax, f"{WORDS[estimated]} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
 
 
-NAMED = 8  # parameters that have a colour of their own
-
-
 def over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | None = None) -> Axes:
     """Draw the mean of an output over a path with the band of its quantiles and the error of the mean."""
     ax = ax or axes()
@@ -234,11 +235,6 @@ def _along(ax: Axes, path: str, unit: str, y: str, **legend: Any) -> Axes:
     """Label the axes, the first of which is the number that has steps."""
     ax.locator_params(axis="x", nbins=5)
     return finished(ax, named(text_of(path), unit), y, **legend)
-
-
-BARS = 15  # parameters that a tornado chart shows
-PALE = "#c4cbd2"  # of what no parameter has alone
-SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 
 def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.bodies.geometry import AXES
+from forward.bodies.geometry import AXES, Vector
 from forward.model import FloatArray
 from forward.readable import number, scale
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, ON_DEEP, PLAIN, axes, finished, grid, text_of
@@ -17,14 +17,15 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from forward.bodies.geometry import Vector
-
 
 EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]  # of a box whose corners count in bits
 # Edges with names, all in front: their corners, the side of the name, its alignment, its turn in degrees.
 NAMED = ((0, 1, (0, -1), "right", 0), (1, 3, (0.5, -1), "left", 0), (0, 4, (-1, 0), "right", 90))
 GAP = 0.03  # between an edge and its name, in extents
 ROUNDING = 1e-9  # of the extent
+LONGEST = 0.15  # of the extent of the body: the longest arrow
+PANEL, INSIDE = (3.5, 2.7), (0.15, 0.25, 0.4, 0.25)  # inches
+Extent = Sequence[tuple[float, float]]
 
 
 def looking(up: FloatArray) -> FloatArray:
@@ -61,10 +62,6 @@ def box(ax: Axes, ends: FloatArray) -> None:
         ax.text(x, y, words, fontsize="x-small", ha=across, va="center" if turned else "top", rotation=turned)
     ax.set_aspect("equal")
     ax.axis("off")
-
-
-LONGEST = 0.15  # of the extent of the body: the longest arrow
-PANEL, INSIDE = (3.5, 2.7), (0.15, 0.25, 0.4, 0.25)  # inches
 
 
 def residuals(one: xr.Dataset) -> Axes:
@@ -125,9 +122,6 @@ def _map(ax: Axes, ends: FloatArray, part: MeasuredPoints, values: FloatArray, m
     drawn = ax.scatter(x, y, c=values[order], vmin=0.0, vmax=most, cmap="viridis", s=14)
     ax.figure.colorbar(drawn, ax=ax, label=words, shrink=0.7, pad=0.02, fraction=0.07)
     ax.set_title(text_of(part.case), fontsize="small")
-
-
-Extent = Sequence[tuple[float, float]]
 
 
 def told(one: xr.Dataset, places: Mapping[str, FloatArray], bounds: Extent, lump: str, ax: Axes | None = None) -> Axes:

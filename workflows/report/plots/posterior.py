@@ -21,6 +21,12 @@ LATTICE = 40  # points along an axis at which densities are computed
 DOTS = 160  # draws shown in each pair
 CURVE = 120  # points of a density on the diagonal
 Ends = Sequence[tuple[float, float]]  # of axes
+PALE = 0.55  # shades above it are written on in white
+SAID = 1.05  # times narrower from which it is written
+LEAST = 4.0  # times narrower that the darkest shade stands for, at least
+OUTPUTS = 12  # that have intervals
+SPECIMENS = 40  # that have a row
+RATIO = 30.0  # of the ends of an axis above which it is logarithmic
 
 
 def pairs(
@@ -147,11 +153,6 @@ def holding(low: float, high: float, truth: float, far: float, margin: float) ->
     return low, high
 
 
-PALE = 0.55  # shades above it are written on in white
-SAID = 1.05  # times narrower from which it is written
-LEAST = 4.0  # times narrower that the darkest shade stands for, at least
-
-
 def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw how many times narrower each load case alone makes each parameter, and all together.
 
@@ -176,9 +177,6 @@ def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     return ax
 
 
-OUTPUTS = 12  # that have intervals
-
-
 def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw the interval of each output by the prior and by the posterior; 0 and 1 are the ends of that by the prior.
 
@@ -199,10 +197,6 @@ def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
         ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
         ax.plot(middle, places[known], "|", color=colour, markersize=14, markeredgewidth=2)
     return finished(ax, "from the lower to the upper end of the interval before the data", above=2)
-
-
-SPECIMENS = 40  # that have a row
-RATIO = 30.0  # of the ends of an axis above which it is logarithmic
 
 
 def specimens(of: xr.Dataset, name: str, unit: str, ax: Axes | None = None) -> Axes:

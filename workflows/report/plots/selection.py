@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE = 2  # tests side by side
+SHOWN = 12  # outputs that have bars
 
 
 def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -139,9 +140,6 @@ def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
         )
         for rank, model in enumerate(order)
     ]
-
-
-SHOWN = 12  # outputs that have bars
 
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:

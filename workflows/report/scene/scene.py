@@ -117,17 +117,10 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
     for tool in tools_of(dataset):
         at, triangles = surface(tool, points)
         insides.append(Inside(f"tool {tool.label}", triangles, at, "tool", 0.5))
-    return Scene(
-        points,
-        cells,
-        kind,
-        up_of(dataset),
-        dataset[mean].to_numpy(),
-        list(_quantities(dataset, mean, every=every)),
-        insides,
-        sliders=None if study is None else sliders(dataset, study),
-        motion_name="its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters",
-    )
+    shown, moving = list(_quantities(dataset, mean, every=every)), None if study is None else sliders(dataset, study)
+    name = "its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters"
+    body = points, cells, kind, up_of(dataset), dataset[mean].to_numpy()
+    return Scene(*body, shown, insides, sliders=moving, motion_name=name)
 
 
 def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
@@ -149,17 +142,11 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
             triangles = np.concatenate([of + k for (of, _), k in zip(parts, first, strict=True)])
             label, at = f"{inclusion.label}, {len(parts)} posterior draws", np.concatenate([at for _, at in parts])
             insides.append(Inside(label, triangles, at, "draw", 0.2, shown=False))
-    return Scene(
-        points,
-        cells,
-        kind,
-        up_of(one),
-        np.zeros_like(points),
-        [*_stiffness(one), *_by_case(one, points, cells, kind)],
-        [*_regions(one, points, cells, kind), *insides],
-        {case.case: (case.places, case.residuals, case.over) for case in measured_points(one)},
-        cut="" if inclusions or "stiffness_mean" not in one else "v",
-    )
+    shown = [*_stiffness(one), *_by_case(one, points, cells, kind)]
+    insides = [*_regions(one, points, cells, kind), *insides]
+    arrows = {case.case: (case.places, case.residuals, case.over) for case in measured_points(one)}
+    body = points, cells, kind, up_of(one), np.zeros_like(points)
+    return Scene(*body, shown, insides, arrows, cut="" if inclusions or "stiffness_mean" not in one else "v")
 
 
 def up_of(dataset: xr.Dataset) -> FloatArray:
@@ -369,14 +356,8 @@ def packed(scene: Scene) -> tuple[str, str]:
         if not len(inside.triangles):
             continue
         mine = split(scene.points if inside.points is None else inside.points, inside.triangles)
-        entry = {
-            "name": inside.name,
-            "colour": COLOURS[inside.kind],
-            "opacity": inside.opacity,
-            "shown": inside.shown,
-            "outside": inside.kind == "tool",
-            "triangles": pack.add(mine.triangles),
-        }
+        entry = {"name": inside.name, "colour": COLOURS[inside.kind], "opacity": inside.opacity, "shown": inside.shown}
+        entry |= {"outside": inside.kind == "tool", "triangles": pack.add(mine.triangles)}
         if inside.points is None:
             entry["nodes"] = pack.add(number[mine.nodes])
         else:

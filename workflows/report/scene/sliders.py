@@ -12,7 +12,7 @@ import numpy as np
 from forward.model import FloatArray, SolveError
 from forward.readable import named as with_its_unit
 from forward.readable import spoken
-from uq.inputs.distributions import Normal
+from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels
@@ -23,7 +23,6 @@ from workflows.results.surfaces import IntArray
 if TYPE_CHECKING:
     import xarray as xr
 
-    from uq.inputs.distributions import Distribution
     from workflows.studies.sampling import Study
 
 MOST = 160  # parameters

@@ -10,7 +10,7 @@ import numpy as np
 
 from forward.bodies.geometry import AXES
 from forward.hyperelastic import Path as PathOfLoads
-from forward.model import SolveError
+from forward.model import FloatArray, SolveError
 from forward.readable import and_error, named, number, size, spoken
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
 from workflows.report.plots import outputs
@@ -20,12 +20,13 @@ from workflows.report.section import Results, section
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import FloatArray
     from forward.specimen import Specimen
     from workflows.report.scene.scene import Scene
 
 DRAWN = 8  # data sets that have more than a row in the table
 STILLS = 2  # pictures for paper
+LEAST = 3  # places that make a map
+MISSES = ("measured", "predicted", "residual over its error")
 
 
 def _body_applies(results: Results) -> bool:
@@ -151,9 +152,6 @@ def curve(results: Results) -> Iterator[Block]:
     yield Pictures.of(*drawn)
 
 
-LEAST = 3  # places that make a map
-
-
 # If outputs of load cases of a specimen were inverted.
 @section("datum_axis", heading="Forces", when=lambda results: bool((results.dataset["datum_axis"] >= len(AXES)).any()))
 def places(results: Results) -> Iterator[Block]:
@@ -195,9 +193,6 @@ def places_of(model: Specimen) -> dict[str, FloatArray]:
         if len(tools) == 1:
             found[case.name] = np.array(tools[0].at, dtype=float)
     return found
-
-
-MISSES = ("measured", "predicted", "residual over its error")
 
 
 def misses(datum: xr.Dataset, unit: str, like: float | None = None) -> Iterator[str]:

@@ -21,6 +21,17 @@ from workflows.report.section import Results, section, written
 if TYPE_CHECKING:
     import xarray as xr
 
+EVENLY = (
+    "Models of a group get the same random parameters. Weights make the estimates those of the first model, whatever "
+    "the others are; numbers of samples make the largest relative error of a mean least for the cost."
+)
+CHOSEN = (
+    "All cheap models are asked at all points. Those at which the model of the study is solved as well are drawn with "
+    "probabilities that grow with the difference of two cheap models, and count with the inverse of these: the "
+    "estimates are those of the first model, whatever the others are. Numbers make the "
+    "largest relative error of a mean least."
+)
+
 
 @section("row_method", heading="Error against cost")
 def error_against_cost(results: Results) -> Iterator[Block]:
@@ -92,18 +103,6 @@ def errors(results: Results, output: str, estimated: str) -> Table:
             ),
         },
     )
-
-
-EVENLY = (
-    "Models of a group get the same random parameters. Weights make the estimates those of the first model, whatever "
-    "the others are; numbers of samples make the largest relative error of a mean least for the cost."
-)
-CHOSEN = (
-    "All cheap models are asked at all points. Those at which the model of the study is solved as well are drawn with "
-    "probabilities that grow with the difference of two cheap models, and count with the inverse of these: the "
-    "estimates are those of the first model, whatever the others are. Numbers make the "
-    "largest relative error of a mean least."
-)
 
 
 @section("fidelity_cost", heading="Models")

@@ -18,6 +18,11 @@ from workflows.report.words import counted, joined, law, solves, stability
 if TYPE_CHECKING:
     from workflows.studies.sampling import Study
 
+NOTES = 1  # that are read at once, unless there is something graver
+FIRST = 2  # findings that stand before the answers: errors, and these
+LONG = 25  # words of a finding that is read at once
+BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
+
 
 @section()
 def header(results: Results) -> Iterator[Block]:
@@ -30,12 +35,6 @@ def header(results: Results) -> Iterator[Block]:
         yield Text(f"{sets} data sets, {failed}; {counted(solves(results.summary))}")
     else:
         yield Text(f"{summary['stopped']}; {counted(solves(results.summary))}, {failed}")
-
-
-NOTES = 1  # that are read at once, unless there is something graver
-FIRST = 2  # findings that stand before the answers: errors, and these
-LONG = 25  # words of a finding that is read at once
-BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
 
 
 @section(

@@ -23,6 +23,16 @@ if TYPE_CHECKING:
     from forward.model import FloatArray
 
 TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
+SHOWN = 24  # rows of the table of a data set
+SETS = 12  # data sets that have a table
+PREDICTED = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
+WORTH = {
+    "information": "What they tell (nat)",
+    "parameters": "Share of the parameters' variances that they take away",
+    "predictions": "Share of the predictions' variances that they take away",
+    "models": "Expected ln Bayes factor of the true model (nat)",
+}
+FIRST = 5  # observations on the card
 
 
 @section("alone_eigenvalue", heading="All data sets", when=lambda results: results.dataset.sizes["data_set"] > 1)
@@ -53,11 +63,6 @@ def batch(results: Results) -> Iterator[Block]:
     yield Table(head, rows, text={0, 2})
 
 
-SHOWN = 24  # rows of the table of a data set
-SETS = 12  # data sets that have a table
-PREDICTED = ("output", "predicted", "95 %", "before the data", "share of the variance removed", "error of the mesh")
-
-
 @section("prediction_share", heading="Predictions")
 def predictions(results: Results) -> Iterator[Block]:
     """What is predicted from each data set, and what its data added."""
@@ -75,16 +80,15 @@ def predictions(results: Results) -> Iterator[Block]:
         for goal in one["goal"].values[:SHOWN]:
             at = one.sel(goal=goal)
             unit, mesh = str(at["goal_unit"].item()), single(at, "prediction_mean").mesh
-            names = ("mean", "std", "lower", "upper", "prior_mean", "prior_std", "share")
-            mean, std, lower, upper, before, wide, share = (float(at[f"prediction_{name}"]) for name in names)
-            told = and_error(mean, std, unit), interval(lower, upper, unit, mean), and_error(before, wide, unit)
+            before, wide, share = (float(at[f"prediction_{name}"]) for name in ("prior_mean", "prior_std", "share"))
             removed = percent(share) if np.isnan(share) or share >= 0 else "none"
-            rows.append((str(goal), *told, removed, size(mesh, unit) if np.isfinite(mesh) else "not estimated"))
+            error = size(mesh, unit) if np.isfinite(mesh) else "not estimated"
+            rows.append((str(goal), *_band(at), and_error(before, wide, unit), removed, error))
         yield Table(PREDICTED, rows)
         if "prediction_process_mean" in one:
             yield Text("With what the model does not explain, where it is known from displacements around there:")
             parts = (one.sel(goal=goal) for goal in one["goal"].values[:SHOWN])
-            yield Table(PREDICTED[:3], [(str(at["goal"].item()), *_whole(at)) for at in parts])
+            yield Table(PREDICTED[:3], [(str(at["goal"].item()), *_band(at, "process_")) for at in parts])
         if np.isfinite(one["prediction_std"]).any():
             caption = "95 % intervals before and after the data, each relative to the one before."
             yield Pictures.of((plots.bands(one), caption))
@@ -92,10 +96,10 @@ def predictions(results: Results) -> Iterator[Block]:
         yield Text(f"Those of {len(done) - SETS} more data sets are in results.nc.")
 
 
-def _whole(at: xr.Dataset) -> tuple[str, str]:
-    """A prediction with what the model does not explain, and its interval."""
+def _band(at: xr.Dataset, kind: str = "") -> tuple[str, str]:
+    """A prediction and its interval; of the kind "process_" with what the model does not explain."""
     unit, names = str(at["goal_unit"].item()), ("mean", "std", "lower", "upper")
-    mean, std, lower, upper = (float(at[f"prediction_process_{name}"]) for name in names)
+    mean, std, lower, upper = (float(at[f"prediction_{kind}{name}"]) for name in names)
     return and_error(mean, std, unit), interval(lower, upper, unit, mean)
 
 
@@ -190,15 +194,6 @@ def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray
     found = np.interp(np.log(sizes), at, curve) / sizes
     order = np.argsort(sign * sizes)
     return (sign * sizes)[order], found[order]
-
-
-WORTH = {
-    "information": "What they tell (nat)",
-    "parameters": "Share of the parameters' variances that they take away",
-    "predictions": "Share of the predictions' variances that they take away",
-    "models": "Expected ln Bayes factor of the true model (nat)",
-}
-FIRST = 5  # observations on the card
 
 
 @section("chosen", heading="Which observations tell most")

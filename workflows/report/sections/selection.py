@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     from workflows.studies.selection import Selection
 
+UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
+
 
 @section("probability", heading="Evidences and probabilities")
 def evidences(results: Results) -> Iterator[Block]:
@@ -99,9 +101,6 @@ def dependence(results: Results) -> Iterator[Block]:
     of = [[dataset.sel(model=model, variant=name) for name in names] for model in models]  # models have longer names
     rows = [(model, *(written(o, "variant_log_evidence") for o in row)) for model, row in zip(models, of, strict=True)]
     yield Folded("Their evidences, ln Z", [Table(("ln Z", *names), rows)])
-
-
-UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
 
 
 @section("probability", heading="Averaged predictions")
