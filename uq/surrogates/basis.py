@@ -426,16 +426,23 @@ def lacking(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, Floa
     return plain, np.sqrt(draws.weights @ left**2)
 
 
+def gaps(indices: IntArray, i: int) -> IntArray:
+    """Return lower powers (K, d) of parameter i that no function of a basis (P, d) has."""
+    lower = np.setdiff1d(np.arange(2, indices[:, i].max()), indices[:, i])
+    return np.asarray(lower[:, None] * np.eye(indices.shape[1], dtype=np.int64)[i])
+
+
 def neighbours(indices: IntArray, tails: NDArray[np.bool_], partners: IntArray) -> Iterator[IntArray]:
     """Go through powers (d,) that a basis (P, d) lacks: the next two of a parameter with a tail, alone and in products.
 
-    Products are with one of the partners; with another tail, of what is the highest power alone too.
+    Products are with one of the partners; with another tail, of what is the highest power alone too. And `gaps`: where
+    few samples chose from many powers, others may look the same there.
     """
     known = {tuple(row) for row in indices.tolist()}
     unit = np.eye(indices.shape[1], dtype=np.int64)
     for i in np.flatnonzero(tails):
         following = int(indices[:, i].max()) + 1
-        found = [following * unit[i], (following + 1) * unit[i]]
+        found = [following * unit[i], (following + 1) * unit[i], *gaps(indices, i)]
         for j in partners[partners != i]:
             found.append(following * unit[i] + unit[j])
             if tails[j]:

@@ -28,6 +28,7 @@ from uq.surrogates.basis import (
     Candidates,
     IntArray,
     candidates_of,
+    gaps,
     lacking,
     neighbours,
     orthonormal,
@@ -156,8 +157,9 @@ class Regression:
 
         On a bounded range samples reach the ends, and the leave-one-out error shows what is missing. In tails they do
         not: above all, the next power of a parameter with a tail is missing, or that after it, and it grows beyond the
-        samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
-        then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
+        samples; where few samples chose from many powers, lower ones may be missing too (`gaps`). If the residuals of
+        such a function ψ of norm 1, fitted at these samples, have the sum of squares r², then outputs whose residuals
+        have the sum of squares s² miss a function of norm s/r.
         """
         tails = self.inputs.tails
         if not tails.any():
@@ -376,15 +378,17 @@ class Regression:
         powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
         powers[:, np.arange(places.size), places] = following, following + 1
-        functions, norms = lacking(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
+        inside = [gaps(basis.indices, i) for i in places]
+        functions, norms = lacking(self.inputs, basis, np.concatenate([*powers, *inside]))
         _, found = self._taken_up(self.data.left(functions))
         found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
-        next_one, after = found.reshape(2, places.size, 1)
+        next_one, after = found[: 2 * places.size].reshape(2, places.size, 1)
         # An odd function, or one beside a slope, has no even powers, and lacks the one after the next.
         squares = self.fit.coefficients**2
         alike = ((degrees > 1) & (degrees % 2 == following % 2)).T @ squares
         lacks = alike <= SYMMETRIC * ((degrees > 1).T @ squares)
-        return np.asarray(np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0))
+        least = np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0)
+        return np.asarray(np.minimum(least, found[2 * places.size :].min(initial=np.inf)))
 
     def beyond(self, points: FloatArray | None = None) -> Beyond:
         """Return what the fit has in tails beyond its samples, or beyond points (n, d)."""
