@@ -34,7 +34,7 @@ FARTHEST = 3.0  # length of a step, in standard deviations of the prior
 STIFFER, SOFTER = 8.0, 3.0
 HALVED = 20  # times that a step of Newton is halved
 ROUNDED = 1e-12  # gain over the log posterior that is rounding
-MOST_STARTS = 32
+MOST_STARTS, ENDED = 32, 0.1
 APART, NEGLIGIBLE = 3.0, 9.0  # deviations between modes, and ln of the weight of one beside the other
 DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
 
@@ -69,7 +69,8 @@ class Laplace:
     modes
         End points (k, c) of the searches, and `ends` (k,), the log posterior there.
     curvatures
-        Gauss–Newton's second derivatives (k, c, c) there; None where nothing is said of other modes.
+        Gauss–Newton's second derivatives (k, c, c) there, NaN where a search has not ended at a mode; None where
+        nothing is said of other modes.
     """
 
     mode: FloatArray
@@ -164,7 +165,7 @@ def laplace(
                 ends.append(found)
         if not ends:
             raise SolveError(f"the model has no answer at any of the {starts} starts of the search for the mode")
-        curvatures = np.array([_positive(end.curvature[0]) for end in ends])
+        curvatures = np.array([_at_mode(end) for end in ends])
         values = np.array([float(end.log_posterior[0]) for end in ends])
         seen = len(_distinct(np.vstack([end.x for end in ends]), curvatures, values))
         enough = seen < 2 or number >= MOST_STARTS or seen * (number - 1) <= (seen + 0.5) * (number - seen - 2)
@@ -190,13 +191,21 @@ def laplace(
     )
 
 
+def _at_mode(end: Density) -> FloatArray:
+    """Second derivatives (c, c) where a search has ended; NaN if it would go on by more than a tenth of a deviation."""
+    gradient, curvature = end.gradient[0], _positive(end.curvature[0])
+    ended = float(gradient @ np.linalg.solve(curvature, gradient)) < ENDED**2
+    return curvature if ended else np.full_like(curvature, np.nan)
+
+
 def _distinct(modes: FloatArray, hessians: FloatArray, ends: FloatArray, log_evidence: float = -np.inf) -> list[int]:
     """Return which of modes (k, c) are apart, by their weights, and not negligible beside the heaviest one.
 
     Or beside what has some evidence; an infinite log posterior is of a mode that comes first.
     """
-    weights = ends - np.linalg.slogdet(hessians)[1] / 2
-    heaviest, found = max(weights[np.isfinite(weights)].max(), log_evidence), list[int]()
+    with np.errstate(invalid="ignore"):
+        weights = ends - np.linalg.slogdet(hessians)[1] / 2
+    heaviest, found = max(weights[np.isfinite(weights)].max(initial=-np.inf), log_evidence), list[int]()
     for k in np.argsort(-weights, kind="stable"):
         gaps = ((modes[k] - modes[j], hessians[k] + hessians[j]) for j in found)
         if weights[k] > heaviest - NEGLIGIBLE and all(gap @ both @ gap > 2 * APART**2 for gap, both in gaps):
