@@ -100,8 +100,7 @@ def test_the_map_of_pressures_begins_where_the_mean_was_solved():
     cost, maps = [], []
     for first in (method.first, None):
         asked = Recorder(method)
-        places = model.space.coordinates
-        maps.append(with_contact(xr.Dataset(), ("indenter",), places, study.inputs, asked, first))
+        maps.append(with_contact(xr.Dataset(), model, study.inputs, asked, first))
         cost.append(dict(zip(WORK, asked.log[0].work[0].tolist(), strict=True)))
     assert cost[0]["factorisations"] <= 2  # one for each step, of its reference
     assert cost[1]["factorisations"] >= 6
