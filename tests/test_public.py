@@ -236,15 +236,19 @@ def test_functions_of_one_name_are_told_apart():
         return f
 
     class Scaled:
+        def __init__(self, k):
+            self.k = k
+
         def __call__(self, p):
-            return [4 * p[0]]
+            return [self.k * p[0]]
 
     def study(function):
         model = {"kind": "python", "function": function, "parameters": {"x": 1.0}, "outputs": ["y"]}
         given = {"x": {"kind": "uniform", "lower": 0, "upper": 2}}
         return tissuq.Study(model=model, parameters=given, method={"kind": "monte-carlo", "samples": 4})
 
-    known = [(made(1.0), 1), (made(10.0), 10), (lambda p: [2 * p[0]], 2), (lambda p: [3 * p[0]], 3), (Scaled(), 4)]
+    known = [(made(1.0), 1), (made(10.0), 10), (lambda p: [2 * p[0]], 2), (lambda p: [3 * p[0]], 3), (Scaled(4.0), 4)]
+    known += [(Scaled(k).__call__, k) for k in (5.0, 6.0)]  # methods hold their object
     studies = [(study(function), size) for function, size in known]
     first = studies[0][0].run()["mean"]
     for one, size in studies:

@@ -29,6 +29,7 @@ from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
 _walked: dict[str, tuple[tuple[object, ...], dict[str, tuple[str, str]]]] = {}  # folders and files of modules, as found
+VALUES = ("__closure__", "__defaults__", "__kwdefaults__", "__self__")  # that a function may hold
 SESSION = "__session__"  # a module of functions that were given themselves, in scripts and notebooks
 _TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
 _refused: ContextVar[list[str] | None] = ContextVar("refused", default=None)  # where not all may be imported
@@ -225,9 +226,10 @@ def path_of(function: Any) -> str:
 
 def _alike(one: Any, other: Any) -> bool:
     """Whether functions are the same: defined once more in a notebook, by code that holds no values of its own."""
-    codes = [getattr(f, "__code__", None) for f in (one, other)]
-    own = any(getattr(f, of, None) for f in (one, other) for of in ("__closure__", "__defaults__", "__kwdefaults__"))
-    return one is other or (codes[0] is not None and codes[0] == codes[1] and not own)
+    codes, around = ([getattr(f, of, None) for f in (one, other)] for of in ("__code__", "__globals__"))
+    own = any(getattr(f, of, None) is not None for f in (one, other) for of in VALUES)
+    same = codes[0] is not None and codes[0] == codes[1] and around[0] is around[1]
+    return one is other or (same and not own)
 
 
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:

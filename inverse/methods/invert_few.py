@@ -279,10 +279,13 @@ def _of_uncertain(
     """
     pull, seen, names = posterior.noise.pull, points.weights[:, None] > 0, inferred.sampled
     count = len(pull) + len(names)
+    process = None if problem.elsewhere is None else inferred.process
+    if not count and process is None:
+        return {}
     residuals = posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None])
     found: Record = {}
-    if inferred.process is not None and problem.elsewhere is not None:
-        means, covariance, beside = inferred.process.given(posterior.noise, residuals)
+    if process is not None:
+        means, covariance, beside = process.given(posterior.noise, residuals)
         found = {"unexplained_point": means, "unexplained_covariance": covariance}
     if not count:
         return found
