@@ -100,7 +100,7 @@ def _band(at: xr.Dataset, kind: str = "") -> tuple[str, str]:
     """A prediction and its interval; of the kind "process_" with what the model does not explain."""
     unit, names = str(at["goal_unit"].item()), ("mean", "std", "lower", "upper")
     mean, std, lower, upper = (float(at[f"prediction_{kind}{name}"]) for name in names)
-    return and_error(mean, std, unit), interval(lower, upper, unit, mean)
+    return and_error(mean, std, unit), interval(lower, upper, unit, max(mean, std, key=abs))
 
 
 @section("population_draw", heading="The population")
