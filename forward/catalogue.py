@@ -12,8 +12,9 @@ TABLE: dict[str, str | Words] = {
     "derivatives-contradicted": "The derivatives that the model states are not those of its values {where}: "
     "{said}{more}. What follows from derivatives (expansions, controls, local sensitivities, modes) is wrong: correct "
     "the jacobian, or leave it out.",
-    "locking": "Displacements alone on {cells} lock at {where}: a cantilever, Cook's membrane and a pressed block, a "
-    "few cells across, were too stiff by factors of {times}; with one cell across it is more. Take {cure}.",
+    "locking": "Displacements alone on {cells} lock at {where}: bodies a few cells across were too stiff by factors of "
+    "{times}. These are a cantilever, Cook's membrane and a pressed block; with one cell across it is more. Take "
+    "{cure}.",
     "followers": "The load {loads} follows the body, so that its stiffness is not symmetric. Stability is judged by "
     "the symmetric part, in which divergence (buckling) shows; flutter shows in no static test.",
     "reduced-body-fails": "The body had no answer at {lost} of the points at which it was solved for its reduced "

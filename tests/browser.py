@@ -208,6 +208,21 @@ def browser() -> Iterator[Page]:
             os.close(from_it)
 
 
+# The words that are read at once, numbers and units among them, without the controls of the body.
+FIRST_SCREEN = """[...document.querySelectorAll('.top')].flatMap((top) => {
+    const walker = document.createTreeWalker(top, NodeFilter.SHOW_TEXT), found = [];
+    while (walker.nextNode()) {
+        const node = walker.currentNode, range = document.createRange(), inside = node.parentElement;
+        range.selectNodeContents(node);
+        const read = !inside.matches('details') && !inside.closest('.viewer, script, style, svg');
+        if (read && inside.checkVisibility() && range.getClientRects().length)
+            found.push(...node.textContent.split(/\\s+/).filter((word) => /[\\p{L}\\p{N}]/u.test(word)));
+    }
+    return found;
+}).join(' ')"""
+WORDS = 120  # of the first screen
+
+
 def without_fault(page: Page, report: Path) -> None:
     """Open a report on a telephone, then on a screen, light, dark and printed: what is wrong with it fails.
 
@@ -232,5 +247,6 @@ def without_fault(page: Page, report: Path) -> None:
                 assert page.run(f"{viewers}.every((v) => v.querySelectorAll('.stills img').length > 0)"), said
             else:  # nothing is wider than the window
                 assert page.run("document.documentElement.scrollWidth") <= width, said
+                assert len((first := page.run(FIRST_SCREEN)).split()) <= WORDS, first
         assert page.run(f"document.querySelectorAll({json.dumps(unnamed)}).length") == 0, said
         assert page.run("document.querySelectorAll('h1').length") == 1, said

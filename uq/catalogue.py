@@ -24,12 +24,12 @@ TABLE: dict[str, str | Words] = {
     "{spread:.2g}: few of them determine the standard deviation, and its 95 % interval may contain the true value "
     "less often. Take more samples.",
     "tails": "The standard deviation of {about} rests on few of its {n} samples, which count as {worth:.0f} (their "
-    "kurtosis is {kurtosis:.3g}): its 95 % interval may contain the true value less often, since larger values may be "
+    "kurtosis is {kurtosis:.3g}). Its 95 % interval may contain the true value less often, since larger values may be "
     "missing. Take more samples.",
     "tails-of-difference": "The standard deviation of {about} rests on few of the {n} samples of the difference "
     "between meshes {coarser} and {level}, which count as {worth:.0f}: its 95 % interval may contain the true value "
     "less often, since larger differences may be missing. Take more samples, or a finer coarsest mesh.",
-    "quantiles-endless": "So few solves do not tell the quantiles of {levels} of {about}: less than one is expected "
+    "quantiles-endless": "So few solves do not tell the quantiles of {levels} of {about}. Less than one is expected "
     "beyond them, and their intervals have no end on that side. Take more solves, or quantiles less far out.",
     "constant": "All {n} samples of {about} are {value:.6g}. If it is no constant, its mean and standard deviation "
     "leave out what happens in up to {unmet:.2g} of all cases, and so do their errors.",

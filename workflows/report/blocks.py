@@ -27,6 +27,16 @@ ALIKE = 1e-12  # standard deviation over the mean up to which values are the sam
 HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 
+def words(*texts: str) -> int:
+    """Count words, and numbers and units among them."""
+    return sum(any(map(str.isalnum, word)) for text in texts for word in text.split())
+
+
+def first_within(limit: int, sizes: Sequence[int]) -> int:
+    """Return how many of the first ones are together within a limit: at least one, if there is one."""
+    return max(int(np.searchsorted(np.cumsum(sizes), limit, side="right")), min(len(sizes), 1))
+
+
 @dataclass(frozen=True)
 class Block:
     """Something on the page; a style and a script that it needs are there once."""
@@ -192,11 +202,24 @@ class Answer:
 
 @dataclass(frozen=True)
 class Card(Block):
-    """The question of a study in words, what is to be read before the answers, and these side by side."""
+    """The question of a study in words, what is to be read before the answers, and these side by side.
+
+    Answers beyond the first `words` words of it are folded, the first one never.
+    """
 
     question: str
     answers: Sequence[Answer] = ()
     before: Sequence[Text] = ()
+    words: int = 80
+
+    @property
+    def parts(self) -> tuple[Sequence[Answer], Sequence[Answer]]:
+        """The answers that are read at once, and those that are folded."""
+        count = first_within(
+            self.words - words(self.question, *(said.text for said in self.before)),
+            [words(one.name, one.value, *one.lines) for one in self.answers],
+        )
+        return self.answers[:count], self.answers[count:]
 
     @property
     def lines(self) -> Sequence[str]:

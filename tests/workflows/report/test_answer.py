@@ -14,7 +14,7 @@ from forward.readable import and_error, interval, percent, quantity, rounded, sc
 from tests.workflows.report.test_report import SVG, solve, study, study_of, write
 from uq.findings import add
 from workflows.report import blocks, plots
-from workflows.report.page import write_report
+from workflows.report.page import render, write_report
 from workflows.report.sections import answer, inversions
 from workflows.report.sections.frame import gravest, told
 from workflows.results import summary
@@ -172,6 +172,15 @@ def test_the_terminal_says_how_many_answers_it_leaves_to_the_report(monkeypatch)
     *listed, last = closing.answers(xr.Dataset({"many": 1.0}), {}, None)
     assert listed == [f"a{k}: 1 m" for k in range(answer.TILES)]
     assert last == "The other 3 are in the tables of the report."
+
+
+@pytest.mark.parametrize(("words", "at_once"), [(0, 1), (9, 1), (10, 2), (80, 3)])
+def test_answers_beyond_the_first_words_are_folded(words, at_once):
+    card = blocks.Card("How much?", [blocks.Answer(f"a{k}", "1 m", ("± 2 mm",)) for k in range(3)], words=words + 2)
+    assert [len(part) for part in card.parts] == [at_once, 3 - at_once]
+    page = render("x", [("answer", [card])])
+    assert page.count("<summary>") == (at_once < 3)
+    assert not any(blocks.Card("How much?").parts)
 
 
 @pytest.mark.parametrize(("notes", "shown"), [(5, 5), (6, 4), (20, 4)])

@@ -777,12 +777,14 @@ class Viewer {
     const many = 6, lines = rows.map((_, i) => i).sort((a, b) => weight(b) - weight(a) || a - b).map((i) => rows[i].line);
     const more = lines.length > many ? [make("details", {}, make("summary", { textContent: `${lines.length - many} more parameters` }), ...lines.slice(many))] : [];
     const loo = x.field ? x.field.loo : null;
-    const error = x.field ? ` The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${loo !== null ? `, whose leave-one-out error is ${digits(100 * loo, 2)} % of the standard deviation` : ""}.` : "";
+    const error = x.field ? `The body is drawn to ${said(x.field.rounding, "m", 2)} of the expansion${loo !== null ? `, whose leave-one-out error is ${digits(100 * loo, 2)} % of the standard deviation` : ""}.` : "";
+    const exact = [error, this.told.sliders.source].filter(Boolean).join(" ");
     const whose = this.told.sliders.source ? "of the expansion and the reduced model" : "of the expansion";
     const miss = Math.max(loo || 0, ...start.map((o) => (o.std > 0 && isFinite(o.error) ? o.error / o.std : 0)));
     const sketch = miss > 0.1 ? [make("p", { className: "warning", textContent: `A sketch: this expansion misses up to ${digits(100 * miss, 2)} % of the standard deviation of what it shows.` })] : [];
-    panel.append(...sketch, make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}${error}${this.told.sliders.source ? ` ${this.told.sliders.source}` : ""}` }),
-      table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free);
+    panel.append(...sketch, make("p", { className: "note", textContent: `Move a slider to fix a parameter: the outputs${x.field ? " and the body" : ""} follow, and what stays random spreads them.${x.joint ? " These parameters depend on each other: those that are not fixed follow, to first order." : ""}` }),
+      table, warning, make("div", { className: "rows" }, ...lines.slice(0, many), ...more), free,
+      ...(exact ? [make("details", {}, make("summary", { textContent: "How exact this is" }), make("p", { className: "note", textContent: exact }))] : []));
     panel.hidden = false;
     shown();
   }

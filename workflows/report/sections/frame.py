@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from forward.findings import Finding
 from forward.readable import NONE, duration, number, settings, size, with_unit
 from uq import findings as of_results
-from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text, Tone
+from workflows.report.blocks import Block, Code, Folded, Heading, Pairs, Table, Text, Tone, first_within, words
 from workflows.report.section import Results, section
 from workflows.report.words import counted, joined, law, solves, stability
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 NOTES = 1  # that are read at once, unless there is something graver
 FIRST = 2  # findings that stand before the answers: errors, and these
 LONG = 25  # words of a finding that is read at once
+WORDS = 30  # of findings that are read at once
 BEFORE = {"best-of-bad", "mesh-unknown", "mesh-not-checked", "mesh-not-estimable"}
 
 
@@ -48,11 +50,13 @@ def findings(results: Results) -> Iterator[Block]:
     found = [one for one in of_results.findings(results.dataset) if one not in before]
     grave = [one for one in found if one.severity != "note"]
     notes = [one for one in found if one.severity == "note"]
-    first = 0 if before or grave else NOTES
-    yield from map(told, [*grave, *notes[:first]])
-    if len(notes) > first:
-        more = len(notes) - first
-        yield Folded(f"{more} {'more ' * bool(first)}note{'s' * (more > 1)}", [Text(one.text) for one in notes[first:]])
+    read = [told(one) for one in grave] or [told(one) for one in notes[: 0 if before else NOTES]]
+    at_once = first_within(WORDS, [words(one.text) for one in read])
+    yield from read[:at_once]
+    for kind, of, first in (("finding", grave, at_once), ("note", notes, 0 if grave else at_once)):
+        if rest := of[first:]:
+            title = f"{len(rest)} {'more ' * (first > 0)}{kind}{'s' * (len(rest) > 1)}"
+            yield Folded(title, [Text(one.text) for one in rest])
 
 
 def gravest(results: Results) -> list[Finding]:
@@ -63,10 +67,10 @@ def gravest(results: Results) -> list[Finding]:
 
 
 def told(one: Finding) -> Text:
-    """Write a finding; of a long one, what follows the first sentence is folded."""
-    first, _, more = one.text.partition(". ")
+    """Write a finding; of a long one, what follows the first sentence, or part of one, is folded."""
     tone: Tone = "" if one.severity == "note" else one.severity
-    return Text(f"{first}.", tone, more) if more and len(one.text.split()) > LONG else Text(one.text, tone)
+    found = re.match(r"(.+?[.;]) (.+)", one.text) if words(one.text) > LONG else None
+    return Text(one.text, tone) if found is None else Text(found[1].replace(";", "…"), tone, found[2])
 
 
 @section("nominal", heading="What was computed")
