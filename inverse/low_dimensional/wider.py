@@ -1,11 +1,9 @@
 """A posterior with further unknowns that are standard normal beforehand, such as strengths or standard deviations.
 
-With the gradient g and the second derivatives C⁻¹ of −ln of the posterior at its mode x̂, the mean is near
-
-    x̂ − ½ C Σ_k (g(x̂ + v_k) − 2 g(x̂) + g(x̂ − v_k)),   Σ_k v_k v_kᵀ = C,
-
-by third derivatives (L. Tierney, J. B. Kadane, J. Am. Stat. Assoc. 81 (1986) 82–86). Of these v, those of a Cholesky
-factor with the further unknowns first hold all that these are otherwise by; along the others they stay.
+What is missed where these are integrated out to first order, three points of each tell (Gauss and Hermite), along the
+Cholesky factor of their covariance, with the parameters on their regression on them. Given the further unknowns there,
+the posterior of the parameters is nearly a Gaussian, one Newton step away; their moments are those of the mixture, each
+weighted by what its Gaussian holds of the density.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
-from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.request import Evaluate
 from uq.surrogates.linearisation import linearise
 
@@ -81,15 +79,35 @@ def widened(
     return Wider(found, np.append(x[0], mode[d:]), own, new)
 
 
-def missed(wider: Wider) -> FloatArray:
-    """Return how far the means of the d parameters are moved, in deviations, by third derivatives along the others.
+def missed(wider: Wider, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return what first order misses of the d parameters: of their means, in deviations, and of ln deviation.
 
-    That is what is missed where the others are integrated out to first order. NaN where the model has no answer.
+    `covariance` (c, c) is that of the posterior to first order. NaN where the model has no answer.
     """
     posterior, new = wider.posterior, wider.new
+    rest = np.setdiff1d(np.arange(len(wider.first)), new)
+    own = np.searchsorted(rest, wider.own)
     here = posterior.at(wider.first[None], derivatives=True)
-    covariance = np.linalg.inv(here.curvature[0])
-    lines = np.linalg.solve(np.linalg.cholesky(covariance[np.ix_(new, new)]), covariance[new])
-    ends = posterior.at(np.vstack([wider.first + lines, wider.first - lines]), derivatives=True)
-    bent = ends.gradient.sum(axis=0) - 2 * len(new) * here.gradient[0]
-    return np.asarray(-(covariance @ bent)[wider.own] / np.sqrt(np.diag(covariance)[wider.own]) / 2)
+    joint = np.linalg.inv(here.curvature[0])
+    lines = np.sqrt(3) * np.linalg.solve(np.linalg.cholesky(joint[np.ix_(new, new)]), joint[new])
+
+    def given(at: Density) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Means and variances of the rest, given the further unknowns, and what the Gaussian holds of the density."""
+        gradient, inverse = at.gradient[:, rest], np.linalg.inv(at.curvature[:, rest[:, None], rest])
+        step = -np.einsum("zce,ze->zc", inverse, gradient)
+        held = at.log_posterior - ((gradient * step).sum(axis=1) - np.linalg.slogdet(inverse)[1]) / 2
+        return at.x[:, rest] + step, np.diagonal(inverse, axis1=1, axis2=2), held
+
+    mean, variance, middle = given(here)
+    far, wide, held = given(posterior.at(np.vstack([wider.first + lines, wider.first - lines]), derivatives=True))
+    pairs = np.exp(held - middle + 1.5).reshape(2, len(new)) / 6  # e^(3/2): beside the density of the normal there
+    weights = np.vstack([np.full(len(new), 2 / 3), pairs])[:, :, None]
+    weights = weights / weights.sum(axis=0)
+    means = np.stack([np.broadcast_to(mean, (len(new), len(rest))), *far.reshape(2, len(new), len(rest))])
+    variances = np.stack([np.broadcast_to(variance, (len(new), len(rest))), *wide.reshape(2, len(new), len(rest))])
+    mixed = (weights * means).sum(axis=0)
+    spread = (weights * (variances + (means - mixed) ** 2)).sum(axis=0)
+    moved = (mixed - mean).sum(axis=0) - (joint @ here.gradient[0])[rest]
+    widths = (variance + (spread - variance).sum(axis=0))[0]
+    before = np.diag(covariance)[: len(own)]
+    return (moved / np.sqrt(np.diag(joint)[rest]))[own], np.log(widths[own] / before) / 2

@@ -35,6 +35,7 @@ from uq.surrogates.linearisation import linearise
 
 # What data share is found anew at most so often, until the mode moves less, in deviations: the next move is a tenth.
 ROUNDS, SETTLED = 4, 0.5
+WIDE = 0.15  # ln of how much narrower or wider an answer may be than to first order in what is uncertain
 
 Starts = Callable[[FloatArray], "Start | None"]  # parameters (d,) → what predicts states near there; None if nothing
 
@@ -212,7 +213,8 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
         recorder = Recorder(sampled.evaluate)
         with suppress(SolveError):  # there is no answer to any of them at the mode
             wider, parts = _sampling(first, assumed, sampled, recorder), replace(steps.of("sampled"), recorder=recorder)
-            if not (np.abs(missed(wider)) <= BENT).all():  # or it is not known
+            means, widths = np.abs(missed(wider, np.linalg.inv(gaussian.hessian)))
+            if not (means <= BENT).all() or not (widths <= WIDE).all():  # or they are not known
                 gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
                 problem.say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
                 found, unknown = AtMode(wider.posterior, gaussian), sampled.names
