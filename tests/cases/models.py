@@ -24,6 +24,12 @@ def oscillation(p: ArrayLike) -> float:
     return float(np.cos(0.6 * np.pi + WAVES @ np.asarray(p)))
 
 
+def late(p: ArrayLike) -> float:
+    """A line that is twice as steep beyond two deviations, as where a contact begins."""
+    z = float(np.asarray(p)[0])
+    return z + max(z - 2, 0.0)
+
+
 def event(p: ArrayLike) -> float:
     """What happens with probability 0.03: z above its quantile of 97 %."""
     return float(np.asarray(p)[0] > 1.8807936)

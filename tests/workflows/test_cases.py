@@ -88,6 +88,15 @@ def test_an_event_that_no_sample_has_met(run, method, samples):
     assert f"up to {missed:.2g} of all cases may be missed" in said[0]
 
 
+def test_a_kink_that_no_sample_has_met(run):
+    """The line alone is known to rounding; what one solve in forty would show is said to be in no error."""
+    code, summary, _ = run("event", "model.function='models.late'", "model.outputs=['force']")
+    told, (said,) = summary["accuracy"], summary["findings"]
+    assert (code, told["kept"], said["severity"]) == (DONE, True, "note")
+    assert f"as far as {told['seen']} solves tell" in said["text"]
+    assert f"up to {1 - 0.05 ** (1 / told['seen']):.2g} of all cases" in said["text"]
+
+
 @pytest.mark.fem
 def test_a_column_beyond_buckling(run):
     code, summary, results = run("column", "method.samples=20")

@@ -272,6 +272,7 @@ def _told(study: SamplingBlocks, found: xr.Dataset, asked: Goal, before: dict[st
         "reached": float(asked.tolerance * parts["total"][row, column]),
         "kept": known and not missed and bool((parts["total"] <= 1).all()),
         "unmet": missed,
+        "seen": int(found["ok"].sum()),
         "worst": {"output": names[column], "of": IN_WORDS[ESTIMATED[row]]},
         "shares": {source: float(parts[source][row, column]) for source in words.SOURCES},
         "method": chosen["method"],

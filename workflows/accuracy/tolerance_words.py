@@ -11,6 +11,7 @@ from forward.findings import Finding, entries
 from forward.readable import number
 from forward.scalars import Mistake
 from uq.accuracy.budget import LEAST, OF_SOLVER
+from uq.estimators.doubts import unmet
 from uq.methods.method import UNASKED
 from workflows.accuracy.levers import AIMING, AUTOMATIC, Assessed, MeshLever, Reach, Step, most
 from workflows.studies.predictions import never_estimable
@@ -153,11 +154,13 @@ def of_mesh(found: Mapping[str, Any]) -> str:
 
 
 def missed(study: SamplingBlocks, told: Mapping[str, Any]) -> Iterator[Finding]:
-    """Say that the tolerance is not kept, and what keeps it from being so."""
+    """Say that the tolerance is not kept, and what keeps it from being so; or how much may be unseen where it is."""
     worst, shares, mesh = told["worst"], told["shares"], told["mesh"]
-    if told["kept"]:
-        return
     asked = {"tolerance": told["tolerance"]}
+    if told["kept"]:
+        if (share := unmet(told["seen"])) > told["tolerance"]:
+            yield Finding("tolerance-unseen", "note", {"n": told["seen"], "share": share})
+        return
     if told["unmet"]:
         values = asked | {"share": max(told["unmet"].values())}
         yield Finding("tolerance-constants", "error", values, about=entries(told["unmet"]))
