@@ -82,8 +82,8 @@ TABLE: dict[str, str | Words] = {
     "tolerance-constants": "accuracy.tolerance = {tolerance:g} is not known to be reached: all samples of {about} are "
     "the same, so that what happens in up to {share:.2g} of all cases may be missed, and with it any part of mean and "
     "standard deviation. Leave a constant out of the outputs; to meet an event, give a [method] with many samples.",
-    "tolerance-unseen": "The tolerance is kept as far as {n:,} solves tell: of a jump or a kink that none of them has met, "
-    "in up to {share:.2g} of all cases, no error knows.",
+    "tolerance-unseen": "The tolerance is kept as far as {n:,} solves tell: of a jump or a kink that none of them has "
+    "met, in up to {share:.2g} of all cases, no error knows.",
     "prior-inadmissible": "{share} of the prior is of materials that are not stable at rest (μ or κ is not positive): "
     "it has no weight, and the prior is scaled up where there is a material.",
     "mesh-refined": REFINED + ".",
