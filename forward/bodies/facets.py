@@ -18,6 +18,7 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
+from forward.bodies.location import locate, shapes
 from forward.bodies.mesh import IntArray, Loaded, edges_of, surface_of
 from forward.model import FloatArray
 
@@ -30,8 +31,11 @@ PARALLEL = 0.2  # singular value below which normals of parts that meet are the 
 def lifted(mesh: Loaded) -> Loaded | None:
     """Return a body with the same cells, moved so that facets hide nothing on average; None where facets hide nothing.
 
-    Vertices inside follow those of the surface.
+    Vertices inside follow those of the surface. Of a mesh that was made from another one, the facets of that one count:
+    most of its own lie in one plane with their neighbours.
     """
+    if mesh.lift is not None:
+        return replace(mesh, points=mesh.points + mesh.lift, lift=None) if mesh.lift.any() else None
     facets, normals = _surface(mesh)
     pairs = _neighbours(facets)
     turns = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1)  # cosines
@@ -56,6 +60,13 @@ def lifted(mesh: Loaded) -> Loaded | None:
     for vertex, parts in seen.items():
         shifts[vertex] = np.linalg.pinv([one for one, _ in parts], rcond=PARALLEL) @ [height for _, height in parts]
     return replace(mesh, points=mesh.points + _followed(mesh, np.array(sorted(seen)), shifts))
+
+
+def lift_of(mesh: Loaded, whole: Loaded, points: FloatArray) -> FloatArray:
+    """Return what facets of a mesh hide at points (n, 3) in its cells, linear between vertices that were moved."""
+    at = locate(mesh.points[mesh.cells], points)
+    shifts = (whole.points - mesh.points)[mesh.cells[at.cells]]
+    return np.asarray(np.einsum("nk,nka->na", shapes(at.local, mesh.cells.shape[1]), shifts))
 
 
 def _surface(mesh: Loaded) -> tuple[IntArray, FloatArray]:

@@ -70,6 +70,9 @@ class Loaded:
         Number of the region of each cell.
     slits
         Areas (m²) of closed slits by the names of their boundaries; "" for what is in none.
+    lift
+        What facets hide at the vertices (n, 3) in m (`forward.bodies.facets`), if it is known of the mesh that this one
+        was made from.
     """
 
     points: FloatArray
@@ -79,6 +82,7 @@ class Loaded:
     regions: tuple[str, ...]
     region: IntArray
     slits: dict[str, float] = field(default_factory=dict)
+    lift: FloatArray | None = None
 
 
 class Contents(Settings):

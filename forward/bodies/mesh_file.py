@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -19,6 +20,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
+from forward.bodies.facets import lifted
 from forward.bodies.location import locate, nearest_of
 from forward.bodies.mesh import (
     CLOSE,
@@ -48,6 +50,10 @@ MOST_NODES = 20_000_000
 def _loaded(digest: str, known: Mapping[str, Any]) -> Loaded:
     """Read the file of a body, of known hash, and divide its cells as the fields of the body say."""
     mesh = load(known["file"], digest, known["unit"], tuple(known["names"].items()), known["tags"])
+    return _divided(mesh, known)
+
+
+def _divided(mesh: Loaded, known: Mapping[str, Any]) -> Loaded:
     for _ in range(known["levels"]):
         mesh = divided(mesh, ())
     return mesh if known["divide"] is None else divided(mesh, known["divide"])
@@ -136,6 +142,15 @@ class MeshFile(Settings):
             message = f"model.body.file: {self.file} is not the file that the study was made for: it has changed"
             raise ModelError(message)
         return _loaded(digest, vars(self))
+
+    def lifted(self) -> Loaded | None:
+        """Return the mesh with its surface moved by what facets hide (`forward.bodies.facets`); None where they do not.
+
+        These are the facets of the file: of cells that were divided, most lie in one plane with their neighbours.
+        """
+        mesh = self.load()
+        whole = lifted(self.model_copy(update={"levels": 0, "divide": None}).load())
+        return None if whole is None else replace(mesh, points=_divided(whole, vars(self)).points)
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
         """Return the body with every cell divided into eight, thinner ones at some boundaries.

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 FLAT = 1e-10  # volume of a cell over the cube of its longest edge that counts as zero
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
 BOUNDARY = "boundary "  # before the name of a boundary, in a mesh of our own
+LIFT = "lift"  # name of the array
+LIFT = "lift"  # name of the array
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
 _MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write
@@ -100,6 +102,7 @@ def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
             boundaries = {
                 name.removeprefix(BOUNDARY): arrays[name] for name in arrays.files if name.startswith(BOUNDARY)
             }
+            lift = unit * arrays[LIFT] if LIFT in arrays.files else None
             _check_geometry(points, cells, "tetrahedron", twins_of(points), refuse)
     except ModelError:
         raise
@@ -107,7 +110,7 @@ def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
         if out_of_memory(error):
             raise
         refuse(f"cannot be read as a mesh: {(str(error).splitlines() or [type(error).__name__])[0]}")
-    return Loaded(points, cells, "tetrahedron", boundaries, regions, region)
+    return Loaded(points, cells, "tetrahedron", boundaries, regions, region, lift=lift)
 
 
 def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]:

@@ -17,7 +17,7 @@ from forward.bodies.bisection import Bisected
 from forward.bodies.geometry import AXES, Block, Body, Box
 from forward.bodies.mesh import CORNERS, Contents, IntArray, Loaded, contents, faces_of
 from forward.bodies.mesh_file import MOST_NODES, MeshFile
-from forward.bodies.mesh_reading import BOUNDARY
+from forward.bodies.mesh_reading import BOUNDARY, LIFT
 from forward.model import FloatArray, ModelError
 
 INDICATORS = "indicators"  # name of the array
@@ -90,10 +90,11 @@ class MeshInMemory(MeshFile):
 def packed(mesh: Loaded, indicators: FloatArray | None = None) -> bytes:
     """Return a mesh as a file (.npz) that a `MeshFile` can name; equal meshes give equal bytes.
 
-    It holds how much each cell (c,) adds to errors too, where that is known.
+    It holds how much each cell (c,) adds to errors too, and what facets hide, where that is known.
     """
     facets = {f"{BOUNDARY}{name}": facets for name, facets in mesh.boundaries.items()}
     shares = {} if indicators is None else {INDICATORS: indicators}
+    shares |= {} if mesh.lift is None else {LIFT: mesh.lift}
     arrays = {"points": mesh.points, "cells": mesh.cells, "regions": np.array(mesh.regions), "region": mesh.region}
     file = BytesIO()
     np.savez_compressed(file, **arrays, **facets, **shares)

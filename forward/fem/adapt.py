@@ -11,12 +11,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.bisection import Bisected
+from forward.bodies.facets import lift_of
 from forward.bodies.mesh import Contents, IntArray, Loaded, contents
 from forward.bodies.tetrahedra import MeshInMemory, tetrahedra
 from forward.fem.calibration import moved
@@ -120,17 +122,20 @@ def adapt(
     """
     settings = spec.adapt
     assert settings is not None
-    marked, place, before = None, None, None
+    marked, place, before, lift = None, None, None, None
     if comm.rank == 0:
         first, place = tetrahedra(spec.body)
         marked = Bisected.of(first)
+        if spec.body.kind == "mesh" and (whole := spec.body.lifted()) is not None:
+            lift = partial(lift_of, first, whole)
     found: Adapted | None = None
     cycles: tuple[Cycle, ...] = ()
     while True:
         mesh = None
         if marked is not None and place is not None:
             mesh = marked.loaded()
-            mesh = replace(mesh, points=place(mesh.points))
+            points = place(mesh.points)
+            mesh = replace(mesh, points=points, lift=None if lift is None else lift(points))
         held = comm.bcast(None if mesh is None else contents(mesh, ""))
         finer = spec.model_copy(update={"body": MeshInMemory.of(mesh, held, spec.body)})
         if found is not None:

@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from forward.bodies.facets import lifted
 from forward.bodies.mesh import contents
 from forward.bodies.tetrahedra import MeshInMemory
 from forward.fem.body import DiscreteBody
@@ -165,7 +164,7 @@ class FinerMesh:
         file = spec.body
         if file.kind != "mesh":
             return None
-        mesh = on_first(comm, lambda: lifted(file.load()))
+        mesh = on_first(comm, file.lifted)
         held = comm.bcast(None if mesh is None else contents(mesh, ""))
         if held is None:
             return None

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
 from uq.estimators import failure_domain
@@ -101,6 +102,9 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         settled(found, units)
         add(found, *locking)
+        body = study.spec.bodies[0].body if of_body and len(study.meshes) > 1 else None
+        if body is not None and body.kind == "mesh" and body.lifted() is not None:
+            add(found, Finding("facets-uncounted", "warning"))
         if of_body:
             solved, kind_of_cell = recorders["/"], model.spec.body.cell
             points = np.concatenate([one.points for one in solved.log])

@@ -1,12 +1,17 @@
 """What flat facets hide of curved surfaces: of balls, pipes and creases, and in the outputs of a sphere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from benchmarks.facets import INNER, OUTER, body, exact, octant
-from forward.bodies.facets import lifted
+from forward.bodies.bisection import Bisected
+from forward.bodies.facets import lift_of, lifted
 from forward.bodies.mesh import TETRAHEDRA, Loaded
+from forward.bodies.mesh_file import MeshFile
+from forward.bodies.tetrahedra import packed
 from tests.launch import on_kept_ranks
 from tests.meshes import box
 
@@ -36,6 +41,35 @@ def test_the_volume_of_a_hollow_ball_is_found(cell, along):
     assert np.abs(moved[np.abs(points) < 1e-12]).max() < 1e-12
     radii = np.linalg.norm(moved, axis=1) / np.linalg.norm(points, axis=1)
     assert (radii > 1 - 1e-12).all()  # inside too, where vertices follow
+
+
+@pytest.mark.parametrize("changes", [{"levels": 1}, {"divide": ()}, {"levels": 1, "divide": ()}])
+def test_a_divided_mesh_hides_what_the_file_does(tmp_path, changes):
+    """Its new facets lie in one plane with their neighbours, those of the file do not."""
+    whole = body(tmp_path, "tetrahedron", 3, 2).body
+    before, after = whole.load(), whole.lifted()
+    divided = whole.model_validate(whole.model_dump(exclude={"contents"}) | changes)
+    moved = divided.lifted().points - divided.load().points
+    n = len(before.points)  # vertices of the file come first
+    np.testing.assert_allclose(moved[:n], after.points - before.points, rtol=0, atol=1e-15)
+    assert len(moved) > 4 * n
+    assert np.linalg.norm(moved, axis=1).max() == pytest.approx(np.linalg.norm(moved[:n], axis=1).max())
+
+
+def test_a_mesh_that_was_refined_hides_what_the_first_one_does(tmp_path):
+    """Also as a file, and divided further."""
+    first = body(tmp_path, "tetrahedron", 2, 1).body
+    before, after = first.load(), first.lifted()
+    finer = Bisected.of(before).refined(np.arange(0, len(before.cells), 3)).loaded()
+    finer = replace(finer, lift=lift_of(before, after, finer.points))
+    volumes = [volume(at.points, at.cells) for at in (before, after, finer, lifted(finer))]
+    assert volumes[2] == pytest.approx(volumes[0])
+    assert volumes[3] == pytest.approx(volumes[1])
+    assert len(finer.points) > len(before.points)
+    (tmp_path / "mesh.npz").write_bytes(packed(finer))
+    read = MeshFile(file=str(tmp_path / "mesh.npz"), levels=1).lifted()
+    assert volume(read.points, read.cells) == pytest.approx(volumes[1])
+    assert lifted(replace(finer, lift=0 * finer.lift)) is None
 
 
 @pytest.mark.unit
