@@ -44,6 +44,10 @@ TABLE: dict[str, str | Words] = {
     "tool-misses": "In some samples loads.{label} {what}: at {where}.",
     "spot-narrow": "loads.{label}.width = {wide} is below half the distance of nodes ({apart}): the mesh hardly sees "
     "the spot.",
+    "spot-lost": "Only {share} of the force of loads.{label} acts on '{boundary}'{where}: the rest lies beyond it, and "
+    "is lost.",
+    "field-short": "fields.{label}.length = {length} is below a cell ({cell}). The field is linear between vertices: "
+    "its means over parts of the body, and what follows from them, vary too much. Refine the mesh.",
     "body-size": "model.body.unit = {unit:g} makes the body {extent} long: is that meant? Coordinates in millimetres "
     "have unit = 1e-3",
     "slit": "The mesh has a closed slit of {area}{named}: faces that lie on each other with points of their own, which "

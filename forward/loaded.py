@@ -172,6 +172,7 @@ class LoadedBody(Solid):
             *moved_points(self.body, points),
             *self._of_followers(),
             *(finding for load in self.loads for finding in load.findings(self.body)),
+            *(finding for field in self.fields for finding in field.findings(self.body)),
         )
 
     def _of_followers(self) -> Iterator[Finding]:

@@ -84,6 +84,8 @@ TABLE: dict[str, str | Words] = {
     "standard deviation. Leave a constant out of the outputs; to meet an event, give a [method] with many samples.",
     "tolerance-unseen": "The tolerance is kept as far as {n:,} solves tell: of a jump or a kink that none of them has "
     "met, in up to {share:.2g} of all cases, no error knows.",
+    "field-truncated": "The modes of fields.{name} keep {kept} of its variance: what the others would add to the "
+    "spread is in no number. More modes keep more, basis = 'noise' all.",
     "prior-inadmissible": "{share} of the prior is of materials that are not stable at rest (μ or κ is not positive): "
     "it has no weight, and the prior is scaled up where there is a material.",
     "mesh-refined": REFINED + ".",

@@ -10,7 +10,7 @@ Vertices are in canonical order (`forward.fem.layout`). Nothing here depends on 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -21,7 +21,9 @@ from pydantic import Field, model_validator
 
 from forward.bodies.geometry import Body, Count, Length
 from forward.bodies.selected_inverse import Dissection
+from forward.findings import Finding
 from forward.model import FloatArray
+from forward.readable import told
 from forward.settings import Settings
 
 if TYPE_CHECKING:
@@ -93,6 +95,12 @@ class RandomField(Settings):
             wanted = "a number of modes" if self.basis == "modes" else "no modes"
             raise ValueError(f"basis = '{self.basis}', expected {wanted}")
         return self
+
+    def findings(self, body: Body) -> Iterator[Finding]:
+        """Say where the mesh is too coarse for it."""
+        if self.length < body.longest_edge:
+            length, cell = told(self.length, "m"), told(body.longest_edge, "m", 3)
+            yield Finding("field-short", "warning", {"label": self.label, "length": length, "cell": cell})
 
     def prior(self, body: Body) -> NodalPrior:
         """Return the distribution of the values at the vertices of a body: the parameters of `basis` "nodes"."""

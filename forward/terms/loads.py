@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -10,9 +11,23 @@ import numpy as np
 from annotated_types import Ge, Gt, Unit
 
 from forward.bodies.geometry import Body, Direction, unit_vector
+from forward.bodies.mesh import fan
+from forward.bodies.surface import facets
 from forward.findings import Finding
 from forward.readable import listed, told
 from forward.terms.term import Place, Term
+
+PLACED = ("x", "y", "z", "width")  # numbers of a spot by which it reaches over an edge
+WHOLE = 0.9  # share of a spot on its boundary, from which on nothing is said
+PARTS = 12  # of the edges of a triangle, over which a spot is integrated
+INSIDE = np.array(
+    [
+        ((3 * i + k) / (3 * PARTS), (3 * j + k) / (3 * PARTS), 1 - (3 * (i + j) + 2 * k) / (3 * PARTS))
+        for k in (1, 2)
+        for i in range(PARTS + 1 - k)
+        for j in range(PARTS + 1 - k - i)
+    ]
+)  # centres of its parts
 
 
 class Gravity(Term):
@@ -97,11 +112,32 @@ class Spot(Term):
         return -density * ufl.dot(at.constant(unit_vector(self.direction)), at.u) * at.on(self.on)
 
     def findings(self, body: Body) -> Iterator[Finding]:
-        """Say where the spot is too small for the mesh."""
+        """Say where the spot is too small for the mesh, or beyond the boundary."""
         edge = body.longest_edge / body.degree
         if self.width < edge / 2:
             wide, apart = told(self.width, "m", 6), told(edge, "m", 3)
             yield Finding("spot-narrow", "warning", {"label": self.label, "wide": wide, "apart": apart})
+        yield from self.findings_over(body, {})
+
+    def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+        """Say how much of the force is lost, at most, at the ends of ranges."""
+        stated = {name: scalar.value for name, scalar in self.scalars.items()}
+        own = {name: ends for name, ends in ranges.items() if name in PLACED}
+        triangles = fan(facets(body, self.on))
+        points = np.einsum("qk,nka->nqa", INSIDE, triangles).reshape(-1, 3)
+        sides = triangles[:, 1:] - triangles[:, :1]
+        areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+        shares = {}
+        for ends in itertools.product(*own.values()):
+            numbers = stated | dict(zip(own, ends, strict=True))
+            squares = ((points - [numbers[axis] for axis in "xyz"]) ** 2).sum(axis=1) / numbers["width"] ** 2
+            density = np.exp(-squares / 2).reshape(len(areas), -1).mean(axis=1)
+            shares[ends] = float(areas @ density) / (2 * math.pi * numbers["width"] ** 2)
+        worst = min(shares, key=lambda ends: shares[ends])
+        if shares[worst] < WHOLE:
+            where = ", ".join(f"{name} = {value:.3g}" for name, value in zip(own, worst, strict=True))
+            values = {"label": self.label, "share": f"{100 * shares[worst]:.2g} %", "boundary": self.on}
+            yield Finding("spot-lost", "warning", values | {"where": f" at {where}" if own else ""})
 
     def words(self, numbers: Mapping[str, str]) -> str:
         place = ", ".join(numbers[name] for name in "xyz")

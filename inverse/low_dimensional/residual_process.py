@@ -96,7 +96,7 @@ def process(posterior: Posterior, at: Density, data: Measurements, elsewhere: Me
     noise, scale, d = posterior.noise, posterior.scale(at.x)[0], len(posterior.inputs.names)
     A, unit = posterior.sensitivities(at)[0], float(np.median(scale))
     start = unexplained(A, posterior.residuals(at.outputs, at.x) - A @ at.x[0, :d])[0]
-    lengths = LENGTHS * np.ptp(data.places[data.placed], axis=0).max()
+    lengths = LENGTHS * (np.ptp(data.places[data.placed], axis=0).max() or 1.0)  # at one place, all are the same
     kernels = [correlation(data, data, length) for length in lengths]
 
     def log_evidence(kernel: FloatArray, squares: FloatArray) -> FloatArray:

@@ -39,7 +39,7 @@ class Method(Settings):
     undecided
         What the planned solves are for, if they decide how many more there are; otherwise empty.
     in_turn
-        Whether it takes draws of equal weight in turn (`Inputs.random`).
+        Whether it takes draws of equal weight in turn (`Inputs.random`), and its errors are those of the draws too.
     """
 
     undecided: ClassVar[str] = ""

@@ -201,6 +201,7 @@ class SensitivityMonteCarlo(MonteCarlo):
         "quadratic" controls it by the square of the tangent, "linear" is the published form.
     """
 
+    in_turn: ClassVar[bool] = False  # the mean of the control is that of all draws
     kind: Literal["sensitivity-monte-carlo"] = "sensitivity-monte-carlo"  # type: ignore[assignment]
     coefficient: Coefficient = "one"
     second_moment: SecondMoment = "quadratic"

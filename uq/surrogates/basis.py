@@ -79,7 +79,8 @@ class Joint:
     def number(self, indices: IntArray) -> IntArray:
         """Return which functions (P,) have the degrees of multi-indices (P, d) of all parameters."""
         numbers = {index.tobytes(): i for i, index in enumerate(self.indices)}
-        return np.array([numbers[index.tobytes()] for index in np.ascontiguousarray(indices[:, self.members])])
+        found = [numbers[index.tobytes()] for index in np.ascontiguousarray(indices[:, self.members])]
+        return np.array(found, dtype=np.int64)
 
 
 def hermite(t: FloatArray, degree: int) -> FloatArray:

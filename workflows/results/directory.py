@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.errors import Error
+from forward.findings import Finding
 from forward.machine import write_whole
 from forward.readable import per
+from uq.findings import add
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
 from workflows.results.surfaces import tool_grid, tools_of
@@ -29,6 +31,7 @@ TETRAHEDRON = 10  # of VTK
 AXES = 3
 # Of arrays that are not numbers, other than displacements and their derivatives.
 UNITS = {"stress": "Pa", "von_mises": "Pa", "moved": "m", "indicator by volume": "1/m³"}
+MOST = 0.9  # of the variance of a random field: modes that keep less leave out what is worth a word
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 
@@ -95,6 +98,8 @@ def with_random_fields(
         return dataset
     dataset = dataset.assign_coords(random_field=list(variance_kept))
     dataset = dataset.assign(variance_kept=(("random_field",), list(variance_kept.values())))
+    few = [(name, f"{kept:.0%}") for name, kept in variance_kept.items() if kept < MOST]
+    add(dataset, *(Finding("field-truncated", "note", {"name": name, "kept": kept}) for name, kept in few))
     if "node" in dataset.dims:
         values = np.array([factors[name] for name in variance_kept])
         dataset = dataset.assign(factor=(("random_field", "realisation", "node"), values))

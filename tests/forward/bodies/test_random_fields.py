@@ -16,6 +16,7 @@ from tests.matern import correlation, inflation, precision
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
+from uq.findings import findings
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo, _JointMoments
@@ -428,8 +429,18 @@ def test_a_study_shows_its_fields(tmp_path):
     ]
     expansion = study.model.fields[0].on(study.model.body)
     assert float(dataset["variance_kept"].sel(random_field="stiffness")) == pytest.approx(expansion.kept, rel=1e-12)
+    assert ("field-truncated" in [one.code for one in findings(dataset)]) == (expansion.kept < 0.9)
     first = np.exp(expansion.offset + expansion.values(dataset["points"].to_numpy()[0]))  # the first sample
     np.testing.assert_allclose(dataset["factor"].sel(random_field="stiffness")[0], first, rtol=1e-12)
     report = (tmp_path / "field" / "report.html").read_text(encoding="utf-8")
     for words in ("fields.stiffness.0 to 4", "Matérn correlation of length 0.1 m", "of the variance of the field"):
         assert words in report
+
+
+@pytest.mark.unit
+def test_a_field_that_is_shorter_than_the_cells_says_so():
+    body = Box(size=(0.08, 0.02, 0.02), cells=(8, 2, 2))
+    assert [one.code for one in RandomField(of="stiffness", length=0.009, std=0.4, basis="noise").findings(body)] == [
+        "field-short"
+    ]
+    assert not list(RandomField(of="stiffness", length=0.02, std=0.4, basis="noise").findings(body))

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from forward.bodies.geometry import Box
 from forward.conformance import check_derivatives
+from forward.terms.loads import Spot
 from forward.terms.term import Term
 from tests.bodies import loaded_body
 from tests.launch import report_of_own
@@ -145,6 +147,30 @@ seed = 1
 @pytest.mark.slow
 def test_a_study_with_springs_is_checked_and_run(outside, undrawn):
     assert "Springs: on = x-max, k = random" in report_of_own(outside, STUDY)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("place", "share"),
+    [((0.5, 0.5, 0.3), 1.0), ((1.0, 0.5, 0.3), 0.5), ((0.5, 0.5, 0.2), np.exp(-1 / 2.88)), ((1.0, 1.0, 0.3), 0.25)],
+)
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
+def test_a_spot_that_misses_its_boundary_says_so(place, share, kind):
+    """Of a Gaussian bell on a square, at an edge, a corner and off the face."""
+    body = Box(size=(1.0, 1.0, 0.3), cells=(5, 5, 1), cell=kind)
+    x, y, z = place
+    spot = Spot(on="z-max", direction=(0, 0, -1), size=2.0, x=x, y=y, z=z, width=0.12)
+    said = [one.text for one in spot.findings(body) if one.code == "spot-lost"]
+    assert said == (
+        []
+        if share == 1
+        else [
+            f"Only {100 * share:.2g} % of the force of loads.spot acts on 'z-max': the "
+            "rest lies beyond it, and is lost."
+        ]
+    )
+    (over,) = (one for one in spot.findings_over(body, {"y": (0.5, 1.5), "size": (1.0, 2.0)}))
+    assert "at y = 1.5" in over.text
 
 
 def test_a_spot_is_a_force_of_its_size_that_moves_with_its_place():

@@ -160,3 +160,16 @@ def test_too_many_data_and_data_at_no_place(monkeypatch):
     monkeypatch.setattr(residual_process, "MOST", 10)
     with pytest.raises(SolveError, match=r"data\.errors\.process: 90 data, expected at most 10"):
         with_process(one, best, DATA)
+
+
+def test_one_point_in_two_load_cases_has_no_length():
+    """All lengths are the same there: the process is an error of each case that its components do not share."""
+    at_one = Measurements.of_points(
+        X[:1].repeat(2, axis=0), np.zeros((2, 3)), np.full((2, 3), SIGMA), np.array([0, 1]), ["p"] * 2, ("one", "two")
+    )
+    rows = A[:6]
+    model = FunctionModel(lambda p: rows @ p, INPUTS.names, NAMES[:6], lambda p: rows)
+    one = Posterior(INPUTS, SerialEvaluate(model), rows @ [0.5, -1.0] + 0.3, Noise(np.full(6, SIGMA)))
+    found = process(one, one.at(laplace(one, starts=1).mode[None], derivatives=True), at_one)
+    covariance = found.rows.T @ found.rows
+    np.testing.assert_allclose(covariance, covariance[0, 0] * np.eye(6), atol=2e-3 * SIGMA**2)

@@ -225,7 +225,13 @@ def test_one_parameter_of_draws_is_independent():
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    "method", [MonteCarlo(samples=200), QuasiMonteCarlo(samples=256), Chaos(samples=12, max_order=2, quantiles=())]
+    "method",
+    [
+        MonteCarlo(samples=200),
+        QuasiMonteCarlo(samples=256),
+        Chaos(samples=12, max_order=2, quantiles=()),
+        SensitivityMonteCarlo(samples=64),
+    ],
 )
 def test_errors_count_that_draws_are_few(method):
     """95 % intervals of the mean and the standard deviation of the normal distribution that draws are of."""

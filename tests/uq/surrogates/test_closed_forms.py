@@ -9,9 +9,10 @@ from scipy import integrate, special, stats
 from uq.estimators.fidelities import correlations, uncertainty
 from uq.estimators.moments import student
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Uniform
+from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from uq.methods.derivative_based import poincare
-from uq.surrogates.basis import gauss_rule, hermite, hyperbolic, orthonormal
+from uq.surrogates.basis import Joint, gauss_rule, hermite, hyperbolic, orthonormal
 from uq.surrogates.least_squares import left_out
 
 pytestmark = pytest.mark.unit
@@ -115,3 +116,10 @@ def test_sums_of_means_have_the_degrees_of_freedom_of_welch():
     assert factor[0] == pytest.approx(student((a + b) ** 2 / (a**2 / 7 + b**2 / 4)) / 1.96)
     covariance = np.array([[[4.0, 3.0], [3.0, 9.0]]])
     np.testing.assert_allclose(correlations(covariance), [[1.0, 0.5]])
+
+
+def test_no_functions_of_draws_have_no_numbers():
+    draws = Draws(("a", "b"), np.random.default_rng(0).standard_normal((50, 2)), np.full(50, 0.02), 50.0)
+    joint = Joint.of(draws, np.array([0, 1]), hyperbolic(2, 2, 1.0))
+    assert joint.number(np.zeros((0, 2), dtype=np.int64)).dtype == np.int64
+    np.testing.assert_array_equal(joint.number(joint.indices), range(len(joint.indices)))
