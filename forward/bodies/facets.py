@@ -22,7 +22,7 @@ from forward.bodies.location import locate, shapes
 from forward.bodies.mesh import IntArray, Loaded, edges_of, surface_of
 from forward.model import FloatArray
 
-CREASE = np.cos(np.radians(40.0))  # cosine of the angle between facets from which on they are of two parts
+CREASE = np.cos(np.radians(50.0))  # cosine of the angle between facets from which on they are of two parts
 FLAT = 1 - 1e-6  # that above which they are in one plane
 ROUND = 6  # neighbours at least, of the five numbers of such a surface
 PARALLEL = 0.2  # singular value below which normals of parts that meet are the same
