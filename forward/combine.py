@@ -403,6 +403,7 @@ class CombinedSolution:
             all_of([0.0 if one is None else one.shifts for one in parts], 0.0),
             all_of([0.0 if one is None else one.doubts for one in parts], math.nan),
             all_of([None if one is None else one.hidden for one in parts], 0.0),
+            any(one.unstable for one in known),
         )
 
 

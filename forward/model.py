@@ -211,6 +211,8 @@ class Saturation:
         How far the calibrated errors (m,) may be wrong at the solution where this was found; None where not known.
     hidden
         What flat facets of a curved surface hide in the outputs (m,) there; None for nothing, NaN where not known.
+    unstable
+        Whether the equilibrium is stable on this mesh, and not on a finer one.
     """
 
     outputs: FloatArray
@@ -220,6 +222,7 @@ class Saturation:
     shifts: FloatArray | None = None
     doubts: FloatArray | None = None
     hidden: FloatArray | None = None
+    unstable: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,6 +141,8 @@ TABLE: dict[str, str | Words] = {
     "part of their doubt (mesh_error_doubt). Mesh the body again with smaller cells.",
     "facets-unknown": "The surface is curved, and the faces of its cells are flat: the effect of what lies between is "
     "not known, since there is no answer with the surface moved by as much. Compare with smaller cells.",
+    "unstable-on-finer-mesh": "The equilibrium at the mean parameters is stable on this mesh, but not on a finer "
+    "one: the body buckles in a way that these cells are too large for. Refine the mesh before you use the numbers.",
     "facets-uncounted": "The surface is curved, and the faces of its cells are flat: what lies between is in no error "
     "of methods on several meshes, whose cells are parts of these. Others estimate it; or compare with smaller cells.",
     "solves-chosen": "Full solves were chosen where cheap models differ: {chosen:,} of {points:,} points, with "

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
@@ -279,11 +278,15 @@ class FiniteElementSolution:
 
     def _calibrated(self, spare: float, finer: Calibrating[Self]) -> Saturation:
         spec = self._model.spec
-        with suppress(SolveError):
+        unstable = False
+        try:
             found = finer.calibrated(self)
             if found is not None:
                 return found
-        return self._by_degrees() if richer(spec) <= allowance(spec, spare) else self._typical(self.mesh_error())
+        except SolveError as error:
+            unstable = error.stability == Stability.REFUSED
+        found = self._by_degrees() if richer(spec) <= allowance(spec, spare) else self._typical(self.mesh_error())
+        return replace(found, unstable=unstable)
 
     def _typical(self, error: MeshError) -> Saturation:
         """Return what is typical of estimates with elements of this degree."""

@@ -103,6 +103,8 @@ def with_mesh_errors(
     add(dataset, *doubts(dataset, found.evaluations, told), first=True)
     if len(found.points):
         add(dataset, *of_facets(dataset["output"].to_numpy(), found.outputs[0], found.hidden), first=True)
+    if found.unstable:
+        add(dataset, Finding("unstable-on-finer-mesh", "error"), first=True)
     left_out = [words for name, words in WITHOUT.items() if name in dataset]
     if holds(dataset, "mean", "mesh") and left_out:
         add(dataset, Finding("mesh-error-left-out", "note", {"what": " and of ".join(left_out)}))

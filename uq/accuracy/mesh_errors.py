@@ -119,6 +119,8 @@ class MeshErrors:
         How far the errors (m,) may be wrong at the mean; NaN where that is not known.
     hidden
         What flat facets hide of a curved surface at the mean (m,), which no estimate sees; NaN where it is not known.
+    unstable
+        Whether the equilibrium at the mean is unstable on a finer mesh.
     """
 
     evaluations: Evaluations
@@ -128,6 +130,7 @@ class MeshErrors:
     shifts: FloatArray
     doubts: FloatArray
     hidden: FloatArray
+    unstable: bool = False
 
     @property
     def points(self) -> FloatArray:
@@ -181,7 +184,7 @@ def estimate(
     displaced = float(_factors(known["state"])) * np.vstack(states) if states else None
     measured = bool(known["measured"] == 1)
     factors, shifts, doubts, hidden = (known[name] for name in ("factors", "shifts", "doubts", "hidden"))
-    return MeshErrors(merge(parts), displaced, factors, measured, shifts, doubts, hidden)
+    return MeshErrors(merge(parts), displaced, factors, measured, shifts, doubts, hidden, bool(known["unstable"] == 1))
 
 
 def _factors(saturation: FloatArray) -> FloatArray:

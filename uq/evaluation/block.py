@@ -137,6 +137,7 @@ class _MeshErrors:
             return
         if factors is not None:
             row["factors"], row["state"], row["measured"] = factors.outputs, factors.state, factors.measured
+            row["unstable"] = factors.unstable
             row["shifts"] = 0.0 if factors.shifts is None else factors.shifts
             row["doubts"] = np.nan if factors.doubts is None else factors.doubts
             if factors.hidden is not None:

@@ -32,11 +32,11 @@ def calibration(outputs: int) -> np.dtype[Any]:
     """Names and sizes of what calibrates errors of the mesh.
 
     `factors` of the errors of outputs (m,); `shifts`, what is added then; `doubts`, how far that may be wrong; what is
-    `hidden` by the facets of a curved surface; the factor of the `state`; and whether they were `measured` here (1) or
-    are typical ones (0).
+    `hidden` by the facets of a curved surface; the factor of the `state`; whether they were `measured` here (1) or are
+    typical ones (0); and whether the equilibrium is `unstable` on a finer mesh (1).
     """
     whole = [(name, float, (outputs,)) for name in ("factors", "shifts", "doubts", "hidden")]
-    return np.dtype([*whole, ("state", float), ("measured", float)])
+    return np.dtype([*whole, ("state", float), ("measured", float), ("unstable", float)])
 
 
 @dataclass(frozen=True)

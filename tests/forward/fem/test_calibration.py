@@ -12,6 +12,7 @@ from forward.bodies.mesh_file import MeshFile
 from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, limit_alone, saturation
 from forward.fem.mesh_error_cost import ALONE, MOST_UNKNOWNS, OF_ALONE, SHARE, allowance, finer, with_cells
 from forward.hyperelastic import Hyperelastic
+from forward.model import Stability
 from tests.bodies import OUTPUTS, loaded_body
 from tests.launch import on_kept_ranks
 from tests.meshes import CUBE
@@ -346,3 +347,22 @@ def test_smaller_steps_are_doubted_more():
     ]
     assert left == sorted(left)
     assert left[2] > 1.2 * left[0] - 0.1 * 0.2
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(("size", "unstable"), [(100.0, False), (250.0, True)])
+def test_a_column_that_does_not_buckle_for_its_cells_alone(size, unstable):
+    """Linear cells are too stiff in bending: these buckle at twice the load at which cells half as long do."""
+    spec = Hyperelastic.model_validate(
+        {
+            "formulation": "displacement",
+            "body": {"kind": "box", "size": [1, 0.1, 0.1], "cells": [4, 1, 1], "cell": "hexahedron", "degree": 1},
+            "material": SOFT,
+            "clamp": ["x-min"],
+            "loads": [{"kind": "traction", "on": "x-max", "direction": [-1, 0, 0], "size": size}],
+            "outputs": PLAIN[:1],
+        }
+    )
+    solution = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+    assert solution.stability == Stability.COUNTED
+    assert solution.saturation(math.inf).unstable == unstable

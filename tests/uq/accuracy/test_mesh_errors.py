@@ -40,6 +40,7 @@ class OnMesh(FunctionModel):
     doubt: float | None = None  # of calibrated errors
     measured: bool = True
     hidden: float | None = None  # part of the output that lies between facets and surface
+    unstable: bool = False  # on a finer mesh
 
     def solve(self, parameters, guess=None):
         found = super().solve(parameters, guess)
@@ -60,7 +61,9 @@ class SolvedOnMesh(FunctionSolution):
         if self.model.doubt is not None:
             shifts, doubts = self.model.missed * self.outputs, np.full(m, self.model.doubt)
             hidden = None if self.model.hidden is None else self.model.hidden * self.outputs
-            return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts, hidden=hidden)
+            return Saturation(
+                np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts, hidden=hidden, unstable=self.model.unstable
+            )
         if self.model.seen == 1.0:
             return None
         return Saturation(np.full(m, 1 / self.model.seen), 1.0, 1.0, self.model.measured)
@@ -403,6 +406,12 @@ def test_what_facets_hide_is_doubted_in_all_that_has_units(method):
     assert "u 4.0%, v 4.0%" in said.text
     _, unknown = studied(method, replace(whole, hidden=np.nan))
     assert "facets-unknown" in [one.code for one in findings(unknown)]
+
+
+@pytest.mark.parametrize("unstable", [False, True])
+def test_a_state_that_is_stable_on_its_mesh_alone_is_an_error(unstable):
+    _, found = studied(Chaos(samples=12), replace(on_mesh(affine), doubt=1e-3, unstable=unstable))
+    assert [one.code for one in findings(found) if one.severity == "error"] == ["unstable-on-finer-mesh"] * unstable
 
 
 def test_where_the_mesh_decides_and_where_it_is_coarse():
