@@ -161,7 +161,8 @@ class Solution(Mapping[str, float]):
     def mesh_error(self) -> dict[str, float]:
         """Errors of the mesh by output, exact minus computed, as estimates: add them to correct. Collective.
 
-        NaN where there is no estimate, of the largest stress for example; empty for a model without a mesh.
+        NaN where there is no estimate, of the largest stress for example; empty for a model without a mesh. What flat
+        facets of a curved surface hide is not in them: studies count it among their doubts.
 
         Raises
         ------
