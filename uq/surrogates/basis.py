@@ -79,8 +79,7 @@ class Joint:
     def number(self, indices: IntArray) -> IntArray:
         """Return which functions (P,) have the degrees of multi-indices (P, d) of all parameters."""
         numbers = {index.tobytes(): i for i, index in enumerate(self.indices)}
-        found = [numbers[index.tobytes()] for index in np.ascontiguousarray(indices[:, self.members])]
-        return np.array(found, dtype=np.int64)
+        return np.fromiter((numbers[i.tobytes()] for i in np.ascontiguousarray(indices[:, self.members])), np.int64)
 
 
 def hermite(t: FloatArray, degree: int) -> FloatArray:
