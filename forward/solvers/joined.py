@@ -40,6 +40,8 @@ LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is lo
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
 LATE = 8  # iterations of each of them: where a branch ends Newton's method is quick, or wanders
 ABOVE = (1 / 32, 1 / 16, 1 / 8)  # of the load that is added to find a jump
+FIRST = 1 / 8  # of the load: where no step from rest as long as this follows the tangent, that may have a kink
+TINY = 2.0**-20  # of the load: so little that stiffnesses change by nothing but kinks
 
 
 def strayed(system: System, before: FloatArray, predicted: FloatArray, u: FloatArray, way: Way | None = None) -> str:
@@ -90,6 +92,9 @@ def load_steps(
     load, if `unstable` says so), the branch is expected to end: only `REFUSALS` attempts may find others, and each has
     `LATE` iterations. It need not end: a body that is pushed aside a little bends much where without that it buckles.
 
+    Where the energy has a kink at rest, as that of fibres which carry only tension, the tangent there predicts no step.
+    The branch is then followed from a `TINY` load on (`_off_rest`).
+
     `beyond` is a stable equilibrium at full load, the answer if the branch from rest ends before.
 
     Raises
@@ -118,6 +123,11 @@ def load_steps(
                 barrier, unstable, refused = load, True, max(refused, stop.stability)
                 smallest = max(smallest, LOCATED)
             refusals += refusal or not near
+            if near and reached == 0 and step < FIRST <= load:
+                off = _off_rest(system, settings, zero, history)
+                if off is not None:
+                    found, reached, step = off, 2 * TINY, 1.0
+                    continue
             if near and (step < smallest or 2 * step <= SHORTEST * load):
                 history.append(f"the branch from rest ends at {100 * reached:.4g} % of the load")
                 if beyond is not None:
@@ -135,6 +145,22 @@ def load_steps(
         if iterations <= QUICK:
             step *= 2
     return found._replace(snapped=ended is not None)
+
+
+def _off_rest(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> Found | None:
+    """Return the state under twice a `TINY` load if it is twice that under this load, which no tangent predicts.
+
+    Then the branch has a kink at rest and goes on straight from there, as the tangent beside the kink predicts; where
+    one at rest predicts the first state, or the states do not tell, there is none.
+    """
+    with suppress(Diverged):
+        one = newton(system, settings, zero, history, TINY)[0]
+        if one.predicted is not None and strayed(system, zero, one.predicted, one.state):
+            two = _step(system, settings, one.state, history, 2 * TINY, None, near=True)[0]
+            if not strayed(system, zero, 2 * one.state - zero, two.state):
+                history.append("the tangent at rest has a kink")
+                return two
+    return None
 
 
 def _jumped(

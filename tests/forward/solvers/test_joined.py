@@ -269,6 +269,32 @@ def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
         assert same(equations, one.state, there)
 
 
+@pytest.mark.fem
+def test_fibres_that_carry_only_tension_are_no_jump():
+    """Their tangent at rest predicts no load step, however short; the tangent beside rest does."""
+    numbers = {"c": 1e4, "k1": 2e4, "k2": 1.5, "D1": 1e5, "fibres": ((1.0, 0.5, 0.0), (1.0, -0.5, 0.0))}
+    spec = Hyperelastic.model_validate(
+        {
+            "body": {"size": (0.06, 0.02, 0.01), "cells": (3, 1, 2)},
+            "material": {"kind": "holzapfel-gasser-ogden", **numbers},
+            "clamp": ("x-min",),
+            "loads": ({"kind": "gravity", "direction": (0.0, 0.0, -1.0), "density": 150.0},),
+            "outputs": ({"kind": "mean-displacement", "name": "sag", "on": "x-max", "component": "z"},),
+        }
+    )
+    inputs = Inputs({"material.k1": Uniform(lower=1.5e4, upper=2.5e4)})
+    model = spec.build(MPI.COMM_SELF, inputs.names)
+    centre = linearise(inputs, SerialEvaluate(model))
+    guess = centre.prediction.on(model)
+    first = model.solve(np.array([2e4]))
+    assert guess(np.array([2e4])).reference.joined
+    assert first.work.snaps == 0
+    assert same(model.equations, first.state, small_steps(model, np.array([2e4]), 8))
+    for point in np.array([[1.6e4], [2.4e4]]):
+        one = model.solve(point, guess(point))
+        assert (one.work.snaps, one.work.audits) == (0, 0)
+
+
 # --- who is audited, and what is said of it --------------------------------------------------------------------------
 
 
