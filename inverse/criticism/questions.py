@@ -11,6 +11,8 @@ is the score, which the residuals at the mode hold since r = S⁻¹r₀, and wha
 Learning (2006), section 2.7). The B of an enlargement is the mean over its forms. How large it becomes by chance is
 seen from draws of s: the best of many places is a maximum, and no χ². All questions together are judged by the smallest
 of their probabilities in the same draws (P. H. Westfall, S. S. Young, Resampling-Based Multiple Testing (1993), ch. 2).
+Where residuals are larger than errors as stated make likely, probabilities are those of errors as large as they say:
+errors that are understated call for nothing, and what explains most of the residuals is called for all the same.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
+from inverse.criticism.predictive import examine, spectrum_of
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
 from inverse.low_dimensional.wider import Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
 
 DRAWS = 4000  # of scores as they are by chance
 CALLED = 0.05  # probability up to which data call for something
+UNEXPLAINED = 0.01  # probability of larger residuals below which a model does not explain the data
 OPEN, SHOWN = 1.0, 3  # deviations that data leave open from which on that is told, and of how many
 ROUNDS, SETTLED = 5, 0.05  # how often a form is moved at most, until it moves by fewer deviations
 Forms = Mapping[str, Mapping[Any, FloatArray]]  # names of enlargements → their forms, which say it → patterns (k, N)
@@ -191,17 +195,28 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
     forms = questions.forms(at.parameters[0])
     flat = [(name, label, patterns) for name, by in forms.items() for label, patterns in by.items()]
     changes = questions.changes(posterior, at.parameters[0], np.concatenate([patterns for *_, patterns in flat]))
-    residual = posterior.residuals(at.outputs, at.x)[0]
-    root = np.sqrt(noise.information(residual))
-    G, A = noise.whitened(changes[:, posterior.which] / scale), posterior.sensitivities(at)[0] * root[:, None]
-    scores, H = -G @ noise.score(residual), unexplained(A, G * root)
-    if len(H) < H.shape[1]:
-        H = np.linalg.qr(H.T)[1].T
-    by_chance = np.random.default_rng(seed).standard_normal((DRAWS, H.shape[1])) @ H.T
-    moves = parameters_moved(posterior, gaussian, A, (G * root).T) / deviations(posterior, gaussian)[:, None]
+    residual, slopes = posterior.residuals(at.outputs, at.x)[0], posterior.sensitivities(at)[0]
+    G = noise.whitened(changes[:, posterior.which] / scale)
+
+    def scored(size: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The root of C, scores, A and G with errors that are larger by a factor."""
+        root = np.sqrt(noise.information(residual / size)) / size
+        A, rows = slopes * root[:, None], G * root
+        H = unexplained(A, rows)
+        return np.linalg.qr(H.T)[1].T if len(H) < H.shape[1] else H, -G @ noise.score(residual / size) / size, A, rows
+
+    (H, scores, A, over), (larger, fewer, *_) = scored(1.0), scored(_understated(posterior, at, residual))
+    by_chance = np.random.default_rng(seed).standard_normal((DRAWS, H.shape[1])) @ larger.T
+    moves = parameters_moved(posterior, gaussian, A, over.T) / deviations(posterior, gaussian)[:, None]
     ends = np.cumsum([len(patterns) for *_, patterns in flat])
     found = [
-        _Form(label, *_evidence(H[rows], scores[rows], by_chance[:, rows]), moves[:, rows], patterns)
+        _Form(
+            label,
+            *_evidence(H[rows], scores[rows]),
+            *_evidence(larger[rows], np.vstack([fewer, by_chance])[:, rows])[:1],
+            moves[:, rows],
+            patterns,
+        )
         for (_, label, patterns), end in zip(flat, ends, strict=True)
         for rows in [slice(end - len(patterns), end)]
     ]
@@ -209,39 +224,44 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
     return _judged({name: [one for one, of in zip(found, names, strict=True) if of == name] for name in forms})
 
 
+def _understated(posterior: Posterior, at: Density, residual: FloatArray) -> float:
+    """Return the factor on the errors with which residuals (m,) at the mode are as expected; 1 if they may be."""
+    test, size = examine(posterior.noise.normal_scores(residual), spectrum_of(posterior, at)), 1.0
+    if test.probability < UNEXPLAINED:
+        for _ in range(ROUNDS):  # of normal errors one is enough
+            size *= float(np.linalg.norm(posterior.noise.normal_scores(residual / size)) / np.sqrt(test.degrees))
+    return size
+
+
 class _Form(NamedTuple):
-    """One form: ln B of the data (), and by chance (n,), strengths (k,), covariance (k, k), moves (d, k), patterns."""
+    """One form: ln B () of the data, strengths (k,), their covariance (k, k), what it is judged by, moves, patterns.
+
+    That is ln B (1 + n,) of the data, and by chance, with errors as large as residuals say; moves are (d, k).
+    """
 
     label: Any
     log_evidence: float
-    by_chance: FloatArray
     strengths: FloatArray
     covariance: FloatArray
+    judged: FloatArray
     moves: FloatArray
     patterns: FloatArray
 
 
-def _evidence(
-    H: FloatArray, scores: FloatArray, by_chance: FloatArray
-) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Return ln B of scores (k,), and of those by chance (n, k), and strengths with their covariance."""
+def _evidence(H: FloatArray, scores: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
+    """Return ln B of scores (…, k), and strengths with their covariance."""
     sizes, axes = np.linalg.eigh(H @ H.T)
     over = 1 / (1 + np.maximum(sizes, 0))
-
-    def log_evidence(s: FloatArray) -> FloatArray:
-        return np.asarray(((s @ axes) ** 2 @ over + np.log(over).sum()) / 2)
-
     covariance = (axes * over) @ axes.T
-    return float(log_evidence(scores)), log_evidence(by_chance), covariance @ scores, covariance
+    return ((scores @ axes) ** 2 @ over + np.log(over).sum()) / 2, scores @ covariance, covariance
 
 
 def _judged(found: Mapping[str, list[_Form]]) -> list[Answer]:
     """Return the answers to questions, by their names, from all their forms."""
     logs = {name: np.array([one.log_evidence for one in forms]) for name, forms in found.items()}
     total = {name: float(logsumexp(each) - np.log(len(each))) for name, each in logs.items()}
-    chance = {
-        name: logsumexp([one.by_chance for one in forms], axis=0) - np.log(len(forms)) for name, forms in found.items()
-    }
+    judged = {name: logsumexp([one.judged for one in forms], axis=0) for name, forms in found.items()}
+    chance = {name: values[1:] for name, values in judged.items()}
     # How many of the draws are at least as large, of each draw too; the smallest of these shares over the questions.
     ordered = {name: np.sort(values) for name, values in chance.items()}
     n = DRAWS + 1
@@ -257,7 +277,7 @@ def _judged(found: Mapping[str, list[_Form]]) -> list[Answer]:
         move = weights @ each
         inside = np.array([np.einsum("dk,kl,dl->d", one.moves, one.covariance, one.moves) for one in forms])
         left = np.sqrt(weights @ (inside + (each - move) ** 2))
-        alone = share(name, np.array([total[name]]))[0]
+        alone = share(name, judged[name][:1])[0]
         probability = float((1 + (least <= alone).sum()) / n)
         best, searched = forms[int(weights.argmax())], total[name] - float(logs[name].max())
         known = (best.label, probability, total[name], move, left, best.strengths, best.patterns, searched)

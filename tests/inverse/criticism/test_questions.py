@@ -105,6 +105,22 @@ def test_a_right_model_is_accused_once_in_twenty(dof):
         assert abs((least <= level).mean() - level) < 4 * np.sqrt(level * (1 - level) / 400)
 
 
+@pytest.mark.few(1)
+@pytest.mark.parametrize("dof", [None, 4.0])
+def test_errors_that_are_understated_call_for_nothing(dof):
+    """By a factor of three; what explains the residuals is called for all the same, and found where it is."""
+    accused = []
+    for seed in range(100):
+        values = drawn(seed, (), dof)
+        right = A @ INPUTS.drawn(np.random.default_rng(seed), 1)[0]
+        found, _ = found_of(right + 3 * (values - right), dof=dof)
+        accused.append(min(one.probability for one in found) <= CALLED)
+    assert np.mean(accused) <= 0.12
+    (two, one), _ = found_of(drawn(0, [8.0, -8.0], dof), dof=dof)
+    assert two.probability < 0.01
+    assert two.log_evidence > one.log_evidence
+
+
 @pytest.mark.unit
 def test_a_model_without_an_answer_says_nothing_and_stops_nothing(monkeypatch):
     def lost(*args):
