@@ -24,7 +24,7 @@ from inverse.methods.record import COLUMNS, ENDS, WORDS, stacked, usual_sizes
 from uq.findings import add
 from uq.inputs.distributions import Distribution, Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
-from workflows.studies.assumptions import KEPT
+from workflows.studies.assumptions import KEPT, TakenForGranted
 from workflows.studies.predictions import of_file
 
 if TYPE_CHECKING:
@@ -44,13 +44,20 @@ EVIDENCE = ("log_evidence", "log_evidence_error", "determined")
 NUMBERS = (*EVIDENCE, "residual_square", "residual_degrees", "residual_probability")
 
 
-def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
+def dataset(
+    study: InversionBlocks,
+    outcomes: Sequence[Outcome],
+    vertices: Vertices | None,
+    taken: TakenForGranted | None = None,
+) -> xr.Dataset:
     """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
     Vertices of a specimen are places (N, 3), cells (n_cells, k), and VTK's number of their kind; None of other models.
+    What is taken for granted is that of the study, or of one with more data sets, of which these are some.
     """
     import xarray as xr
 
+    taken = study.taken if taken is None else taken
     each = [one.dataset for one in outcomes]
     record = stacked(each, usual_sizes(study.method, field=study.field) | {"case": len(study.parts)})
     held: dict[str, Any] = dict(record)
@@ -77,16 +84,16 @@ def dataset(study: InversionBlocks, outcomes: Sequence[Outcome], vertices: Verti
     sets, names, columns = study.data.sets, list(study.names), COLUMNS["field" if study.field else "parameters"]
     coordinates = {"data_set": [item.name for item in sets], "parameter": names, "partner": names}
     coordinates |= {"case": list(study.parts), "axis": ["x", "y", "z"], "column": list(columns)}
-    if study.taken is not None and "assumption_shift" in held:
-        assumed = study.taken.shown
-        coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(study.taken.groups)}
+    if taken is not None and "assumption_shift" in held:
+        assumed = taken.shown
+        coordinates |= {"assumption": [one.name for one in assumed], "uncertain": list(taken.groups)}
         held |= {f"assumption_{key}": ("assumption", [getattr(one, key) for one in assumed]) for key in KEPT}
-        by = study.taken.loadings
+        by = taken.loadings
         acting = np.flatnonzero(by.any(axis=1))
         if "uncertain_point" in held and len(acting):
             held["uncertain_weight"] = (("number", "uncertain"), by[acting])
-            held["uncertain_value"] = ("number", study.taken.values[acting])
-            coordinates["number"] = [study.taken.numbers[k].name for k in acting]
+            held["uncertain_value"] = ("number", taken.values[acting])
+            coordinates["number"] = [taken.numbers[k].name for k in acting]
     if study.asked:
         coordinates["question"] = list(study.asked)
     if study.predict is not None:
@@ -359,7 +366,7 @@ def table_of_finished(
         else:
             data = study.data.model_copy(update={"sets": (one,)})
             alone = study.model_copy(update={"data": data, "measurements": (measurement,)})
-            rows[number] = _row(judged(dataset(alone, [outcome], vertices), alone).isel(data_set=0))
+            rows[number] = _row(judged(dataset(alone, [outcome], vertices, study.taken), alone).isel(data_set=0))
         write(_table(study.names, study.parts, (rows[number] for number in sorted(rows))))
 
     return add

@@ -198,6 +198,19 @@ def test_what_cannot_be_uncertain_is_refused(folder, given, told):
     assert told in str(error.value)
 
 
+def test_data_sets_need_not_have_all_outputs(folder):
+    """The second of three tables lacks one: what is taken for granted of it moves nothing there."""
+    (folder / "some").mkdir()
+    for name, text in (("one", TABLE), ("two", TABLE.partition("w,")[0]), ("zero", TABLE)):
+        (folder / "some" / f"{name}.csv").write_text(text)
+    assert ran(folder / "stated.toml", folder / "lacking", "data={files='some', noise={relative=0.1}}") == 0
+    found = results(folder / "lacking")
+    assert found["assumption"].values.tolist() == ["data.scale.displacement", "data.scale.w"]
+    assert not found["assumption_shift"][1, 1].any()
+    table = (folder / "lacking" / "batch.csv").read_text().splitlines()
+    assert [line.split(",")[:2] for line in table[1:]] == [["one", "yes"], ["two", "yes"], ["zero", "yes"]]
+
+
 def test_tables_are_data_sets_side_by_side(batch, looked_at, capsys):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     found = results(batch)
