@@ -256,13 +256,17 @@ class TakenForGranted:
         scales = [*(["displacement"] if self.spec.placed else []), *measured]
         shifts = [f"data.shift.{axis}" for axis in AXES] if self.spec.placed else []
         known = [*(one.name for one in self.all), *(f"data.scale.{name}" for name in scales), *shifts]
+        zeros = [one.name for one in of_numbers(self._scalars, self.unknown, self._extent) if not one.size]
         for name, how in self.stated.items():
             if name in self.unknown:
                 yield ("uncertain", name), "is a parameter too, expected one of both", name
             elif how.group in self.unknown:
                 yield ("uncertain", name, "group"), "is the name of a parameter, expected another", how.group
             elif not any(means(name, path) for path in known):
-                yield ("uncertain", name), f"not a number that is taken for granted; {nearest(name, known)}", name
+                if how.relative is not None and any(means(name, path) for path in zeros):
+                    yield ("uncertain", name), "a part of zero is zero, expected std", how.relative
+                else:
+                    yield ("uncertain", name), f"not a number that is taken for granted; {nearest(name, known)}", name
             elif how.relative is not None and not name.startswith("data.scale"):
                 numbers = [one for one in self.numbers if means(name, one.name)]
                 if not all(one.part for one in numbers):

@@ -190,11 +190,12 @@ def test_what_is_uncertain_is_among_the_errors(folder):
         ("uncertain={'data.shift.x'={std=1e-3}}", "uncertain.data.shift.x: not a number that is taken for granted"),
         ("uncertain={'data.scale'={}}", "uncertain.data.scale: expected either relative or std"),
         ("uncertain={'data.scale'={std=0.1,group='a'}}", "uncertain.data.scale.group: is the name of a parameter"),
+        ("model.parameters.c=0;uncertain={c={relative=0.1}}", "uncertain.c: a part of zero is zero, expected std; giv"),
     ],
 )
 def test_what_cannot_be_uncertain_is_refused(folder, given, told):
     with pytest.raises(StudyError) as error:
-        load(folder / "stated.toml", [given])
+        load(folder / "stated.toml", given.split(";"))
     assert told in str(error.value)
 
 
