@@ -184,7 +184,7 @@ TABLE: dict[str, str | Words] = {
         short="{name} is too uncertain for its first order",
     ),
     "uncertain-sampled": Words(
-        "{listed}: too uncertain for first order, and so sampled together with the parameters", short=""
+        "{listed}: sampled together with the parameters, since first order is not enough", short=""
     ),
     "called-for": Words(
         "the data call for {question} ({form}): ln Z is {gain} larger with it{also}, and {answer} {size:.2g} "

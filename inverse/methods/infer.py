@@ -6,7 +6,7 @@ Start, mode, errors that data share, error of the mesh, evidence: in this order,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Generic, TypeVar
@@ -211,10 +211,10 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
     recorder, sampled = None, problem.sampled
     if sampled is not None and assumed is not None:
         recorder = Recorder(sampled.evaluate)
-        with suppress(SolveError):  # there is no answer to any of them at the mode
+        heavy = problem.errors.dof is not None  # then nothing is known to first order
+        with nullcontext() if heavy else suppress(SolveError):  # there is no answer to any of them at the mode
             wider, parts = _sampling(first, assumed, sampled, recorder), replace(steps.of("sampled"), recorder=recorder)
-            means, widths = np.abs(missed(wider, np.linalg.inv(gaussian.hessian)))
-            if not (means <= BENT).all() or not (widths <= WIDE).all():  # or they are not known
+            if heavy or _bent(wider, gaussian):
                 gaussian = parts("mode", partial(laplace, wider.posterior, starts=1, first=wider.first))
                 problem.say(f"first order is not enough of what is uncertain: {', '.join(sampled.names)} sampled")
                 found, unknown = AtMode(wider.posterior, gaussian), sampled.names
@@ -231,6 +231,12 @@ def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
     )
     solves = 0 if recorder is None else recorder.solves
     return Inferred(found, first, searched, one, mesh, before, process, moves, unknown, solves)
+
+
+def _bent(wider: Wider, gaussian: Laplace) -> bool:
+    """Whether first order misses much of the parameters, or what it misses is not known."""
+    means, widths = np.abs(missed(wider, np.linalg.inv(gaussian.hessian)))
+    return not (means <= BENT).all() or not (widths <= WIDE).all()
 
 
 def _sampling(first: AtMode, assumed: Assumptions, sampled: Sampled, evaluate: Evaluate) -> Wider:

@@ -248,14 +248,19 @@ class TakenForGranted:
         body = self.spec.bodies[0].body
         return Moved(data, self._extent, onto(body) if data.on_surface else body.nearest, data.on_surface)
 
-    def mistakes(self) -> Iterator[Mistake]:
-        """Find what is stated to be uncertain and is not taken for granted; of data what may be measured counts."""
+    @property
+    def of_data(self) -> list[str]:
+        """Names of what is taken for granted of the data, whatever may be measured."""
         measured = dict.fromkeys(
             STEP_OF.sub("", name) if unit != "m" else "displacement" for name, unit in self._units.items()
         )
         scales = [*(["displacement"] if self.spec.placed else []), *measured]
         shifts = [f"data.shift.{axis}" for axis in AXES] if self.spec.placed else []
-        known = [*(one.name for one in self.all), *(f"data.scale.{name}" for name in scales), *shifts]
+        return [*(f"data.scale.{name}" for name in scales), *shifts]
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Find what is stated to be uncertain and is not taken for granted; of data what may be measured counts."""
+        known = [*(one.name for one in self.all), *self.of_data]
         zeros = [one.name for one in of_numbers(self._scalars, self.unknown, self._extent) if not one.size]
         for name, how in self.stated.items():
             if name in self.unknown:
@@ -271,6 +276,16 @@ class TakenForGranted:
                 numbers = [one for one in self.numbers if means(name, one.name)]
                 if not all(one.part for one in numbers):
                     yield ("uncertain", name), "a place or a direction, expected std", how.relative
+
+    def of_heavy_tails(self, kind: str, *, field: bool) -> Iterator[Mistake]:
+        """Find what is stated to be uncertain and cannot be sampled, as errors of that kind need."""
+        paths = [*self.of_data, *(one.name for one in self.numbers if field)]
+        beside, others = (" with a field", "") if field else ("", "only numbers of the model, or ")
+        message = (
+            f"cannot be sampled{beside}, as errors of kind '{kind}' need, expected {others}errors of kind 'normal'"
+        )
+        wrong = (name for name in self.stated if any(means(name, path) for path in paths))
+        yield from ((("uncertain", name), message, name) for name in wrong)
 
     def with_changes(self, found: xr.Dataset, mean: FloatArray, evaluate: Evaluate) -> xr.Dataset:
         """Add how far outputs are larger at the mean (d,) if each number that is not random is; NaN without an answer.

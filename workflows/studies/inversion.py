@@ -209,7 +209,8 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             yield ("uncertain",), f"{message}method.expansion nor method.reduced", list(self.uncertain)
         elif self.uncertain and self.taken is not None:
             predicted = [] if self.predict is None else [replace(self.taken, spec=self.predicted)]
-            yield from of_none([self.taken, *predicted])
+            kind, wrong = self.data.errors.kind, list(of_none([self.taken, *predicted]))
+            yield from wrong or (() if kind == "normal" else self.taken.of_heavy_tails(kind, field=self.field))
 
     def _of_specimen(self) -> Iterator[Mistake]:
         """Find mistakes of the inversion of displacements."""

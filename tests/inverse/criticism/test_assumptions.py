@@ -192,6 +192,17 @@ def test_a_place_is_no_part_of_itself():
 
 
 @pytest.mark.unit
+@pytest.mark.parametrize(
+    ("name", "few", "field"),
+    [("loads.traction.size", False, True), ("data.scale", True, True), ("data.shift.x", True, True)],
+)
+def test_heavy_tails_need_what_can_be_sampled(name, few, field):
+    """Numbers of the model, beside few parameters."""
+    taken = TakenForGranted(bench.cube_spec(1), ("material.mu",), (), {name: Uncertain(std=0.1)})
+    assert [bool(list(taken.of_heavy_tails("student-t", field=one))) for one in (False, True)] == [few, field]
+
+
+@pytest.mark.unit
 def test_what_moves_most_is_said_in_three_clauses_at_most():
     assumed = [
         Assumption("cases.pull.loads.traction.size", 2.0, "Pa", PART),

@@ -97,6 +97,7 @@ def ran(study, out, *changes, report=False):
     return main(["run", str(study), "--out", str(out), "--quiet", *([] if report else ["--no-report"]), *sets])
 
 
+HEAVY = "data.errors={kind='student-t', degrees=4}"
 FILES = "data={files='data', noise={relative=0.1}}"
 
 
@@ -190,6 +191,8 @@ def test_what_is_uncertain_is_among_the_errors(folder):
         ("uncertain={'data.shift.x'={std=1e-3}}", "uncertain.data.shift.x: not a number that is taken for granted"),
         ("uncertain={'data.scale'={}}", "uncertain.data.scale: expected either relative or std"),
         ("uncertain={'data.scale'={std=0.1,group='a'}}", "uncertain.data.scale.group: is the name of a parameter"),
+        (f"uncertain={{'data.scale'=0.1}};{HEAVY}", "uncertain.data.scale: cannot be sampled, as errors of kind 'stu"),
+        (f"uncertain={{'data.scale.w'=0.1}};{HEAVY}", "expected only numbers of the model, or errors of kind 'normal'"),
         ("model.parameters.c=0;uncertain={c={relative=0.1}}", "uncertain.c: a part of zero is zero, expected std; giv"),
     ],
 )
@@ -197,6 +200,35 @@ def test_what_cannot_be_uncertain_is_refused(folder, given, told):
     with pytest.raises(StudyError) as error:
         load(folder / "stated.toml", given.split(";"))
     assert told in str(error.value)
+
+
+@pytest.mark.few(1)
+def test_with_heavy_tails_what_is_uncertain_is_sampled(folder):
+    """y = a L t of L ± 10 %, with Student's errors: against a grid, which knows that all data share L."""
+    t, a, dof, sigma = np.array([0.5, 1, 1.5, 2, 3]), np.exp(np.linspace(0, 2, 1200))[:, None], 4, 0.1
+    y = np.array([1.22, 2.73, 4.46, 5.96, 9.04])
+    (folder / "levers.py").write_text(
+        "import numpy as np\nt = np.array([0.5, 1, 1.5, 2, 3])\n"
+        "def lever(p): return p[0] * p[1] * t\ndef slopes(p): return np.c_[p[1] * t, p[0] * t]\n"
+    )
+    model = "{kind='python', function='levers.lever', jacobian='levers.slopes', parameters={a=1.0, L=1.0}, "
+    changes = [f"model={model}outputs=[{{name='y', size=5}}]}}", "parameters={a={kind='log-normal', mean=2, std=1}}"]
+    changes += [f"data={{outputs={{y={y.tolist()}}}, sigma={{y={sigma}}}}}", HEAVY, "uncertain={L=0.1}"]
+    assert ran(folder / "stated.toml", folder / "heavy", *changes, "method.samples=128") == 0
+    one = results(folder / "heavy").isel(data_set=0)
+    z = np.linspace(-5, 5, 1001)
+    r = (y - a[:, :, None] * (1 + 0.1 * z)[:, None] * t) / sigma
+    log = -(dof + 1) / 2 * np.log1p(r**2 / dof).sum(axis=2) - z**2 / 2
+    log = log - (np.log(a) - np.log(2 / np.sqrt(1.25))) ** 2 / 2 / np.log(1.25)  # of ln a, of which the grid is even
+    weights = np.exp(log - log.max())
+    weights = weights.sum(axis=1) / weights.sum()
+    mean = weights @ a[:, 0]
+    std = np.sqrt(weights @ (a[:, 0] - mean) ** 2)
+    assert float(one["mean"][0]) == pytest.approx(mean, abs=0.1 * std)
+    assert float(one["std"][0]) == pytest.approx(std, rel=0.08)
+    codes = [one["code"] for one in json.loads((folder / "heavy" / "summary.json").read_text())["findings"]]
+    assert "uncertain-sampled" in codes
+    assert "errors-too-large" not in codes
 
 
 def test_data_sets_need_not_have_all_outputs(folder):

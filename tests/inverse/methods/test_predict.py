@@ -60,7 +60,7 @@ def test_what_is_too_uncertain_for_first_order_is_sampled(folder, more):
     assert float(one["prediction_mean"][0]) == pytest.approx(float(other["prediction_mean"][0]), rel=1e-3)
     assert float(one["prediction_std"][0]) == pytest.approx(float(other["prediction_std"][0]), rel=0.02)
     (said, *_) = [one for one in findings(found) if one["code"] == "uncertain-sampled"]
-    assert "s: too uncertain for first order" in said["text"]
+    assert "s: sampled together with the parameters" in said["text"]
     assert not any(one["code"] == "uncertain-bent" for one in findings(found))
 
 
