@@ -22,6 +22,7 @@ TABLE: dict[str, str | Words] = {
     "averaged-without-mesh": "The error of the mesh is not estimated of averaged predictions: a study of one "
     "candidate tells it.",
     "averaged-shares": "Not to know which candidate is right makes up this share of the variance: {shares}.",
+    "population-without": "{lost} of {of} data sets could not be inverted, and are not in the population: {specimens}.",
     "not-inverted": "{name} could not be inverted: {why}",
     "verdict": "{verdict}",
     "only-candidate": "{best} is the only candidate.",

@@ -152,8 +152,18 @@ class Left:
         if self.kind not in ("select", "invert"):
             raise ValueError(f"{self.path}: is a study of kind '{self.kind}', expected 'select' or 'invert'")
         names = _texts(self.found, "group" if self.kind == "select" else "data_set")
-        done = np.atleast_1d(self.found["ok"]).astype(bool) if self.kind == "invert" else [True] * len(names)
-        return {name: self.draws(name, model, beside=False) for name, one in zip(names, done, strict=True) if one}
+        return {name: self.draws(name, model, beside=False) for name in names if name not in self.lost}
+
+    @cached_property
+    def lost(self) -> list[str]:
+        """The data sets that could not be inverted."""
+        if self.kind != "invert":
+            return []
+        return [
+            name
+            for name, one in zip(_texts(self.found, "data_set"), np.atleast_1d(self.found["ok"]), strict=True)
+            if not one
+        ]
 
 
 def _texts(found: Arrays, name: str) -> list[str]:

@@ -98,7 +98,9 @@ class PopulationStudy(FromPython, StudyKind):
     def findings(self) -> tuple[Finding, ...]:
         every = self.posteriors if self._there else {}
         few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
-        return tuple(once_for_outputs(few, every))
+        lost, count = self.source.lost if every else [], len(every)
+        values = {"lost": len(lost), "of": count + len(lost), "specimens": ", ".join(lost)}
+        return (*once_for_outputs(few, every), *([Finding("population-without", "warning", values)] if lost else ()))
 
     @property
     def _there(self) -> bool:

@@ -161,6 +161,17 @@ def test_data_that_have_changed_are_not_inverted_again(batch, tmp_path):
     assert any("s1.csv has changed since s1 was inverted" in text for text in texts(tmp_path / "population"))
 
 
+def test_data_sets_that_could_not_be_inverted_are_named(batch, tmp_path):
+    shutil.copytree(batch / "data", tmp_path / "data")
+    (tmp_path / "data" / "s2.csv").write_text("output,value,sigma\nu,nan,1\n")
+    (tmp_path / "invert.toml").write_text(INVERT)
+    run(load(tmp_path / "invert.toml"), "invert", tmp_path / "results", quiet=True, report=False)
+    study = load(population(tmp_path, tmp_path / "results", 'distribution = "normal"'))
+    assert run(study, "population", tmp_path / "population", quiet=True, report=False) == 0
+    lost = "1 of 4 data sets could not be inverted, and are not in the population: s2."
+    assert [text for text in texts(tmp_path / "population") if "could not be inverted" in text] == [lost]
+
+
 def by_sums(truth, slope, sigma):
     """Median of the typical modulus, by sums over grids of ln C1, and of its mean and deviation over specimens."""
     z, m = np.linspace(3, 9, 1201), np.linspace(3, 9, 121)
