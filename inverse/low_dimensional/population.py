@@ -12,8 +12,10 @@ Kernel over polynomial is a normal kernel again, of covariance B_i, at other pla
 
     ∫ p_i/π_0 N(z|m, C) dz ≈ Σ_s v_is N(b_is | m, C + B_i).
 
-For normal posteriors under normal priors it is exact for normal kernels of any width. The prior of m is normal, twice
-as wide as π_0, around its mean; standard deviations of the population have half-t priors with 3 degrees of freedom
+For normal posteriors under normal priors it is exact for normal kernels of any width. Where π_0 has ends, draws stay in
+their places, kernels are cut at the ends and hold their weight inside, and of the integral counts what is inside: of
+each number the share of a normal distribution, as if they were independent. The prior of m is normal, twice as wide as
+π_0, around its mean; standard deviations of the population have half-t priors with 3 degrees of freedom
 and those of π_0 as scale; correlations have density ∝ det R (Lewandowski, Kurowicka and Joe's with η = 2). m, the
 logarithms of standard deviations and the angles of R are sampled by emcee's ensemble of walkers (J. Goodman, J. Weare,
 Commun. Appl. Math. Comput. Sci. 5 (2010) 65–80).
@@ -39,6 +41,7 @@ FREEDOM = 3.0  # of the prior of standard deviations
 WIDER = 2.0  # prior of the mean of a population over that of a specimen
 KEPT = 200  # draws of a specimen that are used
 FLAT = 1e-14  # smallest eigenvalue of a covariance over the largest
+AGAIN = 50  # times that a draw beyond the ends of a prior is made again
 MOST_BENT = 0.99  # second derivatives of ln π_0 over those of a posterior as a normal distribution
 
 
@@ -56,12 +59,15 @@ class Specimen:
         Ln π_0 (S,) at the draws.
     effective
         Number of independent draws that they are worth.
+    ends
+        Of π_0, lower and upper (2, d), infinite where there are none; None where there are none at all.
     """
 
     draws: FloatArray
     weights: FloatArray
     log_prior: FloatArray
     effective: float
+    ends: FloatArray | None = None
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -100,12 +106,14 @@ class Specimen:
             H[i, j] = H[j, i] = value
         bent, axes = np.linalg.eigh(H)
         H = (axes * bent.clip(-MOST_BENT, MOST_BENT)) @ axes.T  # no prior is narrower than a posterior
-        near, h = np.sqrt(1 - self.width**2) * u, self.width
+        near, h = (np.sqrt(1 - self.width**2) if self.ends is None else 1.0) * u, self.width
         B = np.linalg.inv(np.eye(d) / h**2 + H)
         at = (near / h**2 - found[1 : 1 + d]) @ B
         with np.errstate(divide="ignore"):
             logs = np.log(self.weights) - rest - found[0]
         logs += (np.einsum("si,ij,sj->s", at, np.eye(d) / h**2 + H, at) - (near**2).sum(axis=1) / h**2) / 2
+        if self.ends is not None:
+            logs -= _log_inside(self.mean + near @ root.T, h**2 * np.diag(self.covariance), self.ends)
         return Kernels(self.mean + at @ root.T, root @ B @ root.T, logs)
 
 
@@ -117,6 +125,18 @@ class Kernels(NamedTuple):
     log_weights: FloatArray
 
 
+def _log_inside(means: FloatArray, variances: FloatArray, ends: FloatArray) -> FloatArray:
+    """Ln of the probability (…,) that independent normal numbers (…, d) lie between ends (2, d)."""
+    from scipy.special import ndtr
+
+    found = np.zeros(np.broadcast_shapes(means.shape, variances.shape)[:-1])
+    for k in np.flatnonzero(np.isfinite(ends).any(axis=0)):
+        lower, upper = ((end - means[..., k]) / np.sqrt(variances[..., k]) for end in ends[:, k])
+        turned = np.where(lower + upper > 0, -1.0, 1.0)  # to the tail where differences are exact
+        found += np.log(np.maximum(np.abs(ndtr(turned * upper) - ndtr(turned * lower)), 1e-300))
+    return found
+
+
 def thinned(one: Specimen, seed: int) -> Specimen:
     """Return a specimen with at most `KEPT` draws of equal weight, by systematic resampling."""
     if len(one.draws) <= KEPT:
@@ -124,7 +144,7 @@ def thinned(one: Specimen, seed: int) -> Specimen:
     places = (np.arange(KEPT) + np.random.default_rng(seed).uniform()) / KEPT
     which = np.searchsorted(np.cumsum(one.weights), places).clip(max=len(one.weights) - 1)
     weights = np.full(KEPT, 1 / KEPT)
-    return Specimen(one.draws[which], weights, one.log_prior[which], min(one.effective, KEPT))
+    return Specimen(one.draws[which], weights, one.log_prior[which], min(one.effective, KEPT), one.ends)
 
 
 @dataclass(frozen=True)
@@ -194,9 +214,18 @@ class Fit:
         middle = at + np.einsum("aij,aj->ai", gain, mean - at)
         left = kernel - gain @ kernel
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
-        normals = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
         together = weights.mean(axis=0)
-        return middle + np.einsum("aij,aj->ai", vectors, normals), float(1 / (together**2).sum())
+
+        def drawn() -> FloatArray:
+            normals = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
+            return np.asarray(middle + np.einsum("aij,aj->ai", vectors, normals))
+
+        found = drawn()
+        if one.ends is not None:
+            for _ in range(AGAIN):
+                found = np.where(((found < one.ends[0]) | (found > one.ends[1])).any(axis=1)[:, None], drawn(), found)
+            found = found.clip(*one.ends)
+        return found, float(1 / (together**2).sum())
 
 
 def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -206,7 +235,13 @@ def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> F
     whitened = (inverses.reshape(-1, len(places)) @ places).reshape(*means.shape, -1)  # one product for all
     whitened -= inverses @ (means - one.mean)[:, :, None]
     logs = np.log(np.einsum("aii->ai", inverses)).sum(axis=1)
-    return np.asarray(one.kernels.log_weights - np.einsum("ads,ads->as", whitened, whitened) / 2 + logs[:, None])
+    found = np.asarray(one.kernels.log_weights - np.einsum("ads,ads->as", whitened, whitened) / 2 + logs[:, None])
+    if one.ends is not None:
+        half = inverses @ one.kernels.covariance  # what is left of a kernel under the population has B − halfᵀ half
+        left = np.diag(one.kernels.covariance) - (half**2).sum(axis=1)
+        middle = one.kernels.places - np.einsum("aki,aks->asi", half, whitened)
+        found += _log_inside(middle, np.maximum(left, 1e-300)[:, None], one.ends)
+    return found
 
 
 @phase("fitting the population")

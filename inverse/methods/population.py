@@ -314,7 +314,12 @@ class Scale:
         z = self.to(draws.values[some])
         # dθ = |θ| dz
         logs = prior.log_density(draws.values[some]) + (z.sum(axis=1) if self.logarithmic else 0.0)
-        return Specimen(z, draws.weights[some] / draws.weights[some].sum(), logs, draws.effective)
+        supports = [prior.marginals[name].support or (-np.inf, np.inf) for name in draws.names]
+        ends = np.sort(np.array(supports).T * self.signs, axis=0)
+        if self.logarithmic:
+            ends = np.log(ends.clip(0, None), out=np.full(ends.shape, -np.inf), where=ends > 0)
+        given = ends if np.isfinite(ends).any() else None
+        return Specimen(z, draws.weights[some] / draws.weights[some].sum(), logs, draws.effective, given)
 
     def of_prior(self, prior: Inputs) -> Hyperprior:
         """Return mean and standard deviation of the prior of a specimen."""

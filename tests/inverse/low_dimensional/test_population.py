@@ -28,6 +28,25 @@ def test_kernels_are_exact_for_normal_posteriors_under_normal_priors():
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)  # 0.17 with π_0 constant in a kernel
 
 
+@pytest.mark.unit
+def test_kernels_end_where_a_prior_does():
+    """The likelihood N(1.9 | z, 0.25) under a uniform prior on [0, 2] against a sum over a grid; draws stay inside."""
+    from scipy.stats import norm
+
+    z = np.linspace(0, 2, 2001)
+    likelihood = norm.pdf(z, 1.9, 0.5)
+    u = (np.arange(200) + 0.5) / 200
+    values = np.interp(u, np.cumsum(likelihood) / likelihood.sum(), z)[:, None]
+    prior = Inputs({"a": Uniform(lower=0.0, upper=2.0)})
+    one = Scale(False, np.ones(1)).specimen(Draws(("a",), values, np.full(200, 1 / 200), 200.0), prior)
+    means, std = np.array([[1.5], [1.7], [1.9]]), 0.05
+    found = np.log(np.exp(_log_kernels(one, means, np.full((3, 1, 1), std**2))).sum(axis=1))
+    exact = np.log(norm.pdf(z, means, std) @ likelihood)
+    np.testing.assert_allclose(found - found[1], exact - exact[1], atol=0.1)  # 0.3 with kernels beyond the ends
+    draws, _ = Fit(means[2:3].repeat(500, 0), np.full((500, 1, 1), std**2), 500.0, (one,)).estimates(0, 0)
+    assert draws.max() <= 2
+
+
 def of_normal(y, sigma, prior, rng):
     """Draws of the posterior of a number that was measured once, under a normal prior."""
     variance = 1 / (1 / sigma**2 + 1 / prior.std**2)
