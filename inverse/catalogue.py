@@ -37,6 +37,9 @@ TABLE: dict[str, str | Words] = {
     "parentheses): their estimates, and what they say of the population, are rough. {why}More samples in their own "
     "study, or a prior like the population there, help.",
     "population-worth": "The draws of the population are worth {worth}: its ends are rough.",
+    "population-shared": "What the source states as uncertain is taken to err alike in all specimens: one deviation of "
+    "{listed} of a specimen's posterior deviations. Intervals of the mean, the typical and a new specimen hold that; "
+    "the spread is as if each erred by itself, and may be larger. What does so belongs in method.own.",
     "population-small": "{specimens} specimens say little on how wide the population is: its prior does.",
     "far-from-prior": Words(
         "the posterior of {name} ({value}) lies {distance:.1f} prior deviations from the prior ({centre}): the "

@@ -22,6 +22,8 @@ TABLE: dict[str, str | Words] = {
     "averaged-without-mesh": "The error of the mesh is not estimated of averaged predictions: a study of one "
     "candidate tells it.",
     "averaged-shares": "Not to know which candidate is right makes up this share of the variance: {shares}.",
+    "population-model-error": "The specimens have one model, whose errors, which the source learnt from each, are "
+    "likely alike in all: they are taken as independent, and intervals of the mean do not hold what is shared.",
     "population-without": "{lost} of {of} data sets could not be inverted, and are not in the population: {specimens}.",
     "not-inverted": "{name} could not be inverted: {why}",
     "verdict": "{verdict}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ WIDER = 1.5  # priors with which specimens are drawn again, over the distributio
 MIXED = 100.0  # independent draws of the population, below which its quantiles are rough
 FEW = 4  # specimens, below which the prior decides how wide a population is
 PRIOR = 4096  # points that stand for the prior
+TELLS = 0.01  # of a specimen's deviation, by which an error that all share has to move it to be told
 QUANTILES = (0.025, 0.5, 0.975)
 
 # Name of a specimen, prior → its draws, or None and why.
@@ -52,6 +54,9 @@ class Population(Settings):
     covariates
         What specimens differ in that may move their means, linearly: for each, the numbers of all specimens, or words,
         by their names: ``grade = { one = 1, two = 3 }``, ``region = { one = "cortex", two = "thalamus" }``.
+    own
+        What the source states as uncertain (names under ``uncertain``, or groups) and errs in each specimen by itself,
+        as its thickness may; all else errs alike in all, as a device does.
     new
         Covariates of the new specimen; those that are not given are as on average.
     draws
@@ -68,18 +73,25 @@ class Population(Settings):
     study: str | None = None
     distribution: Literal["normal", "log-normal"] = "log-normal"
     covariates: dict[str, dict[str, float | str]] = Field(default={})
+    own: tuple[str, ...] = ()
     new: dict[str, float | str] = Field(default={})
     draws: Annotated[int, Field(ge=100, le=100_000)] = 1000
     seed: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
 
     def run(
-        self, posteriors: Mapping[str, Draws], prior: Inputs, again: Again | None = None, steps: Steps = ALL_AGAIN
+        self,
+        posteriors: Mapping[str, Draws],
+        prior: Inputs,
+        again: Again | None = None,
+        steps: Steps = ALL_AGAIN,
+        shared: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> xr.Dataset:
         """Fit the population, without solving anything but for specimens whose draws do not reach it.
 
         All draws are of the same parameters, with the same prior. Specimens are drawn again under another prior; None
-        if that cannot be done. Fits may be kept as `steps`. The variables are those of docs/results.md.
+        if that cannot be done. Fits may be kept as `steps`. What is `shared` moves all by deviations (d,) of their
+        posteriors, of its own. The variables are those of docs/results.md.
 
         Raises
         ------
@@ -93,6 +105,12 @@ class Population(Settings):
         x, at = (columns.values, columns.row(self.new)) if self.covariates else (None, None)
         reached = self._reached(posteriors, prior, scale, x, again, steps)
         fit, estimates = reached.fit, reached.estimates
+        alike = {name: one for name, one in shared.items() if name not in self.own}
+        if alike:
+            widths = [np.sqrt(np.diag(scale.specimen(one, prior).covariance)) for one in posteriors.values()]
+            moves = np.array(list(alike.values())) * scale.signs * np.median(widths, axis=0)
+            errors = np.random.default_rng([self.seed, 3]).standard_normal((len(fit.mean), len(alike)))
+            fit = replace(fit, mean=fit.mean + errors @ moves)
         new = scale.back(fit.predictive(self.seed, at))
         own = np.array([np.array(_moments(one)) for one in posteriors.values()])
         together = np.array([scale.back(z) for z, _ in estimates])
@@ -130,6 +148,12 @@ class Population(Settings):
                 "quantile": list(QUANTILES),
             },
         )
+        if alike:
+            found = found.assign(shared_shift=(("shared", "parameter"), moves)).assign_coords(shared=list(alike))
+            largest = {name: (np.abs(by).max(), int(np.abs(by).argmax())) for name, by in alike.items()}
+            told = largest.items()
+            listed = [f"{name} moves {prior.names[k]} by {by:.2g}" for name, (by, k) in told if by >= TELLS]
+            add(found, *([Finding("population-shared", "warning", {"listed": "; ".join(listed)})] if listed else ()))
         if fit.slopes is not None:
             by_covariate = ("covariate", "parameter")
             slopes = np.swapaxes(fit.slopes, 1, 2)

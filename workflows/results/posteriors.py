@@ -154,6 +154,24 @@ class Left:
         names = _texts(self.found, "group" if self.kind == "select" else "data_set")
         return {name: self.draws(name, model, beside=False) for name in names if name not in self.lost}
 
+    def shared(self, model: str | None, parameters: Sequence[str]) -> dict[str, FloatArray]:
+        """By how many (d,) deviations of its posterior what is uncertain moves the median specimen, for one of its own.
+
+        By what is uncertain, in deviations with a sign; of first order.
+        """
+        groups = (
+            _texts(self.found, "uncertain") if "assumption_shift" in self.found and "uncertain" in self.found else []
+        )
+        if not groups:
+            return {}
+        shifts, rows = np.asarray(self.found["assumption_shift"]), _texts(self.found, "assumption")
+        if self.kind == "select":
+            shifts = shifts[_texts(self.found, "model").index(self.candidate(model))]
+        known = _texts(self.found, "parameter")
+        each = np.nan_to_num(np.nanquantile(shifts[..., [known.index(name) for name in parameters]], 0.5, axis=0))
+        # What is uncertain comes first; what has one member has its name.
+        return {name: each[rows.index(name) if name in rows else k] for k, name in enumerate(groups)}
+
     @cached_property
     def lost(self) -> list[str]:
         """The data sets that could not be inverted."""

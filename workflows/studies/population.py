@@ -17,6 +17,7 @@ from pydantic import field_validator
 
 from forward.findings import Finding
 from forward.model import SolveError
+from forward.settings import nearest
 from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.population import Columns, Population, Scale, prior_names
@@ -100,6 +101,8 @@ class PopulationStudy(FromPython, StudyKind):
         few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
         lost, count = self.source.lost if every else [], len(every)
         values = {"lost": len(lost), "of": count + len(lost), "specimens": ", ".join(lost)}
+        if every and self.source.blocks.get("data", {}).get("errors", {}).get("process"):
+            few.append(Finding("population-model-error", "warning"))
         return (*once_for_outputs(few, every), *([Finding("population-without", "warning", values)] if lost else ()))
 
     @property
@@ -147,6 +150,10 @@ class PopulationStudy(FromPython, StudyKind):
         try:
             Scale.of(method.distribution, self.posteriors)
             Columns.of(method.covariates, list(self.posteriors)).row(method.new)
+            shared = self.source.shared(method.model, prior_names(self.posteriors))
+            for name in method.own:
+                if name not in shared:
+                    yield ("method", "own"), f"is not uncertain in the source; {nearest(name, list(shared))}", name
             found = self.source.digest
         except (ValueError, StudyError) as error:
             yield place, str(error), method.source
@@ -269,7 +276,8 @@ class PopulationJob(Job):
                 return found
 
             begin = time.process_time()
-            fitted = method.run(posteriors, prior, timed, Steps(Kept(checkpoint, MPI.COMM_SELF, "steps")))
+            shared = left.shared(method.model, names)
+            fitted = method.run(posteriors, prior, timed, Steps(Kept(checkpoint, MPI.COMM_SELF, "steps")), shared)
             self.own.append(time.process_time() - begin - asking)
             return fitted
 

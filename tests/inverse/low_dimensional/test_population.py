@@ -100,6 +100,24 @@ def test_specimens_far_from_their_prior_are_drawn_again():
     assert "They cannot be drawn again: no data." in text
 
 
+def test_errors_that_specimens_share_widen_the_mean_and_are_told():
+    """Twelve specimens of 10 with errors of 0.5, all of which one device makes up to twice 1 larger."""
+    rng, prior = np.random.default_rng(5), Normal(mean=8.0, std=10.0)
+    posteriors = {f"s{k}": of_normal(11.5 + 0.1 * rng.standard_normal(), 1.0, prior, rng) for k in range(12)}
+    population, inputs = Population(source="batch", distribution="normal", draws=400), Inputs({"a": prior})
+    shared = {"data.scale": np.array([0.98])}
+    found, alone = (population.run(posteriors, inputs, shared=one) for one in (shared, {}))
+    wide, narrow = (np.ptp(one["typical_quantiles"].values[:, 0]) / 3.92 for one in (found, alone))
+    assert narrow < 0.4
+    assert wide == pytest.approx(np.hypot(0.98, narrow), rel=0.15)
+    assert np.ptp(found["new_quantiles"].values[:, 0]) > 3
+    assert found["shared_shift"].values[0, 0] == pytest.approx(0.98, rel=0.05)
+    assert [one.code for one in findings(found)] == ["population-shared"]
+    assert "one deviation of data.scale moves a by 0.98 of" in findings(found)[0].text
+    own = population.model_copy(update={"own": ["data.scale"]}).run(posteriors, inputs, shared=shared)
+    np.testing.assert_array_equal(own["typical_quantiles"], alone["typical_quantiles"])
+
+
 @pytest.mark.unit
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_priors_of_specimens_that_are_drawn_again_cover_the_population(logarithmic):

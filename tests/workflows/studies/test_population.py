@@ -16,6 +16,7 @@ from tests.launch import TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
 from uq.evaluation import kept
 from uq.inputs.distributions import LogNormal, Normal
+from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.report.page import write_report
 from workflows.run.run import run
@@ -170,6 +171,24 @@ def test_data_sets_that_could_not_be_inverted_are_named(batch, tmp_path):
     assert run(study, "population", tmp_path / "population", quiet=True, report=False) == 0
     lost = "1 of 4 data sets could not be inverted, and are not in the population: s2."
     assert [text for text in texts(tmp_path / "population") if "could not be inverted" in text] == [lost]
+
+
+def test_what_is_uncertain_in_the_source_is_shared_by_specimens(batch, tmp_path):
+    """A scale of the data of 5 % moves a number of 6 by about a quarter of its deviation."""
+    shutil.copytree(batch / "data", tmp_path / "data")
+    stated = '\n[uncertain]\n"data.scale" = 0.05\n'
+    (tmp_path / "invert.toml").write_text(INVERT + stated)
+    run(load(tmp_path / "invert.toml"), "invert", tmp_path / "results", quiet=True, report=False)
+    study = load(population(tmp_path, tmp_path / "results", 'distribution = "normal"'))
+    assert run(study, "population", tmp_path / "population", quiet=True, report=False) == 0
+    said = [text for text in texts(tmp_path / "population") if "err alike in all specimens" in text]
+    assert len(said) == 1
+    assert "one deviation of data.scale moves a by 0." in said[0]
+    assert "population-model-error" not in [one.code for one in study.findings]
+    study.source.blocks["data"]["errors"]["process"] = True
+    assert "population-model-error" in [one.code for one in study.findings]
+    with pytest.raises(StudyError, match=r"did you mean 'data\.scale'"):
+        load(population(tmp_path, tmp_path / "results", 'distribution = "normal"\nown = ["data.scael"]'))
 
 
 def by_sums(truth, slope, sigma):
