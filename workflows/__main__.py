@@ -80,7 +80,10 @@ def _say(text: str) -> None:
 
 
 def _first() -> bool:
-    """Whether this is the first rank of the job."""
+    """Whether this is the first rank of the job; tasks that do not know of each other are all first."""
+    mpi = sys.modules.get("mpi4py.MPI")
+    if mpi is not None and mpi.Is_initialized() and not mpi.Is_finalized():
+        return bool(mpi.COMM_WORLD.rank == 0)
     return next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0"
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from forward.machine import reason_to_stop
+from forward.machine import StopError, reason_to_stop
 from forward.model import ModelError, SolveError
 
 T = TypeVar("T")
@@ -137,7 +137,13 @@ class Counter:
     def __init__(self, world: Any) -> None:
         self._world = world
         size = MPI.INT64_T.Get_size()
-        self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
+        try:
+            self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
+        except MPI.Exception as error:
+            message = (
+                f"MPI has no memory that these nodes share a counter in ({error}): docs/clusters.md says what helps"
+            )
+            raise StopError(message) from None
         if world.rank == 0:
             self.reset()  # the memory is not initialised
         world.barrier()
