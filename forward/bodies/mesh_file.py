@@ -20,7 +20,6 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
-from forward.bodies.facets import lifted
 from forward.bodies.location import locate, nearest_of
 from forward.bodies.mesh import (
     CLOSE,
@@ -148,6 +147,8 @@ class MeshFile(Settings):
 
         These are the facets of the file: of cells that were divided, most lie in one plane with their neighbours.
         """
+        from forward.bodies.facets import lifted  # SciPy, which `tissuq check` does without
+
         mesh = self.load()
         whole = lifted(self.model_copy(update={"levels": 0, "divide": None}).load())
         return None if whole is None else replace(mesh, points=_divided(whole, vars(self)).points)
