@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.findings import Finding
+from forward.machine import require
 from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
 from uq.estimators import failure_domain
@@ -43,6 +44,7 @@ REALISATIONS = 3  # of random fields, to look at
 def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
+    require(8 * study.planned * (len(inputs.names) + len(units)), f"to hold {study.planned:,} samples")
     recorders: dict[str, Recorder] = {}
     estimates: list[Evaluations] = []
     told, taken = dict[str, Any](), study.taken

@@ -137,6 +137,13 @@ def reasons(done):
     return [line for line in done.stderr.splitlines() if line.startswith(("failed:", "interrupted"))]
 
 
+@pytest.mark.parametrize("kind", ["monte-carlo", "quasi-monte-carlo"])
+def test_more_samples_than_memory_holds_are_a_line(study, tmp_path, kind):
+    done = in_process("run", study, "--out", tmp_path / "out", "--set", f"method={{kind='{kind}', samples={2**40}}}")
+    assert done.returncode == 1
+    assert reasons(done)[0].startswith("failed: memory ran out: to hold 1,099,511,627,77")
+
+
 @pytest.mark.parametrize("mebibytes", [100, 250, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_program_without_memory_says_so(study, tmp_path, mebibytes):
     done = tissuq("run", study, "--out", tmp_path / "out", limits=[(resource.RLIMIT_AS, mebibytes * 2**20)])
