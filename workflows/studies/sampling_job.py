@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,10 +104,8 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         settled(found, units)
         add(found, *locking)
-        body = study.spec.bodies[0].body if of_body and len(study.meshes) > 1 else None
-        if body is not None and body.kind == "mesh" and body.lifted() is not None:
-            add(found, Finding("facets-uncounted", "warning"))
         if of_body:
+            add(found, *_of_facets(study))
             solved, kind_of_cell = recorders["/"], model.spec.body.cell
             points = np.concatenate([one.points for one in solved.log])
             add(found, *crossings(solved.first, points, model.space.coordinates, cells, kind_of_cell))
@@ -117,6 +115,13 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         return with_random_fields(with_stresses(found, tensors), factors, model.space.variance_kept)
 
     return made(labelled=labelled, node_volumes=partial(node_volumes, model.space.coordinates, cells))
+
+
+def _of_facets(study: SamplingBlocks) -> Iterator[Finding]:
+    """Say of several meshes of a curved body that their facets are those of the first."""
+    body = study.spec.bodies[0].body
+    if len(study.meshes) > 1 and body.kind == "mesh" and body.lifted() is not None:
+        yield Finding("facets-uncounted", "warning")
 
 
 def _with_mesh_errors(
