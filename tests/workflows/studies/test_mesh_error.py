@@ -3,10 +3,12 @@
 import json
 import re
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.facets import body
 from forward.readable import SIZES, margin, places
 from tests.launch import ROOT, TISSUQ, assert_same_bits, in_process, run, run_script
 from uq.findings import findings
@@ -15,6 +17,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import document, dump, load, parse
 from workflows.run.plan import plan
 from workflows.run.run import run as run_study
+from workflows.studies import sampling_job
 
 TINY = ROOT / "configs" / "tiny.toml"
 OFF = "accuracy.mesh_error=false"
@@ -323,3 +326,10 @@ def test_a_function_has_no_mesh_that_could_be_unknown(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "configs")
     found = load(ROOT / "configs" / "own-model.toml").run()
     assert "mesh_unknown" not in found.attrs
+
+
+@pytest.mark.parametrize(("curved", "meshes", "said"), [(True, 2, 1), (True, 1, 0), (False, 2, 0)])
+def test_methods_on_several_meshes_say_that_facets_are_in_no_error(tmp_path, curved, meshes, said):
+    solid = body(tmp_path, "tetrahedron", 2, 1) if curved else load(TINY).spec
+    study = SimpleNamespace(spec=SimpleNamespace(bodies=[solid]), meshes=[None] * meshes)
+    assert [one.code for one in sampling_job._of_facets(study)] == ["facets-uncounted"] * said
