@@ -10,7 +10,6 @@ where the body enters a tool further all the same, it is raised by steps of a fa
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -360,11 +359,8 @@ class Indenter(Term):
 
     def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         """Find samples, at the ends of ranges, in which it starts deep in the body, misses it or goes through it."""
-        stated = {name: scalar.value for name, scalar in self.scalars.items()}
-        own = {name: ends for name, ends in ranges.items() if name in stated and name != "friction"}
         found: dict[str, tuple[float, str]] = {}
-        for ends in itertools.product(*own.values()):
-            numbers = stated | dict(zip(own, ends, strict=True))
+        for numbers, where in self.at_ends({name: ends for name, ends in ranges.items() if name != "friction"}):
             if not any(numbers[name] for name in POINTING):
                 continue
             inside, left = self.entered(body, numbers | {"depth": 0.0}), -self.entered(body, numbers)
@@ -372,7 +368,6 @@ class Indenter(Term):
             extent = float(sum(abs(d) * [high - low for low, high in body.bounds]))
             far = numbers["depth"] - extent if self.shape != "plane" else 0.0
             away = extent if inside <= tolerance(body) and _behind(body, tip, d, extent) else 0.0
-            where = ", ".join(f"{name} = {value:.3g}" for name, value in zip(own, ends, strict=True))
             for what, size, least in (
                 ("starts {} inside the body, which counts as a deeper push", inside, self.depth),
                 ("stays {} off the body, and its force is 0", left, 0.0),

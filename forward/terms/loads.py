@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -17,7 +16,6 @@ from forward.findings import Finding
 from forward.readable import listed, told
 from forward.terms.term import Place, Term
 
-PLACED = ("x", "y", "z", "width")  # numbers of a spot by which it reaches over an edge
 WHOLE = 0.9  # share of a spot on its boundary, from which on nothing is said
 PARTS = 12  # of the edges of a triangle, over which a spot is integrated
 INSIDE = np.array(
@@ -121,23 +119,19 @@ class Spot(Term):
 
     def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         """Say how much of the force is lost, at most, at the ends of ranges."""
-        stated = {name: scalar.value for name, scalar in self.scalars.items()}
-        own = {name: ends for name, ends in ranges.items() if name in PLACED}
         triangles = fan(facets(body, self.on))
         points = np.einsum("qk,nka->nqa", INSIDE, triangles).reshape(-1, 3)
         sides = triangles[:, 1:] - triangles[:, :1]
         areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
-        shares = {}
-        for ends in itertools.product(*own.values()):
-            numbers = stated | dict(zip(own, ends, strict=True))
+        least, at = 1.0, ""
+        for numbers, where in self.at_ends({name: ends for name, ends in ranges.items() if name != "size"}):
             squares = ((points - [numbers[axis] for axis in "xyz"]) ** 2).sum(axis=1) / numbers["width"] ** 2
             density = np.exp(-squares / 2).reshape(len(areas), -1).mean(axis=1)
-            shares[ends] = float(areas @ density) / (2 * math.pi * numbers["width"] ** 2)
-        worst = min(shares, key=lambda ends: shares[ends])
-        if shares[worst] < WHOLE:
-            where = ", ".join(f"{name} = {value:.3g}" for name, value in zip(own, worst, strict=True))
-            values = {"label": self.label, "share": f"{100 * shares[worst]:.2g} %", "boundary": self.on}
-            yield Finding("spot-lost", "warning", values | {"where": f" at {where}" if own else ""})
+            share = float(areas @ density) / (2 * math.pi * numbers["width"] ** 2)
+            least, at = min((least, at), (share, where))
+        if least < WHOLE:
+            values = {"label": self.label, "share": f"{100 * least:.2g} %", "boundary": self.on}
+            yield Finding("spot-lost", "warning", values | {"where": f" at {at}" if at else ""})
 
     def words(self, numbers: Mapping[str, str]) -> str:
         place = ", ".join(numbers[name] for name in "xyz")

@@ -21,6 +21,7 @@ methods, so that a study can be checked without it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
@@ -174,6 +175,14 @@ class Term(Named):
     def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         """Find what may be wrong where its numbers are parameters, from their ranges by name."""
         return iter(())
+
+    def at_ends(self, ranges: Mapping[str, tuple[float, float]]) -> Iterator[tuple[dict[str, float], str]]:
+        """Go through its numbers at the ends of ranges, in all combinations, with where that is in words."""
+        stated = {name: scalar.value for name, scalar in self.scalars.items()}
+        own = {name: ends for name, ends in ranges.items() if name in stated}
+        for ends in itertools.product(*own.values()):
+            moved = dict(zip(own, ends, strict=True))
+            yield stated | moved, ", ".join(f"{name} = {value:.3g}" for name, value in moved.items())
 
     def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
         """Return points (m) of the body and the directions in which it holds them, be it from one side only."""
