@@ -63,10 +63,10 @@ def lifted(mesh: Loaded) -> Loaded | None:
 
 
 def lift_of(mesh: Loaded, whole: Loaded, points: FloatArray) -> FloatArray:
-    """Return what facets of a mesh hide at points (n, 3) in its cells, linear between vertices that were moved."""
+    """Return what facets of tetrahedra hide at points (n, 3) in them, linear between vertices that were moved."""
     at = locate(mesh.points[mesh.cells], points)
     shifts = (whole.points - mesh.points)[mesh.cells[at.cells]]
-    return np.asarray(np.einsum("nk,nka->na", shapes(at.local, mesh.cells.shape[1]), shifts))
+    return np.asarray(np.einsum("nk,nka->na", shapes(at.local, 4), shifts))
 
 
 def _surface(mesh: Loaded) -> tuple[IntArray, FloatArray]:

@@ -149,9 +149,8 @@ class MeshFile(Settings):
         """
         from forward.bodies.facets import lifted  # SciPy, which `tissuq check` does without
 
-        mesh = self.load()
         whole = lifted(self.model_copy(update={"levels": 0, "divide": None}).load())
-        return None if whole is None else replace(mesh, points=_divided(whole, vars(self)).points)
+        return None if whole is None else replace(self.load(), points=_divided(whole, vars(self)).points)
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
         """Return the body with every cell divided into eight, thinner ones at some boundaries.

@@ -24,7 +24,6 @@ FLAT = 1e-10  # volume of a cell over the cube of its longest edge that counts a
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
 BOUNDARY = "boundary "  # before the name of a boundary, in a mesh of our own
 LIFT = "lift"  # name of the array
-LIFT = "lift"  # name of the array
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
 _MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write

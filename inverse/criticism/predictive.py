@@ -18,6 +18,8 @@ from inverse.data.neighbours import DRAWS, Neighbours, agreement
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.posterior import Density, Posterior
 
+UNEXPLAINED = 0.01  # probability below which a model does not explain its residuals, or how they agree
+
 
 @dataclass(frozen=True)
 class ResidualTest:

@@ -29,7 +29,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
-from inverse.criticism.predictive import examine, spectrum_of
+from inverse.criticism.predictive import UNEXPLAINED, examine, spectrum_of
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
 from inverse.low_dimensional.wider import Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 DRAWS = 4000  # of scores as they are by chance
 CALLED = 0.05  # probability up to which data call for something
-UNEXPLAINED = 0.01  # probability of larger residuals below which a model does not explain the data
 OPEN, SHOWN = 1.0, 3  # deviations that data leave open from which on that is told, and of how many
 ROUNDS, SETTLED = 5, 0.05  # how often a form is moved at most, until it moves by fewer deviations
 Forms = Mapping[str, Mapping[Any, FloatArray]]  # names of enlargements → their forms, which say it → patterns (k, N)
@@ -205,7 +204,9 @@ def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Que
         H = unexplained(A, rows)
         return np.linalg.qr(H.T)[1].T if len(H) < H.shape[1] else H, -G @ noise.score(residual / size) / size, A, rows
 
-    (H, scores, A, over), (larger, fewer, *_) = scored(1.0), scored(_understated(posterior, at, residual))
+    H, scores, A, over = stated = scored(1.0)
+    size = _understated(posterior, at, residual)
+    larger, fewer, *_ = stated if size == 1 else scored(size)
     by_chance = np.random.default_rng(seed).standard_normal((DRAWS, H.shape[1])) @ larger.T
     moves = parameters_moved(posterior, gaussian, A, over.T) / deviations(posterior, gaussian)[:, None]
     ends = np.cumsum([len(patterns) for *_, patterns in flat])

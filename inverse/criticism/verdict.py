@@ -11,7 +11,7 @@ from forward.model import FloatArray
 from inverse.criticism.assessment import counts
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights
-from inverse.criticism.predictive import ResidualTest
+from inverse.criticism.predictive import UNEXPLAINED, ResidualTest
 from inverse.criticism.weights import enough, fewest, usual, worth
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode
@@ -129,10 +129,10 @@ def _objection(converged: bool, test: ResidualTest, left: float = 0.0) -> Verdic
         why = "the search for the mode did not converge"
         far = f"{why}: its next step would move an unknown by up to {left:.2g} standard deviations"
         return Verdict("neither", far if left > np.sqrt(NEAR) else why)
-    if test.probability < 0.01:
+    if test.probability < UNEXPLAINED:
         why = f"the model does not explain the data: |r|² = {test.square:.4g} where {test.degrees:.4g} is expected"
         return Verdict("neither", f"{why} (probability {test.probability:.1g})")
-    if test.agreement_probability < 0.01:
+    if test.agreement_probability < UNEXPLAINED:
         why = f"residuals of neighbours agree too much (probability {test.agreement_probability:.1g})"
         return Verdict("neither", f"{why}: the model, or the independence of the noise, is wrong")
     return None

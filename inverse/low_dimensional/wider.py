@@ -100,14 +100,11 @@ def missed(wider: Wider, covariance: FloatArray) -> tuple[FloatArray, FloatArray
 
     mean, variance, middle = given(here)
     far, wide, held = given(posterior.at(np.vstack([wider.first + lines, wider.first - lines]), derivatives=True))
-    pairs = np.exp(held - middle + 1.5).reshape(2, len(new)) / 6  # e^(3/2): beside the density of the normal there
-    weights = np.vstack([np.full(len(new), 2 / 3), pairs])[:, :, None]
-    weights = weights / weights.sum(axis=0)
-    means = np.stack([np.broadcast_to(mean, (len(new), len(rest))), *far.reshape(2, len(new), len(rest))])
-    variances = np.stack([np.broadcast_to(variance, (len(new), len(rest))), *wide.reshape(2, len(new), len(rest))])
-    mixed = (weights * means).sum(axis=0)
-    spread = (weights * (variances + (means - mixed) ** 2)).sum(axis=0)
-    moved = (mixed - mean).sum(axis=0) - (joint @ here.gradient[0])[rest]
-    widths = (variance + (spread - variance).sum(axis=0))[0]
+    weights = np.exp(held - middle + 1.5).reshape(2, -1, 1) / 6  # e^(3/2): beside the density of the normal there
+    weights /= 2 / 3 + weights.sum(axis=0)
+    apart, wider_by = ((x - y).reshape(2, len(new), -1) for x, y in ((far, mean), (wide, variance)))
+    moves = (weights * apart).sum(axis=0)
+    widths = variance[0] + ((weights * (wider_by + apart**2)).sum(axis=0) - moves**2).sum(axis=0)
+    moved = moves.sum(axis=0) - (joint @ here.gradient[0])[rest]
     before = np.diag(covariance)[: len(own)]
     return (moved / np.sqrt(np.diag(joint)[rest]))[own], np.log(widths[own] / before) / 2

@@ -101,7 +101,8 @@ class PopulationStudy(FromPython, StudyKind):
         few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
         lost, count = self.source.lost if every else [], len(every)
         values = {"lost": len(lost), "of": count + len(lost), "specimens": ", ".join(lost)}
-        if every and self.source.blocks.get("data", {}).get("errors", {}).get("process"):
+        blocks = self.source.blocks if every else {}
+        if blocks.get("model_error") or blocks.get("data", {}).get("errors", {}).get("process"):
             few.append(Finding("population-model-error", "warning"))
         return (*once_for_outputs(few, every), *([Finding("population-without", "warning", values)] if lost else ()))
 

@@ -185,8 +185,14 @@ def test_what_is_uncertain_in_the_source_is_shared_by_specimens(batch, tmp_path)
     assert len(said) == 1
     assert "one deviation of data.scale moves a by 0." in said[0]
     assert "population-model-error" not in [one.code for one in study.findings]
-    study.source.blocks["data"]["errors"]["process"] = True
-    assert "population-model-error" in [one.code for one in study.findings]
+    for blocks, name, given in (
+        (study.source.blocks["data"]["errors"], "process", True),
+        (study.source.blocks, "model_error", {"against": {}}),
+    ):
+        blocks[name] = given
+        assert "population-model-error" in [one.code for one in study.findings]
+        del blocks[name]
+        assert "population-model-error" not in [one.code for one in study.findings]
     with pytest.raises(StudyError, match=r"did you mean 'data\.scale'"):
         load(population(tmp_path, tmp_path / "results", 'distribution = "normal"\nown = ["data.scael"]'))
 
