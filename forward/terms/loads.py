@@ -13,19 +13,12 @@ from forward.bodies.geometry import Body, Direction, unit_vector
 from forward.bodies.mesh import fan
 from forward.bodies.surface import facets
 from forward.findings import Finding
+from forward.model import FloatArray
 from forward.readable import listed, told
 from forward.terms.term import Place, Term
 
 WHOLE = 0.9  # share of a spot on its boundary, from which on nothing is said
-PARTS = 12  # of the edges of a triangle, over which a spot is integrated
-INSIDE = np.array(
-    [
-        ((3 * i + k) / (3 * PARTS), (3 * j + k) / (3 * PARTS), 1 - (3 * (i + j) + 2 * k) / (3 * PARTS))
-        for k in (1, 2)
-        for i in range(PARTS + 1 - k)
-        for j in range(PARTS + 1 - k - i)
-    ]
-)  # centres of its parts
+FINE, MOST = 4, 12  # parts of edges of triangles, over which a spot is integrated: over its width, and at most
 
 
 class Gravity(Term):
@@ -120,8 +113,10 @@ class Spot(Term):
     def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         """Say how much of the force is lost, at most, at the ends of ranges."""
         triangles = fan(facets(body, self.on))
-        points = np.einsum("qk,nka->nqa", INSIDE, triangles).reshape(-1, 3)
         sides = triangles[:, 1:] - triangles[:, :1]
+        finest = FINE * np.sqrt((sides**2).sum(axis=-1).max()) / min(ranges.get("width", (self.width,)))
+        centres = _centres(int(np.clip(np.ceil(finest), 1, MOST)))
+        points = np.einsum("qk,nka->nqa", centres, triangles).reshape(-1, 3)
         areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
         least, at = 1.0, ""
         for numbers, where in self.at_ends({name: ends for name, ends in ranges.items() if name != "size"}):
@@ -137,3 +132,11 @@ class Spot(Term):
         place = ", ".join(numbers[name] for name in "xyz")
         force = f"{numbers['size']} along {listed(self.direction)}"
         return f"spot on {self.on}: {force}, within {numbers['width']} of ({place})"
+
+
+def _centres(parts: int) -> FloatArray:
+    """Barycentric coordinates (parts², 3) of the centres of equal triangles that a triangle is divided into."""
+    corners = [(i, j, k) for k in (1, 2) for i in range(parts + 1 - k) for j in range(parts + 1 - k - i)]
+    i, j, k = np.array(corners).T
+    first, second = (3 * i + k) / (3 * parts), (3 * j + k) / (3 * parts)
+    return np.column_stack([first, second, 1 - first - second])
