@@ -40,6 +40,9 @@ TABLE: dict[str, str | Words] = {
     "population-shared": "What the source states as uncertain is taken to err alike in all specimens: one deviation of "
     "{listed} of a specimen's posterior deviations. Intervals of the mean, the typical and a new specimen hold that; "
     "the spread is as if each erred by itself, and may be larger. What does so belongs in method.own.",
+    "population-beyond": "New specimens would lie beyond the ends of the prior of {listed}, where none can be found: "
+    "the population is not as normal there as it is taken to be, and its mean and spread err by more than they say. "
+    "Widen the prior of the source; a number that is never negative is log-normal rather than normal.",
     "population-small": "{specimens} specimens say little on how wide the population is: its prior does.",
     "far-from-prior": Words(
         "the posterior of {name} ({value}) lies {distance:.1f} prior deviations from the prior ({centre}): the "

@@ -60,23 +60,27 @@ class Discretisation(Sensitivities):
         if float(self._stiffer.value) != stiffer:
             self._stiffer.value = stiffer
             self.linearisation_point.moved()
-        if self.linearisation_point.parameters is not None and np.array_equal(
-            parameters, self.linearisation_point.parameters
-        ):
+        before = self.linearisation_point.parameters
+        if before is not None and (parameters == before).all():
             return
         self.linearisation_point.parameters = np.array(parameters, dtype=float)
         self.linearisation_point.moved()
-        self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
-        for i in self.scalars:  # the other numbers stay
-            if (constant := self.constants.get(self.parameters[i])) is not None:
-                constant.value = parameters[i]
-        self._full_targets = np.zeros(len(self.fixed))
-        for path, mover in self.movers.items():
-            self._full_targets += self._values[path] * mover
+        for i, path, place in self._settable:  # the other numbers stay
+            self._values[path] = value = float(parameters[i])
+            if place is not None:
+                place[()] = value
+        if self.movers:
+            self._full_targets = np.sum([self._values[path] * mover for path, mover in self.movers.items()], axis=0)
         self._moves = any(self._values[path] != 0 for path in self.movers)
         self._external = self._size_of_loads()
         for field in self.fields:  # the size of the loads is their size without random fluctuations
             field.set(parameters)
+
+    @cached_property
+    def _settable(self) -> tuple[tuple[int, str, FloatArray | None], ...]:
+        """Position and path of each parameter that is a number, and the constant's own memory in compiled forms."""
+        paths = ((int(i), self.parameters[i]) for i in self.scalars)
+        return tuple((i, path, self.constants[path].value if path in self.constants else None) for i, path in paths)
 
     def _size_of_loads(self) -> float:
         """Norm (N) of the complete loads on the undeformed body, without tools and items.

@@ -12,7 +12,8 @@ from forward.model import FloatArray
 
 def smallest(comm: Any, value: float) -> float:
     """Smallest value over the ranks; NaN counts as −∞."""
-    return float(comm.allreduce(value if value == value else -np.inf, op=MPI.MIN))  # noqa: PLR0124
+    value = value if value == value else -np.inf  # noqa: PLR0124
+    return float(value if comm.size == 1 else comm.allreduce(value, op=MPI.MIN))
 
 
 def total(comm: Any, values: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from forward.findings import Finding
 from forward.model import FloatArray
+from forward.readable import percent
 from forward.settings import Settings, nearest
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, fitted
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
@@ -31,6 +32,7 @@ MIXED = 100.0  # independent draws of the population, below which its quantiles 
 FEW = 4  # specimens, below which the prior decides how wide a population is
 PRIOR = 4096  # points that stand for the prior
 TELLS = 0.01  # of a specimen's deviation, by which an error that all share has to move it to be told
+BEYOND = 0.02  # of new specimens, that lie where none can be found, from which on it is told
 QUANTILES = (0.025, 0.5, 0.975)
 
 # Name of a specimen, prior → its draws, or None and why.
@@ -162,7 +164,7 @@ class Population(Settings):
                 slope_quantiles=(("quantile", *by_covariate), np.quantile(slopes, QUANTILES, axis=0)),
                 covariate_value=(("specimen", "covariate"), columns.values + columns.means),
             ).assign_coords(covariate=list(columns.names))
-        add(found, *_findings(reached, list(posteriors)))
+        add(found, *_findings(reached, list(posteriors)), *_beyond(fit, prior_names(posteriors)))
         return found
 
     def _reached(
@@ -378,6 +380,24 @@ class Scale:
         if sign > 0:
             return LogNormal(mean=mean, std=std)
         return TruncatedNormal(mean=-mean, std=std, lower=-mean - 8 * std, upper=0.0)
+
+
+def _beyond(fit: Fit, names: Sequence[str]) -> Iterator[Finding]:
+    """Say of which parameters new specimens lie beyond ends of the prior under which specimens were found.
+
+    By the medians of mean and spread: the tails of all draws together say how little few specimens tell.
+    """
+    from scipy.special import ndtr
+
+    bounded = [one.ends for one in fit.specimens if one.ends is not None]
+    if not bounded:
+        return
+    lower, upper = (np.median(ends, axis=0) for ends in np.swapaxes(bounded, 0, 1))
+    middle, spread = np.median(fit.mean, axis=0), np.median(fit.std, axis=0)
+    shares = ndtr((lower - middle) / spread) + ndtr((middle - upper) / spread)
+    listed = [f"{name} ({percent(share)})" for name, share in zip(names, shares, strict=True) if share >= BEYOND]
+    if listed:
+        yield Finding("population-beyond", "warning", {"listed": ", ".join(listed)})
 
 
 def _findings(reached: _Reached, names: list[str]) -> Iterator[Finding]:

@@ -243,3 +243,18 @@ def test_densities_of_correlated_priors():
         pytest.approx(np.log(0.5)),
         -np.inf,
     ]
+
+
+@pytest.mark.parametrize(("middle", "told"), [(5.0, False), (1.0, True)])
+def test_a_population_at_the_end_of_a_prior_is_told(middle, told):
+    """Twelve specimens of N(middle, 1), each known to 0.5 under a prior on [0, 10]: of N(1, 1) a sixth lies below."""
+    from scipy.stats import truncnorm
+
+    rng, u = np.random.default_rng(2), (np.arange(200) + 0.5) / 200
+    y = middle + rng.standard_normal(12) + 0.5 * rng.standard_normal(12)
+    values = [truncnorm.ppf(u, -2 * one, 2 * (10 - one), loc=one, scale=0.5)[:, None] for one in y]
+    posteriors = {f"s{i}": Draws(("a",), one, np.full(200, 1 / 200), 200.0) for i, one in enumerate(values)}
+    population = Population(source="batch", distribution="normal", draws=200)
+    found = findings(population.run(posteriors, Inputs({"a": Uniform(lower=0.0, upper=10.0)})))
+    assert [one.code for one in found] == ["population-beyond"] * told
+    assert all(one.severity == "warning" and "beyond the ends of the prior of a (" in one.text for one in found)
